@@ -267,28 +267,25 @@ def read_rows(path: Path, what: str, columns: int) -> np.ndarray:
 
 def read_receivers(values: Sequence[str], name: str = "--receivers") -> np.ndarray:
     """(R, 3) positions in metres from a CSV or NPY file, or from `x,y,z` words."""
-    return _read_places(values, name, "x,y,z", 3)
+    return _read_places(values, name, "x,y,z in metres", 3)
 
 
 def read_pointings(values: Sequence[str], name: str) -> np.ndarray:
     """(R, 5): positions as of :func:`read_receivers`, azimuth and elevation [degrees] that a horn is turned to."""
-    return _read_places(values, name, "x,y,z,azimuth,elevation", 5)
+    return _read_places(values, name, "x,y,z,azimuth,elevation in metres and degrees", 5)
 
 
-def _read_places(values: Sequence[str], name: str, columns: str, count: int) -> np.ndarray:
+def _read_places(values: Sequence[str], name: str, what: str, count: int) -> np.ndarray:
     if len(values) == 1 and "," not in values[0]:
-        return read_rows(existing(values[0]), f"rows {columns} in metres and degrees", count)
-    try:
-        rows = [[float(number) for number in word.split(",")] for word in values]
-    except ValueError as error:
-        raise ValueError(
-            f"{name}: got {' '.join(values)!r}, expected numbers {columns} in metres and degrees, or one CSV/NPY file"
-        ) from error
-    wrong = [word for word, row in zip(values, rows, strict=True) if len(row) != count]
-    if wrong:
-        raise ValueError(
-            f"{name}: got {wrong[0]!r}, expected {columns} in metres and degrees, or one CSV/NPY file"
-        )
+        return read_rows(existing(values[0]), f"rows {what}", count)
+    rows = []
+    for word in values:
+        try:
+            rows.append([float(number) for number in word.split(",")])
+        except ValueError:
+            rows.append([])
+        if len(rows[-1]) != count:
+            raise ValueError(f"{name}: got {word!r}, expected {what}, or one CSV/NPY file")
     return np.array(rows)
 
 

@@ -309,8 +309,8 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
     if args.relevance is not None:
         options["relevance"] = wr.Relevance.load(existing(args.relevance))
     options |= {name: True for name in ("quick", "reciprocal") if getattr(args, name)}
-    for option in {"relevance", "quick", "reciprocal"} & set(options):
-        if args.model != "bistatic":
+    for option in ("relevance", "quick", "reciprocal"):
+        if option in options and args.model != "bistatic":
             raise ValueError(f"--{option}: only the bistatic model takes it, got --model {args.model}")
     if args.iterations is not None:
         options["iterations"] = args.iterations
@@ -385,16 +385,13 @@ def _suggest(args: argparse.Namespace, out: Output) -> None:
       warprrf suggest field.safetensors candidates.csv -n 3 -o next.csv
       warprrf suggest field.safetensors 2,3,1.5,-90,0 2,3,1.5,90,0 7,4,1.5,0,0 -n 2 --receive-pattern 10
     """
-    places, source, turned = None, existing(args.source), {}
-    if args.receive_pattern not in (None, "isotropic"):
-        pointings = read_pointings(args.candidates, "candidates")
-        places, arrival = (
-            pointings[:, :3],
-            np.radians(np.column_stack([90.0 - pointings[:, 4], pointings[:, 3]])),
-        )
+    source, turned = existing(args.source), {}
+    if args.receive_pattern in (None, "isotropic"):
+        pointings = read_receivers(args.candidates, "candidates")
+        arrival = np.full((len(pointings), 2), 0.5 * np.pi)
     else:
-        pointings = places = read_receivers(args.candidates, "candidates")
-        arrival = np.full((len(places), 2), 0.5 * np.pi)
+        pointings = read_pointings(args.candidates, "candidates")
+        arrival = np.radians(np.column_stack([90.0 - pointings[:, 4], pointings[:, 3]]))
     if args.receive_pattern is not None:
         turned = {"arrival": arrival, "receive_pattern": read_pattern(args.receive_pattern)}
     if source.suffix == ".safetensors":
@@ -409,7 +406,7 @@ def _suggest(args: argparse.Namespace, out: Output) -> None:
         field = wr.RadioField.fit(
             load_geometry(args.source, args.mesh, args), nothing, device=args.device, progress=out
         )
-    chosen = pointings[field.suggest(places, args.n, **turned, progress=out)]
+    chosen = pointings[field.suggest(pointings[:, :3], args.n, **turned, progress=out)]
     rows = _rows(chosen)
     if args.out:
         write_text(args.out, f"x,y,z{',azimuth,elevation' * (chosen.shape[1] == 5)}\n{rows}\n")

@@ -205,21 +205,15 @@ class ExactEngine:
         point = check_array("receiver", receiver, (3,))
         specular = self.tracer.trace(point, 1).with_gas(self.air)
         scattered = self.diffuse(point)
-        first = np.where(
-            specular.kind[:, None] == "los", point, np.nan_to_num(specular.vertices[:, 0])
-        )  # the first point after the transmitter
-        first = np.concatenate([first, point + scattered.range_m[:, None] * scattered.direction])
-        rest = specular.length_m - np.linalg.norm(
-            first[: len(specular.tau)] - self.tracer.transmitter, axis=1
-        )
         spread = self.spread(specular, scattered)
-        delay_s, aod = strongest_delay_and_departure(
-            spread.strongest, self.tracer.transmitter, first, np.concatenate([rest, scattered.range_m])
-        )
+        leg = point + scattered.range_m[:, None] * scattered.direction - self.tracer.transmitter
+        tau = (np.linalg.norm(leg, axis=1) + scattered.range_m) / SPEED_OF_LIGHT
+        aod = np.column_stack(angles_from_directions(leg))
+        departure = np.column_stack([specular.theta_t, specular.phi_t])
         return ReceivedPaths(
             path_gain=spread.path_gain,
-            delay_s=delay_s,
-            aod=aod,
+            delay_s=spread.of_strongest(np.concatenate([specular.tau, tau])),
+            aod=spread.of_strongest(np.concatenate([departure, aod])),
             line_of_sight=bool((specular.kind == "los").any()),
             totals=power_by_kind(specular, scattered.power),
         )
@@ -232,25 +226,6 @@ def power_by_kind(specular: Paths, diffuse: np.ndarray) -> dict[str, float]:
         "mirror": float(specular.power[specular.kind == "mirror"].sum()),
         "diffuse": float(diffuse.sum()),
     }
-
-
-def strongest_delay_and_departure(
-    strongest: np.ndarray, transmitter: np.ndarray, first: np.ndarray, rest_m: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Delay [s] and departure angles [rad] of each pixel's strongest path, NaN where it has none.
-
-    Args:
-        strongest: Index of the path, shape ``(H, W)``; -1 where empty.
-        first: First point after the transmitter of each path [m], shape ``(L, 3)``.
-        rest_m: Length from there to the receiver [m], shape ``(L,)``.
-    """
-    delay_s, aod = np.full(strongest.shape, np.nan), np.full((*strongest.shape, 2), np.nan)
-    filled = strongest >= 0
-    index = strongest[filled]
-    leg = first[index] - transmitter
-    delay_s[filled] = (np.linalg.norm(leg, axis=1) + rest_m[index]) / SPEED_OF_LIGHT
-    aod[filled] = np.stack(angles_from_directions(leg), axis=-1)
-    return delay_s, aod
 
 
 @dataclass(frozen=True)

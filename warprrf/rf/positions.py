@@ -312,7 +312,7 @@ def is_open_air(mesh: Mesh, *, device: DeviceLike = None) -> bool:
     if mesh.is_closed:
         return False
     places = _spread(mesh)
-    places = places[np.abs(places[:, 2] - mesh.center[2]) < 0.1 * np.ptp(mesh.bounds[:, 2])]  # halfway up
+    places = places[np.abs(places[:, 2] - mesh.center[2]) <= 0.1 * np.ptp(mesh.bounds[:, 2])]  # halfway up
     ground = np.isfinite(ground_height(mesh, *places[:, :2].T, device=device))
     return bool((ground & _sky_over(mesh, places, device)).mean() > 0.5)
 

@@ -186,6 +186,11 @@ def test_slabs_are_as_thick_as_the_scene_or_the_caller_says_and_else_let_nothing
     assert [group.thickness_m for group in found.groups] == [0.02, np.inf]
     assert "block/top <1>" in found.left_out[0] and "walls" not in found.left_out[0]
     assert wr.Scene.load(found.xml).materials[0].thickness_m == pytest.approx(0.02)
+    nowhere = replace(unknown, surface=replace(field.surface, thickness_m=np.full(3, np.nan)))
+    alike = replace(
+        nowhere, material=np.array([0, 0, 1])
+    )  # one material is one slab, however little is known
+    assert [group.name for group in wr.write_twin(alike, tmp_path / "alike").groups] == ["walls"]
     given = wr.write_twin(unknown, tmp_path / "given", thickness_m={"block/top <1>": 0.3})
     assert [group.thickness_m for group in given.groups] == [0.02, 0.3] and given.left_out == ()
     unknown.save(tmp_path / "field.safetensors")

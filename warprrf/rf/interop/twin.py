@@ -183,10 +183,9 @@ def write_twin(
     _check_replaceable(folder)
     surface = field.surface
     thickness = _thicknesses(field, thickness_m)
-    # A slab: a material of one thickness.
-    slab = np.unique(
-        np.column_stack([field.material, thickness]), axis=0, return_inverse=True, equal_nan=True
-    )[1].reshape(-1)
+    # A slab: a material of one thickness, which may be unknown.
+    slabs = np.column_stack([field.material, np.nan_to_num(thickness, nan=-1.0, posinf=np.inf)])
+    slab = np.unique(slabs, axis=0, return_inverse=True)[1].reshape(-1)
     face_material = slab[surface.group]
     area = np.bincount(face_material, surface.mesh.areas)
     own = np.bincount(surface.group, surface.mesh.areas, minlength=surface.groups)

@@ -15,7 +15,7 @@ import time
 import warnings
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -300,32 +300,17 @@ def _predicts(values: np.ndarray | None) -> bool:
     return values is not None and bool(np.isfinite(values).any())
 
 
-@runtime_checkable
-class _Fitted(Protocol):
-    """A field or a lookup."""
-
-    def was_fitted_on(self, ds: SpectrumDataset) -> np.ndarray: ...
-
-
 def _fitted_on(predict: Callable[[np.ndarray], Any], test: SpectrumDataset) -> int | None:
-    """How many receivers of ``test`` whoever predicts was fitted on; None where that is not known."""
+    """How many receivers of ``test`` the field or lookup that predicts was fitted on; None for anything else."""
     owner = getattr(predict, "__self__", predict)
-    return int(np.count_nonzero(owner.was_fitted_on(test))) if isinstance(owner, _Fitted) else None
-
-
-@runtime_checkable
-class _AnyGrid(Protocol):
-    """A field."""
-
-    def on_grid(self, shape: tuple[int, int]) -> Any: ...
+    return int(np.count_nonzero(owner.was_fitted_on(test))) if hasattr(owner, "was_fitted_on") else None
 
 
 def _on_grid(predict: Callable[[np.ndarray], Any], shape: tuple[int, int]) -> Callable[[np.ndarray], Any]:
     """``predict``, with spectra of ``shape`` if they are a field's."""
-    owner = getattr(predict, "__self__", None)
-    if isinstance(owner, _AnyGrid) and getattr(predict, "__name__", "") == "spectrum":
-        return owner.on_grid(shape).spectrum  # type: ignore[no-any-return]
-    return predict
+    owner: Any = getattr(predict, "__self__", None)
+    is_field = hasattr(owner, "on_grid") and getattr(predict, "__name__", "") == "spectrum"
+    return owner.on_grid(shape).spectrum if is_field else predict
 
 
 def _checked_gain(prediction: Spectrum | ArrayLike, shape: tuple[int, ...], index: int) -> np.ndarray:
