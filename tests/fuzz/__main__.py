@@ -22,7 +22,7 @@ from typing import Any
 
 import tests.conftest  # noqa: F401 (it says where helpers lie)
 from fuzz.place import Place
-from fuzz.trial import KINDS, Case, Trial, ended, stream, targets
+from fuzz.trial import KINDS, Case, Trial, stream, targets
 from fuzz.workers import LIMIT_S, Workers
 from warprrf.cli.output import Output
 from warprrf.device import threads
@@ -73,7 +73,7 @@ def _run(place: Place, state: dict[str, Any], args: argparse.Namespace, file: Pa
     progress, whole, before = Output("fuzz"), int(60.0 * args.minutes), state["seconds"]
     start = time.monotonic()
     waiting = itertools.islice(stream(place, args.seed, args.only), state["done"], None)
-    with Workers(partial(Trial, str(place.folder)), ended, args.workers) as workers:
+    with Workers(partial(Trial, str(place.folder)), args.workers) as workers:
         while time.monotonic() < start + whole:
             for case, outcome in workers.run(itertools.islice(waiting, BATCH), start + whole):
                 state["done"] += 1

@@ -35,8 +35,6 @@ from warprrf.rf.interop.twin import write_twin
 from warprrf.rf.spectra.dataset_files import export_exr, import_exr
 from warprrf.steps import Steps
 
-# ------------------------------------------------------------------------------------------------------------ edits
-
 Edit = tuple[str, int, int]
 INSERTED = [
     *(n.to_bytes(w, order, signed=True) for n in (-1, 0, 2**31 - 1, 10**9, 10**6) for w in (4, 8) for order in ("little", "big")),
@@ -135,9 +133,6 @@ def _places(tree: Any) -> Iterator[tuple[Any, Any]]:
         yield from _places(value)
 
 
-# ----------------------------------------------------------------------------------------------------------- codecs
-
-
 def _read_tensors(path: Path) -> Any:
     from safetensors import safe_open
 
@@ -213,8 +208,6 @@ CODECS: dict[str, tuple[Callable[[Path], Any], Callable[[Path, Any], object]]] =
     "words": (_read_words, _write_words),
 }
 """How contents are taken out of a file and put back."""
-
-# ---------------------------------------------------------------------------------------------------------- formats
 
 
 @dataclass(frozen=True)

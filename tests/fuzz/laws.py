@@ -88,8 +88,6 @@ def _told(ask: Callable[[], Any]) -> str:
     return "; ".join(str(w.message) for w in said)
 
 
-# -------------------------------------------------------------------------------------------------- free places
-
 SIZE = np.array([6.0, 5.0, 3.0])
 BASES = ("room", "open room", "loose walls", "boxes on the ground")
 
@@ -148,9 +146,6 @@ def _free_places(place: Place, edits: tuple[Edit, ...]) -> str:
     return "; ".join([base, *(text for text, count in bad.items() if count)]) if any(bad.values()) else ""
 
 
-# --------------------------------------------------------------------------------------------------------- fields
-
-
 @cache
 def _model(place: Place, name: str) -> wr.RadioField:
     return wr.RadioField.load(place.folder / f"{name}.safetensors", device="cpu")
@@ -166,6 +161,12 @@ VERBS: dict[str, Callable[..., Any]] = {
 STORED = ("spectra", "paths", "cfr")
 
 
+def _emptied() -> Path:
+    shutil.rmtree("case", ignore_errors=True)
+    Path("case").mkdir()
+    return Path("case")
+
+
 def _one_receiver(place: Place, edits: tuple[Edit, ...]) -> str:
     """Every verb of every model takes receivers= and transmitter= by these names; one receiver (3,) has no axis."""
     verb, a, b = edits[0]
@@ -174,9 +175,7 @@ def _one_receiver(place: Place, edits: tuple[Edit, ...]) -> str:
     keep = b // 2 % 2 and verb in STORED
     found = []
     for k, at in enumerate((POINTS[a // 3 % 3], POINTS[a // 3 % 3][None])):
-        store = {"store": Path("case") / f"{k}.nc"} if keep else {}
-        shutil.rmtree("case", ignore_errors=True)
-        Path("case").mkdir()
+        store = {"store": _emptied() / f"{k}.nc"} if keep else {}
         found.append(leaves(VERBS[verb](field, receivers=at, **more, **store)))
     one, row = found
     own = [where for where in one if where in row and one[where].shape != row[where].shape[1:]]
@@ -202,10 +201,9 @@ def _element(pattern: Any) -> wr.PlanarArray:
 
 
 def _kept(place: Place, pattern: Any) -> Any:
-    shutil.rmtree("case", ignore_errors=True)
-    Path("case").mkdir()
+    store = _emptied() / "cfr.nc"
     return place.field.cfr(
-        POINTS, [300e9], tx_array=_element(pattern), diffuse="power", max_paths=9, store=Path("case/cfr.nc")
+        POINTS, [300e9], tx_array=_element(pattern), diffuse="power", max_paths=9, store=store
     )
 
 
@@ -225,8 +223,6 @@ PATTERNS: dict[str, Callable[[Place, Any], Any]] = {
         place.train.subset([0]).deembed(pattern=pattern, iterations=10, tolerance=1e-2).path_gain
     ),
 }  # fmt: skip
-
-# ------------------------------------------------------------------------------------------------- measurements
 
 
 def _powers(place: Place, edits: tuple[Edit, ...]) -> str:
@@ -315,9 +311,6 @@ def _table(place: Place, edits: tuple[Edit, ...]) -> str:
     bad = [name for name, value in right.items() if not np.allclose(getattr(found, name), value)]
     bad += ["chain"] * (found.chain.tolist() != chains)
     return f"read as other {', '.join(bad)}" if bad else ""
-
-
-# -------------------------------------------------------------------------------------- pickles, pages, commands
 
 
 PICKLED: dict[str, Callable[[Place], Any]] = {

@@ -14,7 +14,7 @@ from fuzz import calls, trial
 from fuzz.answers import complaint, differs, leaves, wrong
 from fuzz.files import CODECS, FORMATS
 from fuzz.laws import LAWS
-from fuzz.trial import FILE, LAW, Case, Trial, ended
+from fuzz.trial import FILE, LAW, Case, Outcome, Trial
 from fuzz.workers import Workers
 
 CASES = 600
@@ -30,7 +30,7 @@ def attempt(place, tmp_path, monkeypatch):
 def found(place, cases, **how):
     """Findings of cases, and how many ended how."""
     findings, tried = [], Counter()
-    with Workers(partial(Trial, str(place.folder)), ended, **how) as workers:
+    with Workers(partial(Trial, str(place.folder)), **how) as workers:
         for case, outcome in workers.run(cases):
             tried[outcome.kind] += 1
             if outcome.kind == "finding":
@@ -149,17 +149,17 @@ def test_what_no_answer_exists_for_is_refused(attempt, target, edits):
 
 
 def misbehaving(scratch):
-    asked = {"answers": str, "dies": lambda case: os.abort(), "hangs": lambda case: time.sleep(60.0)}
+    asked = {"answers": Outcome, "dies": lambda case: os.abort(), "hangs": lambda case: time.sleep(60.0)}
     return lambda case: asked[case](case)
 
 
 def test_a_crash_and_a_hang_are_seen_and_others_go_on():
     asked = ["answers", "dies", "answers", "hangs", "answers", "answers"]
-    with Workers(misbehaving, lambda words: f"ended: {words}", 1, 2.0) as workers:
+    with Workers(misbehaving, 1, 2.0) as workers:
         found = dict(workers.run(asked))
-    assert found["answers"] == "answers"
-    assert "exit code -6" in found["dies"]
-    assert "took more than 2 s" in found["hangs"]
+    assert found["answers"] == Outcome("answers")
+    assert "exit code -6" in found["dies"].text
+    assert "took more than 2 s" in found["hangs"].text
 
 
 def test_errors_of_other_kinds_or_without_a_name_are_findings():

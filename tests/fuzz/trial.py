@@ -151,18 +151,10 @@ class Trial:
         return FORMATS[target.removeprefix(FILE)].make(self.place, folder)
 
 
-def ended(words: str) -> Outcome:
-    """What came of a case that its process did not survive."""
-    return Outcome("finding", words)
-
-
 def refused(error: Exception, names: Collection[str]) -> Outcome:
     """An error as an outcome; a bad one says where it came from."""
     bad = complaint(error, names)
     return Outcome("finding", f"{bad} ({origin(error)})") if bad else Outcome("refused", str(error))
-
-
-# ------------------------------------------------------------------------------------------------------------ cases
 
 
 def targets() -> list[str]:

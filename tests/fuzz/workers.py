@@ -15,11 +15,14 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+from fuzz.trial import Outcome
+
 LIMIT_S = 30.0
 """How long a case may take, of which an undamaged one takes a tenth at most."""
 START_S = 180.0
 MEMORY = 12 << 30
 """Bytes of address space of a worker: more is refused by the system, which the worker survives."""
+Make = Callable[[Path], Callable[[Any], Outcome]]
 SPAWN = multiprocessing.get_context("spawn")
 
 
@@ -42,16 +45,12 @@ class Workers:
 
     Args:
         make: called in each process with a scratch folder; returns what tries a case.
-        ended: what came of a case that killed its process or was stopped, from the words for it.
         count: how many.
         limit_s: a case that takes longer is a hang.
     """
 
-    def __init__(
-        self, make: Callable[[Path], Callable[[Any], Any]], ended: Callable[[str], Any], count: int = 2,
-        limit_s: float = LIMIT_S,
-    ) -> None:  # fmt: skip
-        self._make, self._ended, self._count, self._limit_s = make, ended, count, limit_s
+    def __init__(self, make: Make, count: int = 2, limit_s: float = LIMIT_S) -> None:
+        self._make, self._count, self._limit_s = make, count, limit_s
 
     def __enter__(self) -> Workers:
         self._folder = tempfile.TemporaryDirectory(prefix="fuzz-")
@@ -63,7 +62,7 @@ class Workers:
             worker.stop()
         self._folder.cleanup()
 
-    def run(self, cases: Iterable[Any], until: float = float("inf")) -> Iterator[tuple[Any, Any]]:
+    def run(self, cases: Iterable[Any], until: float = float("inf")) -> Iterator[tuple[Any, Outcome]]:
         """Cases with what came of them, as they are done; none is begun after ``until`` (of ``time.monotonic``)."""
         waiting = iter(cases)
         while True:
@@ -83,7 +82,7 @@ class Workers:
                     case, worker.case = worker.case, None
                     yield case, self._received(worker)
 
-    def _received(self, worker: _Worker) -> Any:
+    def _received(self, worker: _Worker) -> Outcome:
         try:
             if worker.pipe.poll():
                 answer, worker.until = worker.pipe.recv(), 0.0
@@ -96,7 +95,7 @@ class Workers:
         number = self._all.index(worker)
         words += "\n" + worker.log.read_text(errors="replace")[-2000:]
         self._all[number] = self._start(number)
-        return self._ended(words)
+        return Outcome("finding", words)
 
     def _start(self, number: int) -> _Worker:
         here, there = SPAWN.Pipe()
@@ -110,9 +109,7 @@ class Workers:
         return _Worker(process, here, log, time.monotonic() + START_S)
 
 
-def _work(
-    pipe: Connection, make: Callable[[Path], Callable[[Any], Any]], scratch: Path, log: Path, limit_s: float
-) -> None:
+def _work(pipe: Connection, make: Make, scratch: Path, log: Path, limit_s: float) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     scratch.mkdir(parents=True, exist_ok=True)
     with log.open("w") as out:
