@@ -163,6 +163,20 @@ def test_a_room_is_one_though_crumbs_lie_beside_it():
     assert in_the_air(mesh, np.array([AIR, TX])).all()
 
 
+def test_a_room_of_solid_walls_has_its_air_between_them():
+    walls = []
+    for axis, side in np.ndindex(3, 2):
+        low, high = LOW - 0.2, HIGH + 0.2
+        low[axis], high[axis] = (HIGH[axis], HIGH[axis] + 0.2) if side else (LOW[axis] - 0.2, LOW[axis])
+        walls.append(box_mesh(low, high))
+    mesh = joined(box_mesh(CUPBOARD[0] - [0, 0, 0.05], CUPBOARD[1]), *walls)[0]
+    places = np.random.default_rng(3).uniform(LOW + 0.05, HIGH - 0.05, (200, 3))
+    held = ((places > CUPBOARD[0]) & (places < CUPBOARD[1])).all(axis=1)
+    clear = mesh.distance(places) > 0.01
+    for known in (TX, None):
+        np.testing.assert_array_equal(in_the_air(mesh, places, known)[clear], ~held[clear])
+
+
 def test_places_round_open_walls_and_lone_boxes_pass_and_in_a_box_do_not():
     rng = np.random.default_rng(4)
     for side in range(6):  # a room without it

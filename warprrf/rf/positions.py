@@ -395,12 +395,22 @@ def _rooms(mesh: Mesh) -> list[int]:
         rest = mesh.distinct_faces[
             rest[np.argsort(-mesh.areas[mesh.distinct_faces[rest]], kind="stable")][:_SAMPLES]
         ]
-        held = holds(mesh.closed_parts[k], mesh.triangles[rest].mean(axis=1))
-        left = mesh.areas[rest].sum()
-        if mesh.areas[rest[held]].sum() > 0.5 * left or left <= _CRUMBS * mesh.closed_parts[k].areas.sum():
+        places, area = mesh.triangles[rest].mean(axis=1), mesh.areas[rest]
+        held, left = area[holds(mesh.closed_parts[k], places)].sum(), area.sum()
+        crumbs = left <= _CRUMBS * mesh.closed_parts[k].areas.sum() and not _is_amid(
+            mesh.closed_parts[k], places
+        )
+        if held > 0.5 * left or crumbs:
             rooms.append(k)
             least = _WALL * volume[k]
     return rooms
+
+
+def _is_amid(part: Mesh, points: np.ndarray) -> bool:
+    """Whether most of ``points`` (N, 3) are in the hollow of a closed surface, as furniture amid walls of solids: all around
+    they see it."""
+    side = part.look_around(points, lattice(_DIRECTIONS))[1]
+    return bool(len(points) and np.mean((side != 0).mean(axis=1) > 1.0 - _LEAK) > 0.5)
 
 
 def _is_cavity(part: Mesh, solids: list[Mesh]) -> bool:
