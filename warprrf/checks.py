@@ -102,6 +102,23 @@ def check_count(name: str, value: object, least: int = 1, most: int = 2**31 - 1)
     return int(value)  # type: ignore[call-overload]
 
 
+def check_chosen(name: str, value: ArrayLike, count: int, least: int = 0) -> np.ndarray:
+    """Indices, ``least`` or more, of ``count`` rows that ``value`` names by whole numbers or a mask.
+
+    Raises:
+        ValueError: for anything else, naming the argument.
+    """
+    chosen = np.asarray(value)
+    if chosen.dtype == bool and chosen.shape == (count,):
+        chosen = np.flatnonzero(chosen)
+    whole = chosen.dtype.kind in "iu" or chosen.size == 0
+    if chosen.ndim != 1 or not whole or len(chosen) < least or (np.abs(chosen + 0.5) > count).any():
+        raise ValueError(
+            f"{name}: got {value!r}, expected whole numbers from 0 to {count - 1}, or a mask ({count},)"
+        )
+    return chosen.astype(np.int64)
+
+
 def check_seed(seed: object) -> int:
     """``seed`` as a whole number of at least 0.
 

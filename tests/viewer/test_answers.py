@@ -138,6 +138,8 @@ def test_things_are_sorted_by_what_they_are(tmp_path, field):
     field.save(tmp_path / "room" / "field.safetensors")
     both = Subject.of([tmp_path / "room"])
     assert both.field is not None and len(both.mesh.faces) == len(mesh.faces)
+    finer = Subject.of([field.on_grid((44, 88)), ds]).field  # compared with the truth on its grid
+    assert finer.shape == ds.path_gain.shape[1:]
 
 
 @pytest.mark.parametrize(

@@ -202,12 +202,11 @@ class Reconstruction:
         Example:
             >>> rec = rec.aligned({"a.jpg": (0, 0, 1.5), "b.jpg": (4, 0, 1.5), "c.jpg": (4, 3, 1.2)})  # doctest: +SKIP
         """
-        found = known_similarity(self.cameras, self.unposed, known_positions)
-        moved = self.transformed(scale=found.scale, rotation=found.rotation, shift=found.shift)
-        moved.scale_rms_m, moved.metric = found.rms_m, True
-        moved.guessed = tuple(
-            line for line in self.guessed if not line.startswith(("scale:", "up:"))
-        )  # known now
+        scale, rotation, shift, rms_m = known_similarity(self.cameras, self.unposed, known_positions)
+        moved = self.transformed(scale=scale, rotation=rotation, shift=shift)
+        moved.scale_rms_m, moved.metric = rms_m, True
+        # Known now:
+        moved.guessed = tuple(line for line in self.guessed if not line.startswith(("scale:", "up:")))
         return moved
 
     def save(self, folder: str | os.PathLike[str]) -> None:

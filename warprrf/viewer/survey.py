@@ -170,8 +170,7 @@ class Survey:
         if truth is None:
             return
         _check_carrier(field, truth)
-        shape = truth.path_gain.shape[1:]  # fitted ones are marked, so that nobody need be warned
-        found = evaluate(truth, lambda at: field.spectrum(at, shape=shape), progress=progress)
+        found = evaluate(truth, lambda at: field.spectrum(at), progress=progress)  # fitted ones are marked
         psnr, fitted = found["per_receiver"]["psnr_db"], field.was_fitted_on(truth)
         worst = np.argsort(psnr)[:WORST]
         labels = [f"{psnr[k]:.1f} dB{' (fitted)' if fitted[k] else ''}" for k in worst]

@@ -83,16 +83,6 @@ class SparseModel:
         )
 
 
-@dataclass(frozen=True)
-class Similarity:
-    """The points x at ``scale rotation x + shift``, and the rms distance at those that it was fitted to [m]."""
-
-    scale: float
-    rotation: np.ndarray
-    shift: np.ndarray
-    rms_m: float
-
-
 def align_to_known(sparse: SparseModel, known_positions: Mapping[str, ArrayLike]) -> SparseModel:
     """``sparse`` in metres and world axes, by the similarity that best meets surveyed camera positions.
 
@@ -106,15 +96,16 @@ def align_to_known(sparse: SparseModel, known_positions: Mapping[str, ArrayLike]
         ValueError: for fewer than three positions, positions on one line, a name that is no photo, or a surveyed
             photo that could not be posed.
     """
-    moved = known_similarity(sparse.cameras, sparse.unposed, known_positions)
-    found = transformed(sparse, moved.scale, moved.rotation, moved.shift)
-    return replace(found, metric=True, upright=True, scale_rms_m=moved.rms_m)
+    scale, rotation, shift, rms_m = known_similarity(sparse.cameras, sparse.unposed, known_positions)
+    moved = transformed(sparse, scale, rotation, shift)
+    return replace(moved, metric=True, upright=True, scale_rms_m=rms_m)
 
 
 def known_similarity(
     cameras: Mapping[str, Camera], unposed: Sequence[str], known_positions: Mapping[str, ArrayLike]
-) -> Similarity:
-    """What brings ``cameras``, by photo name, to surveyed positions; see :func:`align_to_known` for both and errors."""
+) -> tuple[float, np.ndarray, np.ndarray, float]:
+    """Scale, rotation and shift that bring ``cameras``, by photo name, to surveyed positions, and the rms distance that is
+    left there [m]; see :func:`align_to_known` for both and errors."""
     if len(known_positions) < 3:
         raise ValueError(
             f"known_positions: got {len(known_positions)}, expected at least 3 camera positions that are not on a line"
@@ -134,7 +125,7 @@ def known_similarity(
     except ValueError as error:
         raise ValueError(f"known_positions: {error}") from error
     rms = float(np.sqrt(((scale * source @ rotation.T + shift - target) ** 2).sum(axis=1).mean()))
-    return Similarity(scale, rotation, shift, rms)
+    return scale, rotation, shift, rms
 
 
 Scale = float | tuple[str, str, float]

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from warprrf.checks import check_array, check_number, check_positive, check_type, checked
+from warprrf.checks import check_array, check_chosen, check_number, check_positive, check_type, checked
 from warprrf.device import require
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Air
@@ -104,14 +104,7 @@ class ArraySpectra:
 
     def subset(self, rows: ArrayLike) -> ArraySpectra:
         """Some of the spectra, by index or mask."""
-        chosen = np.asarray(rows)
-        if chosen.ndim != 1 or not (
-            (chosen.dtype == bool and len(chosen) == len(self))
-            or (chosen.dtype.kind in "iu" and len(chosen) and (np.abs(chosen + 0.5) < len(self)).all())
-        ):
-            raise ValueError(
-                f"rows: got {rows!r}, expected whole numbers from 0 to {len(self) - 1}, or a mask ({len(self)},)"
-            )
+        chosen = check_chosen("rows", rows, len(self), 1)
         return replace(
             self,
             transmitters=self.transmitters[chosen],

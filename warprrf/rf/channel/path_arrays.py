@@ -216,22 +216,17 @@ class PathArrays:
         amplitude: np.ndarray,
         kind: NDArray[np.str_],
         frequency_hz: float,
-        jones: np.ndarray | None = None,
     ) -> Self:
         """Paths of one receiver from their interaction points ``(L, depth, 3)``, NaN past the last.
 
         Args:
             amplitude: Gain before exp(-j 2 pi f tau), complex, shape ``(L,)``; its modulus squared is the path gain.
-            jones: Polarised gain before exp(-j 2 pi f tau), complex, shape ``(L, 2, 2)``.
         """
         transmitter = check_array("transmitter", transmitter, (3,))
         receiver = check_array("receiver", receiver, (3,))
         vertices = check_array("vertices", vertices, (None, None, 3), finite=False)
-        count = len(vertices)
-        amplitude = check_array("amplitude", amplitude, (count,), complex)
-        if jones is not None:
-            jones = check_array("jones", jones, (count, 2, 2), complex)
-        return cls._from_points(transmitter, receiver, vertices, amplitude, kind, frequency_hz, jones)
+        amplitude = check_array("amplitude", amplitude, (len(vertices),), complex)
+        return cls._from_points(transmitter, receiver, vertices, amplitude, kind, frequency_hz)
 
     @classmethod
     def _from_points(
@@ -244,7 +239,7 @@ class PathArrays:
         frequency_hz: float,
         jones: np.ndarray | None = None,
     ) -> Self:
-        """:meth:`from_points` of arrays that fit each other."""
+        """:meth:`from_points` of arrays that fit each other; ``jones`` (L, 2, 2) is complex, before exp(-j 2 pi f tau) too."""
         count, depth = vertices.shape[:2]
         bounces = np.isfinite(vertices[..., 0]).sum(axis=1)
         points = points_along(transmitter, vertices, receiver)

@@ -36,7 +36,6 @@ class MirrorPaths:
         share: Part of the field that is not blocked, shape ``(L,)``, in (0, 1].
         length_m: Unfolded length, shape ``(L,)``.
         arrival: Unit direction from the receiver to what it sees last, shape ``(L, 3)``.
-        last_point: What it sees last [m]: the transmitter for line of sight, shape ``(L, 3)``.
         cosine: Cosine of incidence at each mirror, 0 past the last, shape ``(L, K)``.
         turn: Angle of its plane of incidence to the one before [rad], shape ``(L, K)``; see :mod:`.polarisation`.
     """
@@ -47,7 +46,6 @@ class MirrorPaths:
     share: np.ndarray
     length_m: np.ndarray
     arrival: np.ndarray
-    last_point: np.ndarray
     cosine: np.ndarray
     turn: np.ndarray
 
@@ -326,7 +324,6 @@ def _described(
         share=share,
         length_m=lengths.sum(axis=1),
         arrival=-along[:, -1],
-        last_point=stops[:, -2],
         cosine=np.pad(np.abs((along[:, :-1] * normal).sum(axis=2)), rest),
         turn=np.pad(turns(stops, normal), rest),
     )

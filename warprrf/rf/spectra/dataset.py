@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_count, check_positive, check_seed, checked
+from warprrf.checks import check_array, check_chosen, check_count, check_positive, check_seed, checked
 from warprrf.device import DeviceLike
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
@@ -350,15 +350,7 @@ class SpectrumDataset:
 
     def subset(self, indices: ArrayLike) -> SpectrumDataset:
         """The receivers named by ``indices`` (whole numbers or a mask); floor and range stay those of the whole set."""
-        chosen = np.asarray(indices)
-        if chosen.dtype == bool and chosen.shape == (len(self),):
-            chosen = np.flatnonzero(chosen)
-        whole = chosen.dtype.kind in "iu" or chosen.size == 0
-        if chosen.ndim != 1 or not whole or (np.abs(chosen + 0.5) > len(self)).any():
-            raise ValueError(
-                f"indices: got {indices!r}, expected whole numbers from 0 to {len(self) - 1}, or a mask ({len(self)},)"
-            )
-        chosen = chosen.astype(np.int64)
+        chosen = check_chosen("indices", indices, len(self))
         per_receiver = ("receivers", "path_gain", "delay_s", "aod", "role", "line_of_sight")
         return replace(self, **{name: getattr(self, name)[chosen] for name in per_receiver})
 

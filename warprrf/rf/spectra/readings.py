@@ -23,6 +23,7 @@ from scipy.special import digamma, polygamma
 
 from warprrf.checks import (
     check_array,
+    check_chosen,
     check_count,
     check_number,
     check_positive,
@@ -201,15 +202,7 @@ class Readings:
 
     def subset(self, rows: ArrayLike) -> Readings:
         """Some of the readings, by index or mask."""
-        chosen = np.asarray(rows)
-        if chosen.ndim != 1 or not (
-            (chosen.dtype == bool and len(chosen) == len(self))
-            or (chosen.dtype.kind in "iu" and len(chosen) and (np.abs(chosen + 0.5) < len(self)).all())
-        ):
-            raise ValueError(
-                f"rows: got {rows!r}, expected whole numbers from 0 to {len(self) - 1}, or a mask ({len(self)},)"
-            )
-        index = np.arange(len(self))[chosen]
+        index = check_chosen("rows", rows, len(self), 1)
         own = (
             "transmitters",
             "receivers",
