@@ -70,13 +70,14 @@ def engine(scene: RadioScene, gas: object) -> ExactEngine:
 
 def test_line_of_sight_is_friis_times_gas_and_mirrors_have_their_images_length(scene: RadioScene) -> None:
     distance = np.linalg.norm(SEEN - TX)
-    totals, without = engine(scene, True).receive(SEEN).totals, engine(scene, False)
-    assert totals["los"] == pytest.approx(friis(SEEN) * passed(distance), rel=1e-12)
+    with_air, without = engine(scene, True), engine(scene, False)
+    direct = with_air.tracer.trace(SEEN, 0).with_gas(with_air.air).power.sum()
+    assert direct == pytest.approx(friis(SEEN) * passed(distance), rel=1e-12)
     mirrors = without.tracer.trace(SEEN, 1)
     mirrors = mirrors.select(mirrors.kind == "mirror")
     assert len(mirrors.gain) >= 6
-    expected = (mirrors.power * passed(mirrors.length_m)).sum()
-    assert totals["mirror"] == pytest.approx(expected, rel=1e-12)
+    expected = direct + (mirrors.power * passed(mirrors.length_m)).sum() + with_air.diffuse(SEEN).power.sum()
+    assert with_air.receive(SEEN).path_gain.sum() == pytest.approx(expected, rel=1e-9)
 
 
 def test_every_scattered_path_has_its_own_length(scene: RadioScene) -> None:

@@ -59,21 +59,19 @@ REVISION = 3
 
 @dataclass(frozen=True)
 class ReceivedPaths:
-    """What one receiver gets, as pixels, and as totals before the beam.
+    """What one receiver gets, as pixels.
 
     Attributes:
         path_gain: Path gain per pixel [linear], shape ``(H, W)``, float64.
         delay_s: Delay of the pixel's strongest path [s], shape ``(H, W)``; NaN where empty.
         aod: Its zenith and azimuth of departure [rad], shape ``(H, W, 2)``; NaN where empty.
         line_of_sight: Whether the transmitter is seen.
-        totals: Path gain by kind: "los", "mirror", "diffuse" [linear].
     """
 
     path_gain: np.ndarray
     delay_s: np.ndarray
     aod: np.ndarray
     line_of_sight: bool
-    totals: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -215,17 +213,7 @@ class ExactEngine:
             delay_s=spread.of_strongest(np.concatenate([specular.tau, tau])),
             aod=spread.of_strongest(np.concatenate([departure, aod])),
             line_of_sight=bool((specular.kind == "los").any()),
-            totals=power_by_kind(specular, scattered.power),
         )
-
-
-def power_by_kind(specular: Paths, diffuse: np.ndarray) -> dict[str, float]:
-    """Total path gain of each kind of path [linear]."""
-    return {
-        "los": float(specular.power[specular.kind == "los"].sum()),
-        "mirror": float(specular.power[specular.kind == "mirror"].sum()),
-        "diffuse": float(diffuse.sum()),
-    }
 
 
 @dataclass(frozen=True)

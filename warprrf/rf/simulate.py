@@ -259,8 +259,6 @@ def _kept(
             "delay_s": found.delay_s,
             "aod": found.aod.astype(np.float32),
             "line_of_sight": np.array(found.line_of_sight),
-            "kinds": np.array(list(found.totals)),
-            "totals": np.array(list(found.totals.values())),
         }
     with Steps(workspace, shared=True) as steps:
         name = digest(inputs, point)[:24]
@@ -273,5 +271,4 @@ def _kept(
         delay_s=held["delay_s"],
         aod=held["aod"],
         line_of_sight=bool(held["line_of_sight"]),
-        totals=dict(zip(held["kinds"].tolist(), held["totals"].tolist(), strict=True)),
     )

@@ -74,10 +74,10 @@ def test_spectra_have_the_same_shape_and_the_same_strongest_pixel(engines):
     ours, theirs = (engine.receive(SEES) for engine in engines)
     pixel = pixel_of(TX - SEES, SHAPE)
     distance = np.linalg.norm(TX - SEES)
+    assert theirs.path_gain.sum() == pytest.approx(engines[1].solve(SEES)["power"].sum(), rel=1e-9)
     for got in (ours, theirs):
         assert np.unravel_index(got.path_gain.argmax(), SHAPE) == pixel
         assert got.delay_s[pixel] == pytest.approx(distance / SPEED_OF_LIGHT, rel=1e-6)
-        assert got.path_gain.sum() == pytest.approx(sum(got.totals.values()), rel=1e-9)
     assert ours.line_of_sight and theirs.line_of_sight
 
 
@@ -110,7 +110,7 @@ def test_a_place_that_no_path_reaches_has_an_empty_spectrum(scene):
     engine = sionna(scene, transmitter=TX, frequency_hz=F, shape=SHAPE, sampling=Sampling(depth=0))
     found = engine.receive(BLOCKED)
     assert not found.path_gain.any() and not found.line_of_sight
-    assert np.isnan(found.delay_s).all() and sum(found.totals.values()) == 0.0
+    assert np.isnan(found.delay_s).all()
     assert engine.receive(SEES).line_of_sight
 
 

@@ -130,9 +130,10 @@ def structure_from_motion(
 
     def model(attempt: Attempt) -> dict[str, Any]:
         if known is None:
-            return {"other_models": _map(colmap, folder, named, (lens, seed), attempt)}
-        _keep_known(colmap, folder, named, (known, match, seed), attempt)
-        return {"other_models": []}
+            _map(colmap, folder, named, (lens, seed), attempt)
+        else:
+            _keep_known(colmap, folder, named, (known, match, seed), attempt)
+        return {}
 
     folder = Path(workspace).absolute() / "sfm"
     kept = folder / "photos"
@@ -152,7 +153,7 @@ def structure_from_motion(
             inputs = [steps.key("matches"), lens, seed]
         if known is not None:
             inputs += [list(named.values()), *_content(known)]
-        found = steps.run("model", model, version=VERSIONS["model"], inputs=inputs, outputs=["model"])
+        steps.run("model", model, version=VERSIONS["model"], inputs=inputs, outputs=["model"])
         result = _straightened(colmap, steps, named, max_pixels)
         unposed = [name for name in named if name not in result.cameras]
         if poses is not None:
@@ -160,9 +161,7 @@ def structure_from_motion(
             causes = dict.fromkeys(unposed, "the poses given have none of it")
         else:
             causes = _causes(colmap, folder / "matches.db", result) if unposed else {}
-        return replace(
-            result, unposed=tuple(unposed), causes=causes, other_models=tuple(found["other_models"])
-        )
+        return replace(result, unposed=tuple(unposed), causes=causes)
 
 
 def _straightened(
@@ -438,8 +437,8 @@ def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[
 
 def _map(
     colmap: ModuleType, folder: Path, named: Mapping[str, Path], settings: tuple[str, int], attempt: Attempt
-) -> list[int]:
-    """Poses and points from the matches, into the folder ``model``; returns how many photos smaller models hold."""
+) -> None:
+    """Poses and points from the matches, into the folder ``model``: the largest of the models found."""
     lens, seed = settings
     working = _copied(folder / "matches.db", attempt.folder / "matches.db")
     images, report = _root(named), attempt.progress
@@ -479,14 +478,13 @@ def _map(
             f"({(inliers >= options.min_num_matches).sum()} pairs of photos match); expected photos of one textured "
             f"place that overlap by half or more: {some(list(named))}"
         )
-    largest, *others = sorted(models, key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
+    largest = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()))
     whole = _fresh(attempt.folder / "model")
     largest.write_binary(str(whole))
     choose_lens(colmap, whole, lens).write_binary(str(whole))
     shutil.rmtree(folder / "model", ignore_errors=True)
     os.replace(whole, folder / "model")
     report("mapping", len(named), len(named))
-    return [m.num_reg_images() for m in others]
 
 
 def _fresh(folder: Path) -> Path:

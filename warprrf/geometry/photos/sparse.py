@@ -36,7 +36,6 @@ class SparseModel:
         track_camera: photos (position in ``list(cameras)``) that see the points, shape ``(sum of track lengths,)``.
         unposed: names of the photos that no pose was found for, or that lie in a smaller, separate model.
         causes: why each of these has no pose, by name, where that is known.
-        other_models: number of photos in each smaller model that was left out.
         metric: whether lengths are metres.
         upright: whether z is up.
         scale_rms_m: rms distance between surveyed and reconstructed camera positions after alignment [m], else NaN.
@@ -54,7 +53,6 @@ class SparseModel:
     track_camera: np.ndarray
     unposed: tuple[str, ...] = ()
     causes: Mapping[str, str] = field(default_factory=dict)
-    other_models: tuple[int, ...] = ()
     metric: bool = False
     upright: bool = False
     scale_rms_m: float = float("nan")

@@ -203,14 +203,11 @@ class SionnaEngine:
     def receive(self, receiver: ArrayLike) -> ReceivedPaths:
         """The spectrum of one receiver (3,)."""
         found = self.solve(receiver)
-        power = found["power"]
-        spread = spread_paths(found["arrival"], power, self.shape, self.beam_sigma_rad, device=self.device)
-        direct, diffuse = found["bounces"] == 0, found["diffuse"]
-        kinds = {"los": direct, "mirror": ~direct & ~diffuse, "diffuse": diffuse}
+        beam = self.shape, self.beam_sigma_rad
+        spread = spread_paths(found["arrival"], found["power"], *beam, device=self.device)
         return ReceivedPaths(
             path_gain=spread.path_gain,
             delay_s=spread.of_strongest(found["tau"]),
             aod=spread.of_strongest(found["aod"]),
-            line_of_sight=bool(direct.any()),
-            totals={kind: float(power[own].sum()) for kind, own in kinds.items()},
+            line_of_sight=bool((found["bounces"] == 0).any()),
         )
