@@ -116,6 +116,11 @@ class PlanarArray:
         local[:, 2] = (0.5 * (self.rows - 1) - row) * down
         return local @ self.rotation.T
 
+    def aperture_m(self, wavelength_m: float) -> float:
+        """Largest distance between two elements [m]."""
+        p = self.positions(wavelength_m)
+        return float(np.linalg.norm(p[-1] - p[0])) if len(p) > 1 else 0.0
+
     def gain(self, directions: ArrayLike) -> np.ndarray:
         """Power gain of an element [linear] towards world ``directions`` (..., 3), shape ``(...)``."""
         local = check_array("directions", directions, (..., 3), finite=False) @ self.rotation
