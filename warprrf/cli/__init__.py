@@ -12,7 +12,6 @@ import inspect
 import re
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import warprrf as wr
 from warprrf.cli.inputs import Add, Parser
@@ -113,7 +112,7 @@ def make_parser(
 
     A command is explained by the docstring of the function that runs it, unless a line and a text are given.
     """
-    common = argparse.ArgumentParser(add_help=False)
+    common = Parser(add_help=False)
     common.add_argument("--seed", type=int, default=0, help="every random choice follows from it (default 0)")
     common.add_argument("--device", default=None, help="cpu or cuda:0 (default: the GPU where there is one)")
     common.add_argument("--quiet", action="store_true", help="no progress")
@@ -136,17 +135,15 @@ def make_parser(
         run: Callable[..., None],
         line: str | None = None,
         text: str | None = None,
-        to: Any = commands,
-        options: bool = True,
     ) -> argparse.ArgumentParser:
         summary, _, explained = inspect.cleandoc(run.__doc__ or "").partition("\n\n")
         line = summary.removesuffix(".") if line is None else line
-        one: argparse.ArgumentParser = to.add_parser(
+        one: argparse.ArgumentParser = commands.add_parser(
             name,
             help=line,
             description=f"{line[0].upper()}{line[1:]}.",
             epilog=explained if text is None else text,
-            parents=[common] if options else [],
+            parents=[common],
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         one.set_defaults(command=run)

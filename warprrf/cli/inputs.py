@@ -285,7 +285,7 @@ def _read_places(values: Sequence[str], name: str, what: str, count: int) -> np.
         except ValueError:
             rows.append([])
         if len(rows[-1]) != count:
-            raise ValueError(f"{name}: got {word!r}, expected {what}, or one CSV/NPY file")
+            raise ValueError(f"{name}: got {word!r}, expected numbers {what}, or one CSV/NPY file")
     return np.array(rows)
 
 

@@ -1,5 +1,5 @@
 """Stage 2: spectra, propagation, materials, radio fields, paths and the lookups they are measured against.
 
-``bistatic`` and ``harmonic`` are the two families of fields, ``channel`` is what is computed from paths, ``coverage``
-what many receivers get of a field, ``baselines`` the learned methods that ours is compared with.
+``fields`` are the two families of radio fields, ``channel`` is what is computed from paths, ``maps`` what many receivers get
+of a field, ``interop`` other programs' scenes and paths, ``relevance`` what each effect is worth.
 """

@@ -2,8 +2,8 @@
 
 In the order in which :func:`warprrf.reconstruct` runs them:
 
-- ``photo_files``, ``sfm``: image files to lenses (``lens_choice``), camera poses, sparse points and undistorted photos
-  (``undistort``); ``sparse`` brings them to metres.
+- ``photo_files``, ``sfm``: image files to lenses, camera poses, sparse points and undistorted photos (``undistort``);
+  ``sparse`` brings them to metres.
 - ``initialise``: the points cleaned (``points``), planes found among them (``planes``), the cells of each plane that
   hold a surface (``cells``), corrected and completed by comparing photos (``sweep``), joined by surfaces without
   features that edges show (``edges``, ``plain``), covered with Gaussians (``initial_gaussians``).

@@ -71,15 +71,13 @@ def is_scan(mesh: Mesh) -> bool:
     return vertex_noise(mesh, pairs, mesh.rounding_m) > SCAN_NOISE_M
 
 
-def scanned_patches(mesh: Mesh, config: SurfaceConfig | None = None) -> PlanarPatches:
+def scanned_patches(mesh: Mesh) -> PlanarPatches:
     """Planar patches of a scan, largest first, on a mesh without its noise: smoothed, snapped to planes, made coarse.
 
     Args:
         mesh: noisy, with holes, of any number of faces.
-        config: least size of a patch, and its distances.
     """
-    config = config or SurfaceConfig()
-    patches = simplified(flattened(find_patches(_smoothed(mesh), config=config)))
+    patches = simplified(flattened(find_patches(_smoothed(mesh), config=SurfaceConfig())))
     return replace(largest_first(patches, MIN_PATCH_M2), two_sided=True)
 
 

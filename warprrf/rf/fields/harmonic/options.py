@@ -124,7 +124,6 @@ class FieldOptions:
         unknown = sorted(set(settings) - set(known))
         if unknown:
             raise TypeError(f"fit: got {', '.join(unknown)}, expected some of {', '.join(known)}")
-        settings = {k: v for k, v in settings.items() if k != "rates" or v is not None}
         return replace(options or cls(), **settings)
 
 
