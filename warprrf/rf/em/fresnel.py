@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import LARGEST, check_alike, check_array, check_count, checked
-from warprrf.kernels.radio.bounce import MOMENTS
+from warprrf.kernels.radio.records import MOMENTS
 from warprrf.rf.em.materials import NARROWEST_LOBE, Material, check_known
 
 LAMBERTIAN = 0

@@ -72,9 +72,9 @@ class BeamOperator:
         out[size < 50.0 * np.finfo(real).eps * size.max(axis=(0, 1), initial=0.0)] = 0.0
         return out.reshape(images.shape).astype(images.dtype, copy=False)
 
-    def at(self, pixels: np.ndarray, images: np.ndarray) -> np.ndarray:
-        """``images`` (H W, C) spread, at ``pixels`` (N,) alone, in single precision, shape ``(N, C)``."""
-        return self._matrix[pixels] @ images.astype(np.float32, copy=False)
+    def at(self, pixels: np.ndarray) -> csr_matrix:
+        """What the map gives at ``pixels`` (N,) alone, in single precision, shape ``(N, H W)``."""
+        return self._matrix[pixels]
 
 
 _OPERATORS = Cache(8)

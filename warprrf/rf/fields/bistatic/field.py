@@ -3,13 +3,13 @@
 A pixel holds the power of every path of a scattering surface, spread by the receiver beam:
 
 - line of sight (Friis) and mirror reflections by the image method, blocking softened;
-- diffuse scattering of surfaces that the transmitter illuminates, a non-negative mix of normalised lobes
-  (:mod:`warprrf.rf.fields.bistatic.scattering`), which changes when the ends are swapped unless fitted as ``reciprocal``;
-- what those illuminate in turn (:mod:`warprrf.rf.fields.bistatic.elements`), and an indirect radiance of each group.
+- diffuse scattering of surfaces that the transmitter illuminates, directly or by a mirror, a non-negative mix of normalised
+  lobes, which changes when the ends are swapped unless fitted as ``reciprocal``; it may be seen in a mirror;
+- what those illuminate in turn (:mod:`warprrf.rf.fields.bistatic.interreflection`).
 
 Where the data hold absorption by the air, every leg of a path has its own.
 
-Parameters belong to groups of surfaces that look alike and are few, so ten spectra suffice; because each term is a
+Parameters belong to groups of surfaces that look alike and are few, so ten spectra suffice; because each interaction is a
 function of both directions and of the path's lengths, the field holds for a transmitter that it never saw.
 """
 
@@ -42,19 +42,31 @@ from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.materials import assumed_permittivity
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import Data, Measured, RadioField
-from warprrf.rf.fields.bistatic import files, uncertainty
+from warprrf.rf.fields.bistatic import files
+from warprrf.rf.fields.bistatic.fit import SUB_PIXELS, FitOptions, TrainingViews, fit
 from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
 from warprrf.rf.fields.bistatic.materials import ARRAYS as PARAMETER_ARRAYS
-from warprrf.rf.fields.bistatic.materials import MOST_NEPERS, Layout, Materials, Parameters, Terms
-from warprrf.rf.fields.bistatic.measured import ArrayImage, read
-from warprrf.rf.fields.bistatic.observations import Frame, as_list, places_of, transmitters_of
+from warprrf.rf.fields.bistatic.materials import MOST_NEPERS, SETS, Effects, Layout, Model, Parameters
+from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, read
+from warprrf.rf.fields.bistatic.observations import (
+    NEPER,
+    Frame,
+    Observation,
+    Place,
+    Target,
+    as_list,
+    frame_of,
+    kinds_of,
+    places_of,
+)
 from warprrf.rf.fields.bistatic.paths import paths_of, strongest
-from warprrf.rf.fields.bistatic.render import Rendered, images, path_powers, render, sent_radiance
+from warprrf.rf.fields.bistatic.records import Evaluation
+from warprrf.rf.fields.bistatic.render import PathGains, evaluation, images, path_gains
 from warprrf.rf.fields.bistatic.suggest import SHAPE as SUGGEST_SHAPE
 from warprrf.rf.fields.bistatic.suggest import Pointings, Sensitivity, Unknowns, suggest
 from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.training import FitOptions, TrainingViews, train
-from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
+from warprrf.rf.fields.bistatic.tracer import Tracer, View
+from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
 from warprrf.rf.maps.links import LinkOptions, Links
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.antenna import Pattern
@@ -75,12 +87,13 @@ class BistaticField(RadioField):
         frequency_hz: carrier [Hz].
         shape: rows and columns of its spectra.
         floor, range_db, beam_sigma_rad: of the data set it was fitted to.
-        terms: what it models.
+        effects: what it models.
         parameters: of the groups; those of one material are alike.
         material: of each group, shape ``(G,)``.
         residual: ln gain of each surface cell over its group, for single bounces and for light that it sends on, shape
-            ``(2, X)``; see :mod:`warprrf.rf.fields.bistatic.residuals`.
+            ``(2, X)``; see :mod:`warprrf.rf.fields.bistatic.residual`.
         errors: how wrong it is; None if it was fitted to fewer receivers than that takes.
+        sub_pixels: square root of the rays per pixel.
         air: absorption of every path: that of the data set it was fitted to; None for none.
         fitted_on: receivers that it was fitted to [m], shape ``(R, 3)``; None where it is not known.
         fitted_under: transmitter of each of those [m], shape ``(R, 3)``; None for its own.
@@ -97,21 +110,23 @@ class BistaticField(RadioField):
     floor: float
     range_db: tuple[float, float]
     beam_sigma_rad: float
-    terms: Terms
+    effects: Effects
     parameters: Parameters = field(repr=False)
     material: np.ndarray = field(repr=False)
     residual: np.ndarray = field(repr=False)
-    errors: uncertainty.ErrorModel | None = field(default=None, repr=False)
+    errors: ErrorModel | None = field(default=None, repr=False)
+    sub_pixels: int = SUB_PIXELS
     air: Air | None = None
     fitted_on: np.ndarray | None = field(default=None, repr=False)
     fitted_under: np.ndarray | None = field(default=None, repr=False)
     report: dict[str, Any] = field(default_factory=dict, repr=False)
     device: DeviceLike = field(default=None, repr=False)
-    _sent: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
+    _evaluated: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        sizes = {"G": self.surface.groups, "L": len(self.terms.lobes), "X": self.surface.cells}
+        sizes = {"G": self.surface.groups, "L": len(self.parameters.lobes), "X": self.surface.cells}
+        check_count("sub_pixels", self.sub_pixels, 1, 16)
         check_arrays(vars(self.parameters), PARAMETER_ARRAYS, **sizes)
         check_arrays(vars(self), _ARRAYS, **sizes)
         materials = int(self.material.max()) + 1
@@ -119,17 +134,12 @@ class BistaticField(RadioField):
             raise ValueError(
                 f"material: got {np.unique(self.material)}, expected all of 0 to {materials - 1}"
             )
-
-        if self.errors is not None:  # terms may have changed since they were learned
-            known = [
-                Layout(materials, sizes["L"], indirect=indirect, gain=gain).size
-                for indirect in (False, True)
-                for gain in (False, True)
-            ]
-            if len(self.errors.covariance) not in known:
-                raise ValueError(
-                    f"errors: got a covariance of {len(self.errors.covariance)} parameters, expected one of {known}"
-                )
+        known = Layout(materials, sizes["L"]).size
+        if self.errors is not None and not known <= len(self.errors.covariance) <= known + 2:
+            raise ValueError(
+                f"errors: got a covariance of {len(self.errors.covariance)} parameters, expected {known}, and one each for "
+                "a common gain and a power of the carrier"
+            )
 
     @property
     def model(self) -> str:
@@ -147,9 +157,9 @@ class BistaticField(RadioField):
         return SPEED_OF_LIGHT / self.frequency_hz
 
     @property
-    def materials(self) -> Materials:
+    def state(self) -> Model:
         """All that a spectrum depends on besides the geometry."""
-        return Materials(self.terms, self.parameters, self.residual, self.transmitter)
+        return Model(self.effects, self.parameters, self.residual, self.transmitter)
 
     @classmethod
     def fit(  # type: ignore[override]
@@ -159,7 +169,7 @@ class BistaticField(RadioField):
         model: str = "bistatic",
         *,
         options: FitOptions | None = None,
-        transport: TrainingViews | None = None,
+        views: TrainingViews | None = None,
         client: Any = None,
         device: DeviceLike = None,
         progress: Progress | None = None,
@@ -173,32 +183,33 @@ class BistaticField(RadioField):
                 Without any receiver the field is what is known beforehand.
             model: ``"bistatic"``.
             options: what is modelled and how it is fitted.
-            transport: what :func:`warprrf.rf.fields.bistatic.training.trace` found for exactly these receivers.
+            views: what :func:`warprrf.rf.fields.bistatic.fit.trace` found for exactly these receivers.
             client: a ``dask.distributed.Client`` whose workers cast the rays; this process by default.
             device: where rays are cast.
             progress: called with the stages ``"patches"``, ``"mirrors"``, ``"transport"`` and ``"fit"``.
             settings: attributes of :class:`warprrf.FitOptions`, in place of those of
-                ``options``: ``quick=True``, ``mirror_order=2``, ``relevance=found``, ...
+                ``options``: ``quick=True``, ``effects="room"``, ``relevance=found``, ...
 
         Raises:
             ValueError: for options out of range, receivers on a surface or outside the scene, spectra that are all
-                empty, or a ``transport`` of others.
+                empty, or ``views`` of others.
             TypeError: for a geometry without a mesh, or an unknown option.
         """
         chosen, data = FitOptions.of(options, settings), as_list(ds)
+        if model != "bistatic":
+            raise ValueError(f"model: got {model!r}, expected 'bistatic'")
         if not any(map(len, data)):
             return cls._unmeasured(geometry, data, chosen, device)
-        found = train(
-            geometry, data, chosen, transport=transport, client=client, device=device, progress=progress
-        )
-        frame = Frame.of(data)
-        ends = np.concatenate([np.column_stack([transmitters_of(one), one.receivers]) for one in data])
+        found = fit(geometry, data, chosen, views=views, client=client, device=device, progress=progress)
+        frame = frame_of(data)
+        ends = np.concatenate([np.column_stack(kind.ends()) for kind in kinds_of(data)])
         ends = ends[np.sort(np.unique(ends, axis=0, return_index=True)[1])]
         receivers = ends[(ends[:, :3] == frame.transmitter).all(axis=1), 3:]
         fitted = replace(
-            cls.prior(found.surface, frame, terms=found.materials.terms, device=device),
-            parameters=found.materials.parameters, residual=found.materials.residual, material=found.material,
-            errors=found.errors, report=found.report, fitted_on=ends[:, 3:], fitted_under=ends[:, :3],
+            cls.prior(found.surface, frame, effects=found.model.effects, sub_pixels=found.sub_pixels, device=device),
+            parameters=replace(found.model.parameters, log_gains=np.zeros(0)), residual=found.model.residual,
+            material=found.material, errors=found.errors, report=found.report, fitted_on=ends[:, 3:],
+            fitted_under=ends[:, :3],
         )  # fmt: skip
         if any(isinstance(one, SpectrumDataset) for one in data):
             return fitted
@@ -214,9 +225,13 @@ class BistaticField(RadioField):
         cls, geometry: GeometryLike, data: list[Measured], o: FitOptions, device: DeviceLike
     ) -> BistaticField:
         """What a fit to no measurement gives: permittivities of ITU-R P.2040, by the names of materials where it has
-        them, terms left free as for few receivers."""
-        frame = Frame.of(data)
-        prior = cls.prior(geometry, frame, terms=o.unmeasured(frame.frequency_hz), device=device)
+        them, and effects that rooms have where they are left open."""
+        frame = frame_of(data)
+        effects = replace(o.candidates(frame.frequency_hz)[:2][-1], residual=False)
+        lobes = o.exponents(frame.frequency_hz)
+        prior = cls.prior(
+            geometry, frame, effects=effects, lobes=lobes, reciprocal=o.reciprocal, sub_pixels=o.rays, device=device
+        )
         places_of(data, prior.mesh, device)
         known = [assumed_permittivity(name, prior.frequency_hz) for name in prior.surface.group_names]
         parameters = replace(prior.parameters, log_excess=np.log(np.array(known) - 1.0))
@@ -229,7 +244,10 @@ class BistaticField(RadioField):
         geometry: GeometryLike,
         ds: SpectrumDataset | Frame,
         *,
-        terms: Terms | None = None,
+        effects: Effects | None = None,
+        lobes: tuple[int, ...] | None = None,
+        reciprocal: bool = False,
+        sub_pixels: int = SUB_PIXELS,
         device: DeviceLike = None,
     ) -> BistaticField:
         """The field before any measurement: every surface is taken for :meth:`Parameters.prior`.
@@ -239,13 +257,14 @@ class BistaticField(RadioField):
         Args:
             geometry: Reconstruction, Scene, Mesh or Surface.
             ds: data set that it is asked to predict.
-            terms: what is modelled; single bounces by default.
+            effects: what is modelled; single bounces by default.
+            lobes, reciprocal, sub_pixels: as of :class:`FitOptions`.
             device: where it computes.
 
         Raises:
             TypeError: for a geometry without a mesh.
         """
-        modelled, surface = terms or Terms(), Surface.of(geometry)
+        surface = Surface.of(geometry)
         rows, columns = ds.shape if isinstance(ds, Frame) else ds.path_gain.shape[1:]
         return cls(
             surface=surface,
@@ -255,10 +274,11 @@ class BistaticField(RadioField):
             floor=float(ds.floor),
             range_db=(float(ds.range_db[0]), float(ds.range_db[1])),
             beam_sigma_rad=float(ds.beam_sigma_rad),
-            terms=modelled,
-            parameters=Parameters.prior(surface.groups, len(modelled.lobes)),
+            effects=replace(SETS["single"], residual=False) if effects is None else effects,
+            parameters=Parameters.prior(surface.groups, *([] if lobes is None else [lobes]), reciprocal=reciprocal),
             material=surface.material,
             residual=np.zeros((2, surface.cells)),
+            sub_pixels=sub_pixels,
             air=getattr(ds, "air", None),
             fitted_on=np.zeros((0, 3)),
             device=device,
@@ -303,7 +323,7 @@ class BistaticField(RadioField):
         *,
         shape: tuple[int, int] | None = None,
         uncertainty: bool = False,
-        view: ReceiverView | None = None,
+        view: View | None = None,
     ) -> Spectrum:
         """The spatial spectrum of every receiver; see :meth:`RadioField.spectrum`.
 
@@ -326,19 +346,20 @@ class BistaticField(RadioField):
     def _trace_spectrum(
         self, receiver: np.ndarray, transmitter: np.ndarray, *, uncertainty: bool = False
     ) -> Spectrum:
-        return self._seen(self.transport(transmitter).view(receiver, self.terms), uncertainty)
+        return self._seen(self._view(receiver, transmitter), uncertainty)
 
-    def _seen(self, view: ReceiverView, uncertainty: bool) -> Spectrum:
-        found = self.render(view)
-        delay, aod = strongest(view, found, self.beam_sigma_rad)
+    def _seen(self, view: View, uncertainty: bool) -> Spectrum:
+        gains = self.path_gains(view)
+        image = images(gains, self._beam)[0]
+        delay, aod = strongest(gains, image, self.beam_sigma_rad)
         spectrum = Spectrum(
-            path_gain=found.image.astype(np.float32),
+            path_gain=image.astype(np.float32),
             delay_s=delay,
             aod=aod,
             floor=self.floor,
             range_db=self.range_db,
         )
-        return replace(spectrum, std_db=self._std_db(view, found)) if uncertainty else spectrum
+        return replace(spectrum, std_db=self._std_db(view, image)) if uncertainty else spectrum
 
     def paths(
         self,
@@ -349,7 +370,7 @@ class BistaticField(RadioField):
         store: str | os.PathLike[str] | None = None,
         client: Any = None,
         progress: Progress | None = None,
-        view: ReceiverView | None = None,
+        view: View | None = None,
     ) -> Paths:
         """Propagation paths; see :meth:`RadioField.paths`.
 
@@ -360,24 +381,24 @@ class BistaticField(RadioField):
             return super().paths(
                 receivers, transmitter, max_paths, store=store, client=client, progress=progress
             )
-        return paths_of(view, self.render(view), self.floor, self.air, max_paths)
+        return self._paths_of(view, max_paths)
 
     def _trace_paths(self, receiver: np.ndarray, transmitter: np.ndarray, max_paths: int | None) -> Paths:
-        view = self.transport(transmitter).view(receiver, self.terms)
-        return paths_of(view, self.render(view), self.floor, self.air, max_paths)
+        return self._paths_of(self._view(receiver, transmitter), max_paths)
+
+    def _paths_of(self, view: View, max_paths: int | None) -> Paths:
+        gains = self.path_gains(view)
+        return paths_of(gains, images(gains, self._beam)[0], self.floor, self.air, max_paths)
 
     def _trace_spectra(self, receivers: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
         """Several receivers are traced at once."""
-        transport = self.transport(transmitter)
-        sent, found = self.sent_radiance(transport), np.empty((len(receivers), *self.shape), np.float32)
-        batch = max(1, RAYS_AT_A_TIME // len(transport.grid.directions))
-        paths = transport.paths(
-            receivers, self.terms.mirror_order
-        )  # chains of mirrors are searched once for all
+        tracer, found = self.tracer(transmitter), np.empty((len(receivers), *self.shape), np.float32)
+        batch = max(1, RAYS_AT_A_TIME // len(tracer.grid.directions))
+        paths = tracer.paths(receivers, self.effects.mirrors)  # chains of mirrors are searched once for all
         for first in range(0, len(receivers), batch):
             some = np.arange(first, min(first + batch, len(receivers)))
-            view = transport.view(receivers[some], self.terms, paths=paths.of(some))
-            found[some] = images(view, path_powers(view, self.materials, sent), self._beam)
+            view = tracer.view(receivers[some], self.effects.mirrors, paths=paths.of(some))
+            found[some] = images(self.path_gains(view), self._beam)
         return found
 
     def array_spectrum(
@@ -408,13 +429,12 @@ class BistaticField(RadioField):
         std = check_number("length_std_m", length_std_m, 0.0)
         ends, found = self.check_positions(receivers, transmitter), []
         for receiver, source in zip(ends.receivers, ends.transmitters, strict=True):
-            view = self.transport(source).view(receiver, self.terms)
+            view = self._view(receiver, source)
             image = ArrayImage.of(view, array, steered.reshape(-1, 3), std)
-            powers = path_powers(view, self.materials, self.sent_radiance(view.transport))
-            found.append(np.maximum(read(view, image, powers), 0.0).reshape(steered.shape[:-1]))
+            found.append(np.maximum(read(self.path_gains(view), image), 0.0).reshape(steered.shape[:-1]))
         return np.asarray(ends.shaped(np.stack(found)))
 
-    def view(self, receivers: ArrayLike, transmitter: ArrayLike | None = None) -> ReceiverView:
+    def view(self, receivers: ArrayLike, transmitter: ArrayLike | None = None) -> View:
         """What one receiver (3,) sees of the geometry under one transmitter (3,), whatever the materials: the costly part
         of a spectrum.
 
@@ -426,28 +446,27 @@ class BistaticField(RadioField):
             raise ValueError(
                 f"receivers: got {len(ends.receivers)} links, expected one place (3,) and transmitter (3,)"
             )
-        return self.transport(ends.transmitters[0]).view(ends.receivers[0], self.terms)
+        return self._view(ends.receivers[0], ends.transmitters[0])
 
-    def render(self, view: ReceiverView) -> Rendered:
-        """The spectrum of what is seen, by its parts."""
-        check_type("view", view, ReceiverView)
-        view = view.transport.complete(view, self.terms)
-        return render(view, self.materials, self._beam, self.sent_radiance(view.transport))
+    def _view(self, receiver: np.ndarray, transmitter: np.ndarray) -> View:
+        return self.tracer(transmitter).view(receiver, self.effects.mirrors)
 
-    def transport(self, transmitter: ArrayLike | None = None) -> Transport:
+    def path_gains(self, view: View) -> PathGains:
+        """Path gain of all that is seen, by sequence of interactions."""
+        check_type("view", view, View)
+        return path_gains(view, self.state, self.evaluation(view.tracer))
+
+    def tracer(self, transmitter: ArrayLike | None = None) -> Tracer:
         """The geometry under ``transmitter`` (3,) [m], by default the fitted one; that of the last few is kept."""
         source = self.transmitter if transmitter is None else check_array("transmitter", transmitter, (3,))
-        return Transport.of(
-            self.surface, source, self.frequency_hz, self.shape, self.terms.sub_pixels,
-            beam_sigma_rad=self.beam_sigma_rad,
+        return Tracer.of(
+            self.surface, source, self.frequency_hz, self.shape, self.sub_pixels, beam_sigma_rad=self.beam_sigma_rad,
             loss_per_m=0.0 if self.air is None else self.air.loss_per_m(self.frequency_hz), device=self.device,
         )  # fmt: skip
 
-    def sent_radiance(self, transport: Transport) -> np.ndarray | None:
-        """Radiance (E,) that elements send on after first bounces; see
-        :func:`warprrf.rf.fields.bistatic.render.sent_radiance`."""
-        key = transport.transmitter.tobytes()
-        return self._sent.get(key, lambda: sent_radiance(transport, self.materials))
+    def evaluation(self, tracer: Tracer) -> Evaluation:
+        """Its parameters under a transmitter as kernels take them, what surfaces get of each other included."""
+        return self._evaluated.get(tracer.transmitter.tobytes(), lambda: evaluation(tracer, self.state))
 
     def suggest(
         self,
@@ -486,37 +505,40 @@ class BistaticField(RadioField):
         return uncertainty.NEPER * np.sqrt(variance[: len(self.surface.element_area)])
 
     def _sensitivity(self, transmitter: np.ndarray) -> tuple[Sensitivity, Unknowns]:
-        transport = self.transport(transmitter).on_grid(SUGGEST_SHAPE, 1, mirror_sub_pixels=1)
+        tracer = self.tracer(transmitter)
+        materials, tracer = self.evaluation(tracer), tracer.on_grid(SUGGEST_SHAPE, 1)
         floor = self.floor * np.prod(self.shape) / np.prod(SUGGEST_SHAPE)
-        return Sensitivity(transport, self.materials, floor), Unknowns.of(transport, self.material)
+        return Sensitivity(tracer, self.state, materials, floor), Unknowns.of(tracer, self.material)
 
     def trace_links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
         """:meth:`links` at positions that were checked, several at a time."""
-        transport = self.transport(transmitter)
-        tracer = LinkTracer(transport, self.materials, self.sent_radiance(transport), options, self.shape)
-        return options.in_batches(receivers, tracer.batch, tracer)
+        tracer = self.tracer(transmitter)
+        work = LinkTracer(tracer, self.state, self.evaluation(tracer), options, self.shape)
+        return options.in_batches(receivers, work.batch, work)
 
     @property
     def _beam(self) -> BeamOperator:
         return beam_operator(self.shape, self.beam_sigma_rad, self.device)
 
-    def _std_db(self, view: ReceiverView, rendered: Rendered) -> np.ndarray:
+    def _std_db(self, view: View, image: np.ndarray) -> np.ndarray:
         """Standard deviation of the dB image per pixel (H, W); see :mod:`warprrf.rf.fields.bistatic.uncertainty`."""
         if self.errors is None:
             raise ValueError(
                 f"uncertainty: this field was fitted to {self.report.get('receivers', 0)} receivers, too few to hold "
                 "some out and learn its error from; fit to four or more"
             )
-        materials, lobes = int(self.material.max()) + 1, len(self.terms.lobes)
-        free = Layout(materials, lobes, indirect=self.terms.indirect, gain=False).size
-        if len(self.errors.covariance) not in (free, free + 1):  # with a common gain
-            raise ValueError(
-                f"uncertainty: this field's errors were learned for {len(self.errors.covariance)} parameters, but its "
-                f"terms have {free} now; fit it with these terms"
-            )
-        return uncertainty.predicted_std_db(
-            self.errors, view, rendered, self.materials, self.material, self._beam, self.floor
-        )
+        rows = np.unique(self.material, return_index=True)[1]
+        lit = self.evaluation(view.tracer)
+        materials = lit.by_materials(self.parameters.take(rows), self.material)
+        layout = Layout(len(rows), len(self.parameters.lobes))
+        place = Place(0, rows[:1], view.tracer.transmitter, view.receivers[0], self.frequency_hz, self.shape, self.air)
+        o = Observation(place, view, SpectrumPixels(self._beam), Target(np.zeros(image.size)), self.floor)
+        slopes, index = o.slopes(self.effects, materials, layout, self.material)
+        power = image.ravel() / self.floor
+        if len(self.errors.covariance) > layout.size:  # of a common gain
+            slopes, index = np.concatenate([slopes, power[None].astype(np.float32)]), np.append(index, layout.size)
+        slopes *= (NEPER / (1.0 + power)).astype(np.float32)
+        return self.errors.std_db(NEPER * np.log1p(power).reshape(image.shape), view.receivers[0], slopes, index)
 
     # ------------------------------------------------------------------------------------------ files
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from warprrf.checks import check_type
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.fields.bistatic.materials import Parameters, Terms
+from warprrf.rf.fields.bistatic.materials import Effects, Parameters
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.uncertainty import ARRAYS as ERROR_ARRAYS
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
@@ -20,7 +20,8 @@ _SURFACE = {
                  "element_centre", "element_area", "element_group", "look", "thickness_m")
 } | {"cell": "texel", "cell_element": "texel_element"}  # fmt: skip
 """Arrays of a surface, and what files call them."""
-_PARAMETERS = ("log_weight", "log_excess", "log_mirror", "log_indirect")
+_PARAMETERS = ("log_weight", "log_excess", "log_mirror")
+_SINGLE = ("lobes", "reciprocal", "log_gain", "roughness")
 
 
 def taken_apart(parts: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -33,8 +34,9 @@ def taken_apart(parts: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str,
     if parts["errors"] is not None:
         tensors |= {f"errors/{name}": np.asarray(value) for name, value in vars(parts["errors"]).items()}
     header = {
-        "terms": asdict(parts["terms"]),
-        "log_gain": p.log_gain,
+        "effects": asdict(parts["effects"]),
+        "sub_pixels": parts["sub_pixels"],
+        **{name: getattr(p, name) for name in _SINGLE},
         "group_names": s.group_names,
         "skin_m": s.skin_m,
         "two_sided": s.two_sided,
@@ -68,9 +70,10 @@ def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict
             two_sided=two_sided,
             **{name: tensors[f"surface/{filed}"] for name, filed in _SURFACE.items()},
         ),
-        "terms": Terms(**header["terms"] | {"lobes": tuple(header["terms"]["lobes"])}),
+        "effects": Effects(**header["effects"]),
+        "sub_pixels": header["sub_pixels"],
         "parameters": Parameters(
-            **{name: tensors[f"parameters/{name}"] for name in _PARAMETERS}, log_gain=header["log_gain"]
+            **{name: tensors[f"parameters/{name}"] for name in _PARAMETERS}, **{name: header[name] for name in _SINGLE}
         ),
         "material": tensors["material"],
         "residual": tensors["residual"],

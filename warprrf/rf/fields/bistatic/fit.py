@@ -1,355 +1,776 @@
-"""Fitting material groups to readings: damped Gauss-Newton in dB on cached responses.
+"""Fitting a bistatic field: trace what receivers see, observe what was read, fit parameters of materials, find out which
+groups are of one material, what differs within them, and how wrong all that is.
 
-Of each group the fit learns the weights of its scattering lobes, one permittivity (the Fresnel curve that lobes and
-mirror share), the strength of its mirror reflection, and, if asked for, an indirect radiance. All are positive, so
-their logarithms are fitted. Priors keep what no spectrum shows near plausible values and tie a surface's scattered and
-mirrored shares together, because they split one reflection (S^2 and 1 - S^2).
+:func:`fit` reads as that list. Each step is a function of a :class:`Training`, which nothing changes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import time
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from scipy.linalg import solve
-from scipy.linalg.blas import ssyrk
+from threadpoolctl import threadpool_limits
 
-from warprrf.rf.fields.bistatic.materials import Layout, Parameters
-from warprrf.rf.fields.bistatic.response import Response, jacobian, predict
+from warprrf.checks import check_count, check_seed, checked, some_of, users_level
+from warprrf.cluster import each
+from warprrf.device import DeviceLike, Progress
+from warprrf.geometry.mesh import GeometryLike, as_mesh
+from warprrf.rf.channel.array_spectra import ArraySpectra
+from warprrf.rf.fields.base import Data, Measured
+from warprrf.rf.fields.bistatic.gauss_newton import Fitted, gauss_newton
+from warprrf.rf.fields.bistatic.materials import LOBES, SETS, Effects, Model, Parameters
+from warprrf.rf.fields.bistatic.measured import SpectrumPixels, WeighedPaths, read
+from warprrf.rf.fields.bistatic.merging import BY_SHAPE, Merging, merge
+from warprrf.rf.fields.bistatic.observations import (
+    NEPER,
+    NOISE_DB,
+    Observation,
+    Place,
+    Problem,
+    as_list,
+    frame_of,
+    observe,
+    places_of,
+)
+from warprrf.rf.fields.bistatic.placing import moved, position_offset, with_azimuths
+from warprrf.rf.fields.bistatic.records import Evaluation
+from warprrf.rf.fields.bistatic.render import evaluation, path_gains
+from warprrf.rf.fields.bistatic.residual import fit_residual, shares_of
+from warprrf.rf.fields.bistatic.surface import Surface
+from warprrf.rf.fields.bistatic.tracer import Tracer, View, traced
+from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
+from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.readings import Readings
 
-NEPER = 10.0 / np.log(10.0)
-"""Decibels of a neper of power."""
-OWN_GAIN = -2
-"""In place of a measuring chain's index: readings of one place whose common gain is not known. Their sum tells it."""
+LEAST_HELD_OUT = 2
+"""Receivers held out below which they choose no effects: one alone likes what others do not."""
+HELD_OUT, MOST_HELD_OUT, LEAST_RECEIVERS = 0.25, 30, 4
+"""Share of receivers that are held out, how many at most, and of how many at least."""
+FEW = 20
+"""Receivers up to which errors are learned from every one, held out in turn."""
+MOST_TO_CHOOSE = 24
+"""Receivers that fits which only decide about something learn from."""
+SHORT_STEPS = 10  # of such a fit
+BETTER, MUCH_BETTER = 0.995, 0.5
+"""Share to which further effects must lower the mean square error of receivers held out; to which single bounces must lower
+it where receivers are too few to hold any out."""
+CLEARLY_WORSE, NOT_MUCH_WORSE = 1.05, 1.25
+"""Share to which the residual may raise it (one that is learned from all receivers gains more), and to which fewer materials
+may that describe the training receivers better."""
+MERGES = 3  # rounds of deciding what is of one material, and fitting
+UNEXPLAINED = 5.0  # standard deviations beyond which a reading of a table is taken to be wrong
+READINGS, LEAST_READINGS = 12_000, 200
+"""Readings that parameters are fitted to, spread over the training receivers, and of each at least."""
+KNOWN_BETTER = 2.0
+"""By how much more readings count that hold line of sight alone: no material is in them. They tell a chain's gain."""
+CLEAR_DB = 10.0  # above its floor a reading's decibels err as they are
+NORMAL_MEDIAN = 1.4826  # standard deviation over the median size of normal errors
+MOST_RAYS = 500_000_000
+"""Spectra with more rays than this are refused: what rays meet is kept during a fit."""
+RAY_BYTES = 40  # kept of each ray
+SUB_PIXELS, QUICK_SUB_PIXELS = 3, 1
+"""Square roots of the rays per pixel."""
 
 
+@runtime_checkable
+class EffectsChoice(Protocol):
+    """What says beforehand which effects a scene needs, such as :class:`warprrf.Relevance`."""
+
+    def needs(self, frequency_hz: float) -> tuple[Effects, tuple[int, ...] | None]:
+        """Effects, each as far as it may be needed, and exponents of lobes; None for those of a fit."""
+
+
+@checked
 @dataclass(frozen=True)
-class Target:
-    """What was read at one receiver, and how errors of it count.
+class FitOptions:
+    """Options of a bistatic fit; :meth:`BistaticField.fit` takes each of them as a keyword.
 
     Attributes:
-        db: readings, 10 log10(P / N0 + 1), shape ``(N,)``.
-        trust: by which errors are multiplied: 1 but for readings with noise of their own, 0 for those left out, shape
-            ``(N,)``; None for 1.
-        censored: readings that only say that there was no more, shape ``(N,)`` bool; None for none.
+        effects: what is modelled: :class:`Effects`, the name of one of :data:`SETS` (``"single"``, ``"room"``,
+            ``"everything"``), or ``"auto"``: the set that errs least on receivers held out (a quarter, 30 at most), and the
+            residual if it does not err more. With fewer than eight receivers it is ``"room"``, or ``"single"`` if that fits
+            much better.
+        lobes: exponents of the scattering lobes ((1 + cos psi) / 2)^n, 0 for Lambertian; None for 0, 2, 5, 12, 30.
+        reciprocal: lobes that scatter alike when transmitter and receiver change places. By default they are those of
+            Degli-Esposti et al. (2007), Sionna RT's, which do not.
+        sub_pixels: square root of the rays per pixel (None: 3); 4 gives better delays of scattering, 2 takes half the
+            time.
+        quick: one ray a pixel, and nothing held out to decide by.
+        gain_offset: fit one gain common to all paths, for a receiver that was not calibrated; see ``report``.
+        iterations: most steps of the fit of materials.
+        relevance: what it rules out is off.
+        seed: of the choice of pixels and held-out receivers.
     """
 
-    db: np.ndarray
-    trust: np.ndarray | None = None
-    censored: np.ndarray | None = None
+    effects: Effects | str = "auto"
+    lobes: tuple[int, ...] | None = None
+    reciprocal: bool = False
+    sub_pixels: int | None = None
+    quick: bool = False
+    gain_offset: bool = False
+    iterations: int = 40
+    relevance: EffectsChoice | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_count("iterations", self.iterations, 0)
+        check_seed(self.seed)
+        if isinstance(self.effects, str) and self.effects not in ("auto", *SETS):
+            raise ValueError(
+                f"effects: got {self.effects!r}, expected wr.Effects, or one of 'auto', {', '.join(map(repr, SETS))}"
+            )
+        if self.sub_pixels is not None:
+            check_count("sub_pixels", self.sub_pixels, 1, 16)
+        Parameters.prior(1, LOBES if self.lobes is None else self.lobes)
 
     @classmethod
-    def joined(cls, targets: Sequence[Target]) -> Target:
-        """All readings of ``targets``, one after another."""
-        trust = [np.ones(len(t.db)) if t.trust is None else t.trust for t in targets]
-        censored = [np.zeros(len(t.db), bool) if t.censored is None else t.censored for t in targets]
-        return cls(
-            np.concatenate([t.db for t in targets]),
-            np.concatenate(trust) if any(t.trust is not None for t in targets) else None,
-            np.concatenate(censored) if any(t.censored is not None for t in targets) else None,
-        )
+    def of(cls, options: FitOptions | None, settings: dict[str, Any]) -> FitOptions:
+        """``options`` with ``settings`` by name.
 
-    def part(self, index: np.ndarray) -> Target:
-        """Some of the readings."""
-        return Target(*(None if a is None else a[index] for a in (self.db, self.trust, self.censored)))  # type: ignore[arg-type]
-
-    def trusted(self, trust: np.ndarray) -> Target:
-        """The same with errors multiplied by ``trust`` (N,)."""
-        return replace(self, trust=trust * (1.0 if self.trust is None else self.trust))
-
-    def gain(self, power: np.ndarray) -> float:
-        """Under which predicted powers (N,) in units of the floor have the sum of what was read."""
-        known = 1.0 if self.trust is None else self.trust > 0
-        return float((known * np.expm1(self.db / NEPER)).sum() / max((known * power).sum(), 1e-300))
-
-    def error(self, power: np.ndarray) -> np.ndarray:
-        """Error of predicted powers ``(..., N)`` in units of the floor, as it counts [dB]."""
-        error = NEPER * np.log1p(power) - self.db
-        if self.censored is not None:
-            error = np.where(self.censored, np.maximum(error, 0.0), error)
-        return np.asarray(error if self.trust is None else self.trust * error)
-
-    def slope(self, power: np.ndarray) -> np.ndarray:
-        """Derivative of :meth:`error` to the power ``(N,)``."""
-        slope = NEPER / (1.0 + power)
-        if self.censored is not None:
-            slope = np.where(self.censored & (NEPER * np.log1p(power) <= self.db), 0.0, slope)
-        return np.asarray(slope if self.trust is None else self.trust * slope)
-
-
-@dataclass(frozen=True)
-class Reading:
-    """What was read at one receiver, and how that answers to the parameters.
-
-    Attributes:
-        response: of the N readings, in units of the floor N0.
-        target: what was read.
-        chain: measuring chain whose unknown gain they hold, -1 where the gain is known, or :data:`OWN_GAIN`.
-        ratio: carrier of the readings over that of the parameters.
-    """
-
-    response: Response
-    target: Target
-    chain: int = -1
-    ratio: float = 1.0
-
-    def tied(self, material: np.ndarray) -> Reading:
-        """The same by materials instead of groups; ``material`` (G,) is that of each group."""
-        return replace(self, response=self.response.tied(material))
-
-    def gain(self, p: Parameters, power: np.ndarray) -> float:
-        """Of the measuring chain, or of these readings, where ``power`` (N,) is predicted."""
-        return gain_of(self.chain, p, self.target, power)
-
-    def power(self, p: Parameters) -> np.ndarray:
-        """Prediction without the chain's gain, in units of the floor, shape ``(N,)``."""
-        return predict(self.response, p.at_ratio(self.ratio))
-
-    def error_db(self, p: Parameters) -> np.ndarray:
-        """Prediction less what was read, as it counts [dB], shape ``(N,)``."""
-        power = self.power(p)
-        return self.target.error(self.gain(p, power) * power)
-
-    def linearised(self, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """:meth:`error_db` ``(N,)``, its derivatives ``(C, N)`` float32, and the places of those parameters ``(C,)``."""
-        power, table, index = jacobian(self.response, p.at_ratio(self.ratio), layout)
-        if self.ratio != 1.0:
-            slopes = layout.slopes_at_ratio(p, self.ratio)[index]
-            index = np.unique(slopes.indices)
-            table = np.asarray(slopes[:, index].T @ table)
-        gain = self.gain(p, power)
-        if self.chain == OWN_GAIN:  # what changes all alike changes nothing
-            known = (
-                np.ones(len(power)) if self.target.trust is None else (self.target.trust > 0).astype(float)
+        Raises:
+            TypeError: for a name that is no option.
+            ValueError: for a value out of range.
+        """
+        names = [f.name for f in fields(cls)]
+        unknown = sorted(set(settings) - set(names))
+        if unknown:
+            raise TypeError(
+                f"fit: got unknown option {', '.join(unknown)}, expected among {', '.join(names)}"
             )
-            alike = table @ known / max(float(known @ power), 1e-300)
-            table = table - alike[:, None] * power
-        if self.chain != -1:
-            power, table = gain * power, np.float32(gain) * table.astype(np.float32)
-        if self.chain >= 0:
-            table = np.concatenate([table, power[None].astype(np.float32)])
-            index = np.append(index, layout.first_chain + self.chain)
-        table *= self.target.slope(power).astype(np.float32)
-        return self.target.error(power), table, index
+        return replace(options or cls(), **settings)
 
+    def candidates(self, frequency_hz: float) -> list[Effects]:
+        """Effects to choose from, the fewest first; one where they are given. What ``relevance`` rules out is off."""
+        most = Effects() if self.relevance is None else self.relevance.needs(frequency_hz)[0]
+        if isinstance(self.effects, Effects):
+            return [self.effects]
+        given = SETS.values() if self.effects == "auto" else [SETS[self.effects]]
+        found = [
+            Effects(**{f.name: min(getattr(one, f.name), getattr(most, f.name)) for f in fields(Effects)})
+            for one in given
+        ]
+        return list(dict.fromkeys(found))
 
-def gain_of(chain: int, p: Parameters, target: Target, power: np.ndarray) -> float:
-    """Gain of readings of ``chain``, of which ``target`` was read and ``power`` (N,) is predicted in units of the floor."""
-    if chain == OWN_GAIN:
-        return target.gain(power)
-    return float(np.exp(p.log_gains[chain])) if chain >= 0 else 1.0
+    def exponents(self, frequency_hz: float) -> tuple[int, ...]:
+        """Of the lobes."""
+        if self.lobes is not None:
+            return self.lobes
+        known = None if self.relevance is None else self.relevance.needs(frequency_hz)[1]
+        return LOBES if known is None else known
 
-
-@dataclass(frozen=True)
-class Deviations:
-    """Standard deviations of the priors, in nepers but for ``energy``.
-
-    Attributes:
-        weight, excess, mirror: of lobe weights, permittivity less one, and mirror share from where the fit starts.
-        gain: of the common gain from one.
-        chain: of a measuring chain's unknown gain from one.
-        energy: of scattered and mirrored shares from a sum of one.
-        together: of a group's indirect radiance from the mean group's.
-    """
-
-    weight: float = 2.0
-    excess: float = 0.8
-    mirror: float = 1.5
-    gain: float = 1.0
-    chain: float = 10.0
-    energy: float = 0.25
-    together: float = 1.0
+    @property
+    def rays(self) -> int:
+        """Square root of the rays per pixel."""
+        return self.sub_pixels or (QUICK_SUB_PIXELS if self.quick else SUB_PIXELS)
 
 
 @dataclass(frozen=True)
-class GroupFit:
-    """How groups are fitted.
+class TrainingViews:
+    """What is seen of the geometry at the places that were measured, whatever the materials: traced once, used by every
+    fit.
 
     Attributes:
-        indirect: whether each group has an indirect radiance.
-        gain: whether a gain common to all paths is fitted.
-        noise_db: standard deviation of an independent reading's error that priors are weighed against [dB]. Errors of a
-            view's pixels hang together (one misplaced edge), which a larger value stands for.
-        huber_db: larger errors count linearly [dB]: shadows that the geometry puts in the wrong place.
-        steps: most steps.
-        longest: most that a logarithm changes in one step.
-        tolerance: relative fall of the objective that ends the fit.
-        deviations: of the priors.
+        places: receivers under their transmitters.
+        views: one for each place.
+        mirrors: most reflections that were sought.
+        seconds: what it took.
     """
 
-    indirect: bool = False
-    gain: bool = False
-    noise_db: float = 3.0
-    huber_db: float = 3.0
-    steps: int = 40
-    longest: float = 1.5
-    tolerance: float = 1e-3
-    deviations: Deviations = Deviations()
+    places: list[Place] = field(repr=False)
+    views: list[View] = field(repr=False)
+    mirrors: int
+    seconds: float
+
+    @property
+    def tracer(self) -> Tracer:
+        """Surface, transmitter and grid of the first place."""
+        return self.views[0].tracer
+
+    def subset(self, indices: Sequence[int] | np.ndarray) -> TrainingViews:
+        """Some of its places."""
+        chosen = [int(i) for i in indices]
+        return replace(self, places=[self.places[i] for i in chosen], views=[self.views[i] for i in chosen])
+
+    def check(self, places: Sequence[Place], sub_pixels: int | None) -> None:
+        """Raise ValueError if they are not those of exactly ``places``."""
+        same = len(self.places) == len(places) and all(
+            a.seen_from == b.seen_from for a, b in zip(self.places, places, strict=True)
+        )
+        if not same or sub_pixels not in (None, self.tracer.grid.sub_pixels):
+            raise ValueError(
+                f"views: got what {len(self.views)} receivers see with {self.tracer.grid.per_pixel} rays a pixel; "
+                f"expected exactly the {len(places)} receivers, transmitter, carrier, grid, beam, air and rays of this fit"
+            )
 
 
-@dataclass(frozen=True)
-class Fitted:
-    """Result of :func:`fit_groups`.
-
-    Attributes:
-        parameters: the fitted parameters.
-        covariance: of the free ones (Laplace), shape ``(F, F)``; see :class:`Layout`.
-        losses: objective after each step, per reading [dB^2].
-        steps: steps taken.
-    """
-
-    parameters: Parameters
-    covariance: np.ndarray
-    losses: list[float]
-    steps: int
-
-
-def priors(
-    p: Parameters, start: Parameters, layout: Layout, sd: Deviations, area: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals of the priors ``(K,)`` and their Jacobian ``(K, F)``: distance to the start and to the mean group,
-    energy kept."""
-    own = np.arange(layout.groups)
-    residuals, rows = [], []
-
-    def add(values: np.ndarray, places: np.ndarray, slope: np.ndarray | float) -> None:
-        block = np.zeros((len(values), layout.size))
-        np.put_along_axis(block, places.reshape(len(values), -1), slope, axis=1)
-        residuals.append(values)
-        rows.append(block)
-
-    for j, places in enumerate(layout.weight(own).T):
-        add((p.log_weight[:, j] - start.log_weight[:, j]) / sd.weight, places, 1.0 / sd.weight)
-    add((p.log_excess - start.log_excess) / sd.excess, layout.excess(own), 1.0 / sd.excess)
-    add((p.log_mirror - start.log_mirror) / sd.mirror, layout.mirror(own), 1.0 / sd.mirror)
-    if layout.indirect:
-        mean = np.average(p.log_indirect, weights=area)
-        add((p.log_indirect - mean) / sd.together, layout.radiance(own), 1.0 / sd.together)
-    if layout.gain:
-        add(np.array([p.log_gain / sd.gain]), np.array([layout.common_gain]), 1.0 / sd.gain)
-    if layout.chains:
-        add(p.log_gains / sd.chain, layout.first_chain + np.arange(layout.chains), 1.0 / sd.chain)
-    shares = np.column_stack([p.weight, np.exp(p.log_mirror)])  # S^2 by lobes, and 1 - S^2
-    places = np.column_stack([layout.weight(own), layout.mirror(own)])
-    add((shares.sum(axis=1) - 1.0) / sd.energy, places, shares / sd.energy)
-    return np.concatenate(residuals), np.concatenate(rows)
-
-
-def huber(error: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
-    """Loss and weight of each error: square up to ``threshold``, linear beyond (Huber 1964)."""
-    size = np.abs(error)
-    small = size <= threshold
-    loss = np.where(small, error**2, threshold * (2 * size - threshold))
-    return loss, np.where(small, 1.0, threshold / np.maximum(size, 1e-12))
-
-
-def objective(readings: Sequence[Reading], p: Parameters, threshold_db: float) -> float:
-    """Sum of the robust squares of the readings' errors [dB^2]."""
-    return sum(float(huber(r.error_db(p), threshold_db)[0].sum()) for r in readings)
-
-
-def start_of(readings: Sequence[Reading], start: Parameters, options: GroupFit) -> tuple[Parameters, Layout]:
-    """Where a fit starts, with an indirect radiance where one is wanted and none is known, and what is free."""
-    chains = max(0, *(r.chain + 1 for r in readings))
-    if len(start.log_gains) != chains:
-        start = replace(start, log_gains=np.array([_first_gain(readings, start, c) for c in range(chains)]))
-    layout = Layout(*start.log_weight.shape, indirect=options.indirect, gain=options.gain, chains=chains)
-    if options.indirect and not np.isfinite(start.log_indirect).all():
-        start = replace(start, log_indirect=np.full(layout.groups, _dark_level(readings)))
-    return start, layout
-
-
-def fit_groups(
-    readings: Sequence[Reading],
-    start: Parameters,
-    area: np.ndarray,
-    options: GroupFit | None = None,
-) -> Fitted:
-    """Levenberg-Marquardt on the groups' parameters.
+def trace(
+    geometry: GeometryLike,
+    ds: Data,
+    *,
+    effects: Effects | None = None,
+    sub_pixels: int = SUB_PIXELS,
+    client: Any = None,
+    device: DeviceLike = None,
+    progress: Progress | None = None,
+) -> TrainingViews:
+    """What the receivers of ``ds`` see of ``geometry`` (a Reconstruction, Scene, Mesh or Surface).
 
     Args:
-        readings: of the training receivers.
-        start: where the fit starts and the priors centre; ``log_indirect`` is set here if it is -inf.
-        area: area of each group [m^2], shape ``(G,)``.
-        options: what is free, and how far the fit goes.
+        effects: which tables are traced at once (others when they are first asked for); None for single bounces, and for
+            as many mirrors up to 3 as can be searched (2 in a city).
+        sub_pixels: square root of the rays per pixel.
+        client: a ``dask.distributed.Client`` whose workers trace, to the same bits; this process by default.
+        device: where rays are cast.
+        progress: called with the stages ``"patches"``, ``"mirrors"`` and ``"transport"``.
+
+    Raises:
+        ValueError: for receivers on a surface or outside the scene, numbers out of range, or more rays or chains of
+            mirrors than :data:`MOST_RAYS` and :data:`~warprrf.rf.paths.images.MOST_CHAINS`.
+        TypeError: for a geometry without a mesh.
     """
-    o = options or GroupFit()
-    start, layout = start_of(readings, start, o)
-    vector, damping, weight = layout.pack(start), 1e-3, 1.0 / o.noise_db**2
-    count = max(sum(len(r.target.db) for r in readings), 1)
-    hessian, losses, taken = np.eye(layout.size), [], 0
-
-    def total(x: np.ndarray) -> float:
-        p = layout.unpack(x)
-        prior = priors(p, start, layout, o.deviations, area)[0]
-        return weight * objective(readings, p, o.huber_db) + float((prior**2).sum())
-
-    current = total(vector)
-    for step in range(o.steps):
-        p = layout.unpack(vector)
-        hessian, gradient = _normal_equations(readings, p, layout, o)
-        r, j = priors(p, start, layout, o.deviations, area)
-        hessian += j.T @ j
-        gradient += j.T @ r
-        improved = False
-        for _ in range(8):
-            move = solve(hessian + damping * np.diag(np.diag(hessian)), -gradient, assume_a="pos")
-            move = np.clip(move, -o.longest, o.longest)
-            value = total(vector + move)
-            improved = value < current
-            if improved:
-                break
-            damping *= 5.0
-        taken = step + 1
-        if not improved:
-            break
-        # Steps that were cut short, or do worse than the quadratic model says, are no sign of having arrived.
-        expected = -float(move @ (2.0 * gradient + hessian @ move))
-        honest = current - value > 0.5 * expected
-        fall = (current - value) / current
-        vector, current = vector + move, value
-        damping = max(damping * 0.3, 1e-6) if honest else damping * 3.0
-        losses.append(current / weight / count)
-        if fall < o.tolerance and honest and (np.abs(move) < o.longest).all():
-            break
-    return Fitted(layout.unpack(vector), np.linalg.inv(hessian), losses, taken)
+    started, tell = time.perf_counter(), progress or (lambda *_: None)
+    places = places_of(as_list(ds), as_mesh(geometry, "geometry"), device)
+    check_count("sub_pixels", sub_pixels, 1, 16)
+    _check_rays(places, sub_pixels)
+    wanted = replace(SETS["single"], mirrors=3) if effects is None else effects
+    tell("patches", 0, 1)
+    surface = Surface.of(geometry)
+    tell("patches", 1, 1)
+    together: dict[tuple[object, ...], list[int]] = {}  # places under one transmitter
+    for k, place in enumerate(places):
+        together.setdefault((place.transmitter.tobytes(), *place.seen_from[2:]), []).append(k)
+    views: dict[int, View] = {}
+    for own in together.values():
+        first = places[own[0]]
+        loss_per_m = 0.0 if first.air is None else first.air.loss_per_m(first.frequency_hz)
+        tracer = Tracer.of(
+            surface, first.transmitter, first.frequency_hz, first.shape, sub_pixels,
+            beam_sigma_rad=first.beam_sigma_rad, loss_per_m=loss_per_m, device=device,
+        )  # fmt: skip
+        receivers = np.stack([places[k].receiver for k in own])
+        if effects is None:
+            wanted = replace(wanted, mirrors=tracer.images.affordable(receivers, wanted.mirrors))
+        found = tracer.paths(receivers, wanted.mirrors, progress)
+        parts = [(receivers[r], found.subset(np.flatnonzero(found.receiver == r))) for r in range(len(own))]
+        for r, view in each(partial(traced, tracer.again, wanted), parts, client):
+            views[own[r]] = tracer.adopted(view)
+            tell("transport", len(views), len(places))
+    seconds = time.perf_counter() - started
+    return TrainingViews(places, [views[k] for k in range(len(places))], wanted.mirrors, seconds)
 
 
-def _normal_equations(
-    readings: Sequence[Reading], p: Parameters, layout: Layout, options: GroupFit
-) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Newton matrix and gradient of the data term."""
-    hessian, gradient = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
-    for reading in readings:
-        error, table, index = reading.linearised(p, layout)
-        if len(index) == 0:  # nothing that it sees is lit
-            continue
-        root = np.sqrt(huber(error, options.huber_db)[1]) / options.noise_db
-        table *= root.astype(np.float32)
-        hessian[np.ix_(index, index)] += ssyrk(1.0, table.T, trans=1)  # its upper triangle
-        gradient[index] += table @ (root * error).astype(np.float32)
-    return np.triu(hessian) + np.triu(hessian, 1).T, gradient
+def _check_rays(places: Sequence[Place], sub_pixels: int) -> None:
+    """Refuse places whose rays would not fit into memory."""
+    rays = sum(place.shape[0] * place.shape[1] for place in places) * sub_pixels**2
+    if rays > MOST_RAYS:
+        raise ValueError(
+            f"ds: {len(places)} spectra of {places[0].shape[0]} x {places[0].shape[1]} pixels take {rays:.2g} rays, "
+            f"{rays * RAY_BYTES / 1e9:.0f} GB and more, expected at most {MOST_RAYS:.2g}: give fewer receivers (ds.split, "
+            "ds.subset) or sub_pixels=1"
+        )
 
 
-def _first_gain(readings: Sequence[Reading], start: Parameters, chain: int) -> float:
-    """ln of the gain that makes the chain's readings agree with what ``start`` predicts, in the median of their power."""
-    ratio = [np.zeros(0)]
-    for r in readings:
-        read, expected = np.expm1(r.target.db / NEPER), r.power(start)
-        known = (read > 0) & (expected > 0) & (True if r.target.censored is None else ~r.target.censored)
-        if r.chain == chain:
-            ratio.append(np.log(read[known] / expected[known]))
-    every = np.concatenate(ratio)
-    return float(np.median(every)) if len(every) else 0.0
+@dataclass(frozen=True)
+class Fit:
+    """Result of :func:`fit`: what a field is made of, and a report."""
+
+    surface: Surface
+    model: Model
+    material: np.ndarray
+    sub_pixels: int
+    errors: ErrorModel | None
+    report: dict[str, Any]
 
 
-def _dark_level(readings: Sequence[Reading]) -> float:
-    """ln of a radiance that explains what the darkest illuminated pixels hold [1/m^2]."""
-    found = []
-    for reading in readings:
-        base, power = reading.response.indirect.sum(axis=0), np.expm1(reading.target.db / NEPER)
-        illuminated = (base > 0) & (power > 0)
-        if illuminated.any():
-            found.append(np.percentile(np.log(power[illuminated] / base[illuminated]), 20))
-    return float(np.median(found)) if found else 0.0
+def fit(
+    geometry: GeometryLike,
+    ds: Data,
+    options: FitOptions,
+    *,
+    views: TrainingViews | None = None,
+    client: Any = None,
+    device: DeviceLike = None,
+    progress: Progress | None = None,
+) -> Fit:
+    """Fit a model to what ``ds`` holds; arguments and errors as for :meth:`BistaticField.fit`."""
+    data = as_list(ds)
+    for one in data:
+        if isinstance(one, SpectrumDataset) and len(one) and not (one.path_gain > one.floor).any():
+            raise ValueError("ds: got no pixel above the floor, expected spectra with power to fit to")
+    frequency_hz = frame_of(data).frequency_hz
+    candidates = options.candidates(frequency_hz)
+    where: dict[str, Any] = {"client": client, "device": device, "progress": progress}
+    where |= {"effects": candidates[0] if len(candidates) == 1 else None, "sub_pixels": options.rays}
+    if views is not None:
+        places = places_of(data, as_mesh(geometry, "geometry"), device)
+        views.check(places, options.sub_pixels)
+        views = replace(views, places=places)  # of a part of what was traced they say where in the whole readings are
+    seen = views or trace(geometry, data, **where)
+    # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
+    with threadpool_limits(1, user_api="blas"):
+        data, zeros = with_azimuths(data, seen.places, seen.views)
+        training = Training.of(seen, data, options, candidates, progress)
+        found = _fitted(training)
+        offsets = _offsets(training, found)
+        if offsets:
+            data = [moved(one, offsets[k]) if k in offsets else one for k, one in enumerate(data)]  # type: ignore[arg-type]
+            training = Training.of(trace(geometry, data, **where), data, options, candidates, progress)
+            found = _fitted(training)
+    _warn_of_left_out(data, found.report["unexplained"])
+    places_moved = {
+        training.names[k]: [(place.receiver.tolist(), offset.tolist()) for place, offset in own]
+        for k, own in offsets.items()
+    }
+    return replace(found, report=found.report | {"azimuth_zero_deg": zeros, "position_offset_m": places_moved})
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What was decided on: effects, the material of each group ``(G,)``, and parameters of materials under them."""
+
+    effects: Effects
+    material: np.ndarray
+    fitted: Fitted
+
+    @property
+    def parameters(self) -> Parameters:
+        """Of the materials."""
+        return self.fitted.parameters
+
+
+@dataclass(frozen=True, eq=False)
+class Training:
+    """One fit: what it learns from, and how.
+
+    Attributes:
+        options: of the fit.
+        candidates: effects to choose from, the fewest first.
+        surface: of the geometry.
+        observations: of every place.
+        parts: those readings of each that parameters are fitted to.
+        chains: names of measuring chains whose gain is unknown.
+        names: of the data sets.
+        data: the data sets.
+        held, kept: places that are held out to decide by, and the others.
+        always: places that are never held out, one of each chain: without any its gain would not be known.
+        lobes: exponents.
+        totals: whether power alone was read, which cannot tell bounces or materials apart.
+        seconds: what tracing took.
+        step: to be called after each fit.
+        log: choices, as they are made.
+    """
+
+    options: FitOptions
+    candidates: list[Effects]
+    surface: Surface
+    observations: list[Observation]
+    parts: list[Observation]
+    chains: list[str]
+    names: list[str]
+    data: Sequence[Measured]
+    held: np.ndarray
+    kept: np.ndarray
+    always: list[int]
+    lobes: tuple[int, ...]
+    totals: bool
+    seconds: float
+    step: Callable[..., None]
+    log: list[dict[str, Any]] = field(default_factory=list)
+
+    @classmethod
+    def of(
+        cls,
+        seen: TrainingViews,
+        data: Sequence[Measured],
+        options: FitOptions,
+        candidates: list[Effects],
+        progress: Progress | None,
+    ) -> Training:
+        """Observations of ``data`` where ``seen`` is seen, some of them held out."""
+        frequency_hz, count = frame_of(data).frequency_hz, len(seen.places)
+        observations, chains = observe(data, seen.places, seen.views, frequency_hz)
+        totals = all(isinstance(one, Readings) and one.total for one in data)
+        candidates = [replace(one, mirrors=min(one.mirrors, seen.mirrors)) for one in candidates]
+        if len(candidates) > 1 and any(isinstance(one, ArraySpectra) for one in data):
+            candidates = [replace(one, mirrors=seen.mirrors) for one in candidates]  # they hear the phases of all
+        if len(candidates) > 1 and totals:
+            candidates = candidates[1:2]
+        rng, chain = np.random.default_rng(options.seed), np.array([o.chain for o in observations])
+        always, held = [int(np.argmax(chain == k)) for k in range(len(chains))], np.zeros(0, int)
+        if count >= LEAST_RECEIVERS and not options.quick:
+            order = rng.permutation(count)
+            held = np.sort(order[~np.isin(order, always)][: min(int(count * HELD_OUT), MOST_HELD_OUT)])
+        lobes = options.exponents(frequency_hz)
+        single = replace(SETS["single"], mirrors=1)
+        prior = Parameters.prior(seen.tracer.surface.groups, lobes, reciprocal=options.reciprocal)
+        parts = []
+        for o in observations:
+            trust, db = o.target.trust, o.target.db
+            known = np.arange(len(db)) if trust is None else np.flatnonzero(trust)
+            size = min(len(known), max(LEAST_READINGS, READINGS // count))
+            part = o.part(known[np.sort(rng.choice(len(known), size, replace=False))])
+            if o.prefers_direct:
+                share = _line_of_sight_share(part, single, prior)
+                part = replace(part, target=part.target.trusted(1.0 + KNOWN_BETTER * share))
+            parts.append(part)
+        steps = _Steps(progress, count, 4 + len(candidates) + MERGES + (2 * count if count <= FEW else 3))
+        return cls(
+            options, candidates, seen.tracer.surface, observations, parts, chains,
+            [getattr(one, "name", "") for one in data], data, held, np.setdiff1d(np.arange(count), held), always, lobes,
+            totals, seen.seconds, steps,
+        )  # fmt: skip
+
+    @property
+    def area(self) -> np.ndarray:
+        """Of each group [m^2]."""
+        s = self.surface
+        return np.bincount(s.group, s.mesh.areas, minlength=s.groups)
+
+    @property
+    def transmitter(self) -> np.ndarray:
+        """Under which gains of light sent on are learned: of several transmitters none."""
+        sources = {o.place.transmitter.tobytes() for o in self.observations}
+        return self.observations[0].place.transmitter if len(sources) == 1 else np.full(3, np.nan)
+
+    def start(self, material: np.ndarray) -> Parameters:
+        """Parameters of materials before any measurement."""
+        return Parameters.prior(int(material.max()) + 1, self.lobes, reciprocal=self.options.reciprocal)
+
+    def few(self, times: int) -> np.ndarray:
+        """Places that fits which only decide about something learn from, those of every chain among them."""
+        others = np.setdiff1d(self.kept, self.always)
+        return np.union1d(self.always, others[: max(times * MOST_TO_CHOOSE - len(self.always), 0)]).astype(int)
+
+    def problem(self, effects: Effects, material: np.ndarray, places: Iterable[int], p: Parameters) -> Problem:
+        """What is fitted to readings of ``places``, lit as under parameters ``p`` of materials."""
+        own = [self.parts[k] for k in places]
+        bare = Problem(own, effects, material, {}, len(self.chains), self.options.gain_offset, NOISE_DB, self.huber_db,
+                       1.0 if self.totals else 0.25)  # fmt: skip
+        return bare.lit(p)
+
+    @property
+    def huber_db(self) -> float:
+        """Larger errors count linearly; totals may miss a mirror of metal, which priors have weaker."""
+        return 10.0 if self.totals else 3.0
+
+    def model(self, choice: Choice, *, residual: bool = False) -> Model:
+        """That of groups, without a residual yet."""
+        effects = replace(choice.effects, residual=residual)
+        none = np.zeros((2, self.surface.cells))
+        return Model(effects, choice.parameters.take(choice.material), none, self.transmitter)
+
+    def fitted(self, choice: Choice, places: Iterable[int], steps: int, rounds: int = 1) -> Choice:
+        """``choice`` with parameters fitted to readings of ``places``; what surfaces get of each other is computed anew in
+        each of ``rounds``."""
+        rounds, places = rounds if choice.effects.scatterings > 1 else 1, list(places)
+        for _ in range(rounds):
+            problem = self.problem(choice.effects, choice.material, places, choice.parameters)
+            found = gauss_newton(problem, choice.parameters, max(steps // rounds, int(steps > 0)))
+            choice = replace(choice, fitted=found)
+        self.step()
+        return choice
+
+    def predicted(self, model: Model, places: Iterable[int]) -> list[np.ndarray]:
+        """All readings at ``places`` under a model, in units of their floors."""
+        return [o.predicted(here, materials) for o, here, materials in self.evaluated(model, places)]
+
+    def evaluated(self, model: Model, places: Iterable[int]) -> Iterable[tuple[Observation, Model, Evaluation]]:
+        """Observations with the model at their carriers, as kernels take it."""
+        known: dict[Any, tuple[Model, Evaluation]] = {}
+        for k in places:
+            o = self.observations[k]
+            key = id(o.view.tracer), o.ratio
+            if key not in known:
+                here = replace(model, parameters=model.parameters.at_ratio(o.ratio))
+                known[key] = here, evaluation(o.view.tracer, here)
+            yield o, *known[key]
+
+    def loss(self, model: Model, places: Sequence[int] | np.ndarray) -> float:
+        """Mean loss of all readings at ``places`` [dB^2]."""
+        predicted = self.predicted(model, places)
+        own = [self.observations[k].losses(x, self.huber_db).mean() for k, x in zip(places, predicted, strict=True)]
+        return float(np.mean(own))
+
+    def held_loss(self, choice: Choice) -> float:
+        """Mean square error at the places held out, without residual [dB^2]: of all readings where they are few, else of
+        those chosen."""
+        if len(self.held) <= LEAST_RECEIVERS:
+            return self.loss(self.model(choice), self.held)
+        problem = self.problem(choice.effects, choice.material, self.held, choice.parameters)
+        powers = zip(problem.observations, problem.powers(choice.parameters), strict=True)
+        losses = [o.losses(o.gain(choice.parameters, x) * x, self.huber_db) for o, x in powers]
+        return float(np.mean(np.concatenate(losses)))
+
+    def note(self, what: str, kept: bool, loss: float) -> None:
+        """Log a choice."""
+        self.log.append({"term": what, "kept": bool(kept), "held_out_rmse_db": float(np.sqrt(loss))})
+
+
+def _line_of_sight_share(o: Observation, effects: Effects, p: Parameters) -> np.ndarray:
+    """Share of readings (N,) that comes straight from the transmitter."""
+    materials = Evaluation(p, device=o.view.tracer.grid.device)
+    direct = replace(effects, mirrors=0, scatterings=0)
+    power = o.power(direct, materials)
+    return np.asarray(power / np.maximum(o.power(effects, materials), np.maximum(power, 1e-300)))
+
+
+@dataclass
+class _Steps:
+    """Progress of a fit whose steps are only estimated."""
+
+    progress: Progress | None
+    count: int
+    total: int
+    done: int = 0
+
+    def __call__(self, *, last: bool = False) -> None:
+        self.done = self.total if last else min(self.done + 1, self.total - 1)
+        if self.progress is not None:
+            self.progress("fit", self.done * self.count, self.total * self.count)
+
+
+def _fitted(t: Training) -> Fit:
+    """All steps of a fit but tracing."""
+    started = time.perf_counter()
+    choice = choose(t)
+    residual, errors = cross_validate(t, choice)
+    choice, model = everyone(t, choice, residual)
+    wrong = unexplained(t, model)
+    if any(len(rows) for rows in wrong.rows):
+        t = left_out(t, wrong.rows)
+        choice, model = everyone(t, choice, residual)
+    if errors is not None:
+        errors = replace(errors, covariance=_covariance(choice.fitted))
+    t.step(last=True)
+    rays = t.observations[0].view.tracer.grid.sub_pixels
+    return Fit(t.surface, model, choice.material, rays, errors, _report(t, choice, wrong, time.perf_counter() - started))
+
+
+def choose(t: Training) -> Choice:
+    """Effects, and which groups are of one material."""
+    material = t.surface.material
+    start = Fitted(t.start(material), np.zeros((0, 0)), [])
+    trials = [Choice(effects, material, start) for effects in t.candidates]
+    if len(t.held) < (LEAST_HELD_OUT if len(trials) > 1 else 1):
+        return _choose_of_few(t, trials)
+    best, least = None, np.inf
+    for trial in trials:
+        trial = t.fitted(replace(trial, fitted=best.fitted if best else start), t.few(1), 2 * SHORT_STEPS, rounds=2)
+        loss = t.held_loss(trial)
+        kept = loss < BETTER * least
+        t.note(_name(trial.effects), kept, loss)
+        if kept or best is None:
+            best, least = trial, loss
+    if best is None:
+        raise ValueError("effects: got none to choose from")
+    if np.isfinite(t.surface.look).all() and material.max() > 0 and not t.totals:
+        best = merged(t, best, least)
+    return best
+
+
+def _choose_of_few(t: Training, trials: list[Choice]) -> Choice:
+    """With too few receivers to hold any out: bounces as rooms have them, unless none fit much better."""
+    if len(trials) == 1:
+        return t.fitted(trials[0], t.kept, t.options.iterations, rounds=2)
+    single, room = (t.fitted(trial, t.kept, t.options.iterations, rounds=2) for trial in trials[:2])
+    everywhere = np.arange(len(t.observations))
+    losses = [t.loss(t.model(trial), everywhere) for trial in (single, room)]
+    fewer = losses[0] < MUCH_BETTER * losses[1]
+    t.note(_name(single.effects), fewer, losses[0])
+    t.note(_name(room.effects), not fewer, losses[1])
+    return single if fewer else room
+
+
+def merged(t: Training, best: Choice, least: float) -> Choice:
+    """Materials by what the readings say, if that lowers the error of the places held out."""
+    trial, options = best, BY_SHAPE if t.surface.by_shape else Merging()
+    problem = t.problem(best.effects, best.material, t.few(2), best.parameters)
+    for _ in range(MERGES):
+        material, start = merge(problem, trial.parameters, t.surface.look, t.area, options)
+        # What surfaces get of each other changes little with who is of which material: it is held.
+        problem = replace(problem, material=material)
+        trial = Choice(best.effects, material, gauss_newton(problem, start, SHORT_STEPS))
+        t.step()
+    loss = t.held_loss(trial)
+    # Few receivers held out say little, fewer materials that describe the others better say much.
+    same = len(t.kept) <= MOST_TO_CHOOSE  # receivers of both fits
+    simpler = same and trial.fitted.losses[-1:] < best.fitted.losses[-1:]
+    keep = loss < least or (simpler and loss < NOT_MUCH_WORSE * least)
+    t.note(f"{best.material.max() + 1} materials as {trial.material.max() + 1}", keep, loss)
+    return trial if keep else best
+
+
+def _name(effects: Effects) -> str:
+    """What a choice of effects is called in a report."""
+    known = [name for name, one in SETS.items() if replace(one, mirrors=effects.mirrors) == effects]
+    return (known or [str(effects)])[0]
+
+
+def cross_validate(t: Training, choice: Choice) -> tuple[bool, ErrorModel | None]:
+    """Whether the residual is wanted, or does not clearly raise the error of places held out, and the errors that then
+    remain: of those held out; where they are few, of all, held out in turn. No errors where no whole spectra were measured."""
+    free = isinstance(t.options.effects, str) and choice.effects.residual
+    if not len(t.held):
+        return choice.effects.residual, None
+    places = np.stack([o.place.receiver for o in t.observations])
+    tried = (False, True) if free else (choice.effects.residual,)
+    power: dict[bool, list[np.ndarray]] = {residual: [] for residual in tried}
+    order: list[int] = []
+    gaps = []
+    for held in _folds(t):
+        kept = np.setdiff1d(np.arange(len(places)), held)
+        own = choice if held is t.held else t.fitted(choice, kept, SHORT_STEPS)
+        order += held.tolist()
+        gaps += [np.linalg.norm(places[kept] - places[r], axis=1).min() for r in held]
+        for residual, found in power.items():
+            model = t.model(own, residual=residual)
+            found += t.predicted(with_residual(t, model, kept) if residual else model, held)
+    loss = {
+        residual: float(np.mean([t.observations[k].losses(x, t.huber_db).mean() for k, x in zip(order, own, strict=True)]))
+        for residual, own in power.items()
+    }
+    keep = loss[True] < CLEARLY_WORSE * loss[False] if free else choice.effects.residual
+    for residual, error in loss.items():
+        t.note("residual" if residual else "no residual", residual == keep, error)
+    if not all(isinstance(o.measured, SpectrumPixels) and o.target.trust is None for o in t.observations):
+        return keep, None
+    shapes = [t.observations[k].place.shape for k in order]
+    images = [(NEPER * np.log1p(x)).reshape(shape) for x, shape in zip(power[keep], shapes, strict=True)]
+    missed = [
+        t.observations[k].target.error(x).reshape(shape)
+        for k, x, shape in zip(order, power[keep], shapes, strict=True)
+    ]
+    return keep, learn_errors(images, missed, np.array(gaps), places, _covariance(choice.fitted))
+
+
+def _folds(t: Training) -> list[np.ndarray]:
+    """Places that are held out in turn to learn errors."""
+    folds = [t.held]
+    if len(t.observations) <= FEW:
+        others = np.setdiff1d(t.kept, t.always)
+        folds += np.array_split(others, max(len(others) // max(len(t.held), 2), 2))
+    return folds
+
+
+def everyone(t: Training, choice: Choice, residual: bool) -> tuple[Choice, Model]:
+    """The choice fitted to all places, and its model with the residual, if wanted."""
+    everywhere = np.arange(len(t.observations))
+    choice = t.fitted(choice, everywhere, t.options.iterations)
+    model = t.model(choice, residual=residual)
+    return choice, with_residual(t, model, everywhere) if residual else model
+
+
+def with_residual(t: Training, model: Model, places: np.ndarray) -> Model:
+    """``model`` with gains of surface cells that readings at ``places`` tell."""
+    shares = [shares_of(o, here, materials) for o, here, materials in t.evaluated(model, places)]
+    t.step()
+    return replace(model, residual=fit_residual(shares, t.surface, quick=t.options.quick))
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """Readings of tables that a fit misses by more than :data:`UNEXPLAINED` of their standard deviations, for each place
+    ``(N,)``; and what it misses the others by, in the median, by table [dB]: their noise."""
+
+    rows: list[np.ndarray]
+    noise_db: dict[str, float]
+
+
+def unexplained(t: Training, model: Model) -> Unexplained:
+    """What ``model`` cannot explain."""
+    rows, left = [], dict[str, list[float]]()
+    predicted = t.predicted(model, range(len(t.observations)))
+    for o, power in zip(t.observations, predicted, strict=True):
+        wrong, target = np.zeros(0, int), o.target
+        if isinstance(o.measured, WeighedPaths) and target.trust is not None and target.censored is not None:
+            error = target.error(power)
+            wrong = np.flatnonzero(np.abs(error) > UNEXPLAINED * NOISE_DB)
+            clear = ~target.censored & (target.db > CLEAR_DB)
+            left.setdefault(t.names[o.place.data], []).extend((error / target.trust)[clear])
+        rows.append(wrong)
+    noise = {name: NORMAL_MEDIAN * float(np.median(np.abs(errors))) for name, errors in left.items() if errors}
+    return Unexplained(rows, noise)
+
+
+def left_out(t: Training, wrong: Sequence[np.ndarray]) -> Training:
+    """``t`` in which readings ``wrong`` of each place count no longer."""
+    observations, parts = list(t.observations), list(t.parts)
+    for k, rows in enumerate(wrong):
+        if len(rows):
+            o = observations[k]
+            counts = ~np.isin(np.arange(len(o.target.db)), rows)
+            observations[k] = replace(o, target=o.target.trusted(counts))
+            parts[k] = replace(parts[k], target=parts[k].target.trusted(counts[parts[k].rows]))
+    return replace(t, observations=observations, parts=parts)
+
+
+def _offsets(t: Training, found: Fit) -> dict[int, list[tuple[Place, np.ndarray]]]:
+    """By data set of unknown positions its places, and how far each receiver is from where it is said to be [m]."""
+    unsure = [k for k, o in enumerate(t.observations) if getattr(t.data[o.place.data], "position_std_m", 0.0) > 0]
+    offsets: dict[int, list[tuple[Place, np.ndarray]]] = {}
+    for o, model, materials in t.evaluated(found.model, unsure):
+        one = t.data[o.place.data]
+        gains = path_gains(o.view, model, materials)
+        total = np.maximum(read(gains, o.measured), 0.0) / o.floor
+        direct = gains.sharp / o.floor
+        gain = o.gain(model.parameters, total)
+        other = np.maximum(total - direct @ o.measured.of_paths(o.view), 0.0)
+        offset = position_offset(one, o, gain * other, gain * direct, t.huber_db)  # type: ignore[arg-type]
+        offsets.setdefault(o.place.data, []).append((o.place, offset))
+    return offsets
+
+
+def _covariance(found: Fitted) -> np.ndarray:
+    """Of what a field keeps: without the gains of chains."""
+    kept = len(found.covariance) - len(found.parameters.log_gains)
+    return found.covariance[:kept, :kept]
+
+
+def _report(t: Training, choice: Choice, wrong: Unexplained, seconds: float) -> dict[str, Any]:
+    found = choice.fitted
+    report: dict[str, Any] = {
+        "receivers": len(t.observations),
+        "held_out": len(t.held),
+        "transport_time_s": t.seconds,
+        "fit_time_s": seconds,
+        "groups": t.surface.groups,
+        "materials": int(choice.material.max()) + 1,
+        "elements": len(t.surface.element_area),
+        "steps": len(found.losses),
+        "losses": {"gain": found.losses},
+        "choices": t.log,
+        "noise_db": wrong.noise_db,
+    }
+    deviation = np.sqrt(np.diag(found.covariance))
+    if t.options.gain_offset:
+        place = found.parameters.log_weight.size + 2 * len(found.parameters.log_excess)
+        report["gain_offset_db"] = NEPER * found.parameters.log_gain
+        report["gain_offset_std_db"] = NEPER * float(deviation[place])
+    report["chains"] = {
+        name: {"gain_db": NEPER * float(gain), "std_db": NEPER * float(std)}
+        for name, gain, std in zip(
+            t.chains, found.parameters.log_gains, deviation[len(deviation) - len(t.chains) :], strict=True
+        )
+    }
+    report["unexplained"] = {}
+    for o, rows in zip(t.observations, wrong.rows, strict=True):
+        if len(rows):
+            report["unexplained"].setdefault(t.names[o.place.data], []).extend(o.place.rows[rows].tolist())
+    return report
+
+
+def _warn_of_left_out(data: Sequence[Measured], wrong: dict[str, list[int]]) -> None:
+    if wrong:
+        count = sum(len(one) for one in data if isinstance(one, Readings))
+        listed = "; ".join(f"{len(rows)} of {name!r}, rows {some_of(rows)}" for name, rows in wrong.items())
+        warnings.warn(
+            f"ds: {sum(map(len, wrong.values()))} of {count} readings are taken for wrong and left out ({listed}): "
+            'report["unexplained"] lists them',
+            UserWarning,
+            stacklevel=users_level(),
+        )

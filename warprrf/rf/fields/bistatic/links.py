@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.fields.bistatic.materials import Materials
-from warprrf.rf.fields.bistatic.render import PathPowers, path_powers
-from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
+from warprrf.rf.fields.bistatic.materials import Model
+from warprrf.rf.fields.bistatic.records import Evaluation
+from warprrf.rf.fields.bistatic.render import PathGains, path_gains
+from warprrf.rf.fields.bistatic.tracer import Tracer
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links
 from warprrf.rf.spectra.spectrum import check_shape
 
@@ -31,9 +32,9 @@ class LinkTracer:
     """Links to one transmitter.
 
     Args:
-        transport: geometry under the transmitter.
-        materials: of the surfaces.
-        sent: what elements send on; see :func:`warprrf.rf.fields.bistatic.render.sent_radiance`.
+        tracer: geometry under the transmitter.
+        model: what is modelled.
+        materials: evaluation of it under the transmitter.
         options: beam, grid and mirrors.
         shape: of the field's spectra, whose pixels are its diffuse paths.
 
@@ -42,39 +43,28 @@ class LinkTracer:
     """
 
     def __init__(
-        self,
-        transport: Transport,
-        materials: Materials,
-        sent: np.ndarray | None,
-        options: LinkOptions,
-        shape: tuple[int, int],
+        self, tracer: Tracer, model: Model, materials: Evaluation, options: LinkOptions, shape: tuple[int, int]
     ) -> None:
-        terms, self._sent = materials.terms, sent
-        self._arguments = (
-            transport.recipe,
-            materials,
-            sent,
-            replace(options, client=None, progress=None),
-            shape,
-        )
+        self._arguments = tracer.again, model, materials, replace(options, client=None, progress=None), shape
+        effects, self._materials = model.effects, materials
         if options.mirror_order is not None:
-            terms = replace(terms, mirror_order=min(terms.mirror_order, options.mirror_order))
-        self._materials = replace(materials, terms=terms)
+            effects = replace(effects, mirrors=min(effects.mirrors, options.mirror_order))
+        self._model = replace(model, effects=effects)
         self._shape = check_shape(options.shape or SHAPE)
-        self._transport = transport.on_grid(self._shape, SUB_PIXELS, mirror_sub_pixels=1)
-        self._search = BeamSearch(self._shape, options.beam_sigma_rad, device=transport.grid.device)
+        self._tracer = tracer.on_grid(self._shape, SUB_PIXELS)
+        self._search = BeamSearch(self._shape, options.beam_sigma_rad, device=tracer.grid.device)
         # a path's pixel is one of the field's spectrum
         self._finer = self._shape[0] * self._shape[1] / (shape[0] * shape[1])
-        self.batch = max(1, RAYS_AT_A_TIME // len(self._transport.grid.directions))
+        self.batch = max(1, RAYS_AT_A_TIME // len(self._tracer.grid.directions))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _again, self._arguments
 
     def __call__(self, receivers: np.ndarray) -> Links:
         """Links of at most :attr:`batch` receivers (R, 3)."""
-        view, count = self._transport.view(receivers, self._materials.terms), len(receivers)
-        powers = path_powers(view, self._materials, self._sent)
-        paths, sharp = view.paths, powers.mirror
+        view, count = self._tracer.view(receivers, self._model.effects.mirrors), len(receivers)
+        gains = path_gains(view, self._model, self._materials)
+        paths, sharp = view.paths, gains.sharp
         total, moment, square = (
             np.bincount(paths.receiver, sharp * (paths.length_m / SPEED_OF_LIGHT) ** k, minlength=count)
             for k in range(3)
@@ -82,8 +72,8 @@ class LinkTracer:
         best = np.zeros(count)
         np.maximum.at(best, paths.receiver, sharp)
         image = np.zeros((count, *self._shape))
-        if self._materials.terms.diffuse:
-            power, delay = self._by_ray(view, powers)
+        if self._model.effects.scatterings:
+            power, delay = gains.by_ray().reshape(count, -1), _delays(gains)
             total, moment, square = (
                 sums + np.einsum("rk,rk->r", power, delay**k)
                 for k, sums in enumerate((total, moment, square))
@@ -95,21 +85,14 @@ class LinkTracer:
             spread = np.sqrt(np.maximum(square / total - mean**2, 0.0))
         return Links(total, best, spread, self._search(image, paths.receiver, paths.arrival, sharp))
 
-    def _by_ray(self, view: ReceiverView, powers: PathPowers) -> tuple[np.ndarray, np.ndarray]:
-        """Path gain and delay [s] of every ray, ``(R, K)`` each; rays that hit nothing have neither."""
-        grid, count = view.transport.grid, len(view.receivers)
-        hit, per_pixel = view.hits.face.numpy() >= 0, grid.sub_pixels**2
-        # What mirrors show is known by pixel: it goes to the pixel's rays in equal shares.
-        ray, power = powers.shown
-        shown = np.bincount(ray // per_pixel, power, minlength=len(hit) // per_pixel)
-        among = hit.reshape(-1, per_pixel).sum(axis=1)
-        share = np.divide(shown, among, out=np.zeros(len(among)), where=among > 0)
-        whole = powers.single + powers.sent + np.where(hit, np.repeat(share, per_pixel), 0.0)
-        range_m = np.where(hit, view.hits.range_m.numpy(), 0.0).reshape(count, -1)
-        way = view.receivers[:, None] - view.transport.transmitter + range_m[..., None] * grid.directions
-        delay = (np.sqrt(np.einsum("rkx,rkx->rk", way, way)) + range_m) / SPEED_OF_LIGHT
-        return whole.reshape(count, -1), delay
+
+def _delays(gains: PathGains) -> np.ndarray:
+    """Delay of light scattered once along every ray [s], shape ``(R, K)``."""
+    view = gains.view
+    range_m = np.where(view.hits.face >= 0, view.hits.range_m, 0.0).reshape(len(view.receivers), -1)
+    way = view.receivers[:, None] - view.tracer.transmitter + range_m[..., None] * view.tracer.grid.directions
+    return (np.sqrt(np.einsum("rkx,rkx->rk", way, way)) + range_m) / SPEED_OF_LIGHT
 
 
-def _again(recipe: Callable[[], Transport], *others: Any) -> LinkTracer:
-    return LinkTracer(recipe(), *others)
+def _again(again: Callable[[], Tracer], *others: Any) -> LinkTracer:
+    return LinkTracer(again(), *others)

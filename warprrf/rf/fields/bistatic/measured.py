@@ -11,13 +11,16 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
+from warprrf.cache import cached_property
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.materials import Parameters
 from warprrf.rf.fields.bistatic.rays import RayGrid
-from warprrf.rf.fields.bistatic.render import PathPowers
-from warprrf.rf.fields.bistatic.transport import ReceiverView
+from warprrf.rf.fields.bistatic.render import PathGains
+from warprrf.rf.fields.bistatic.records import Records
+from warprrf.rf.fields.bistatic.tracer import SHARP, View
 from warprrf.rf.paths.mirror_paths import stops_of
 from warprrf.rf.paths.polarisation import chain_amplitude, vertical_ends
 from warprrf.rf.spectra.beam import BeamOperator
@@ -37,7 +40,7 @@ class Measurement(Protocol):
     def together(self) -> Superposition | None:
         """How line of sight and mirrors add up where their phases count; None where their powers add."""
 
-    def bins(self, view: ReceiverView) -> tuple[np.ndarray, int]:
+    def bins(self, view: View) -> tuple[np.ndarray, int]:
         """Bin of each ray, shape ``(K,)``, -1 for none, and how many bins there are."""
 
     def of_bins(self, power: np.ndarray, *, quick: bool = False) -> np.ndarray:
@@ -46,27 +49,25 @@ class Measurement(Protocol):
     def to_bins(self, readings: np.ndarray) -> np.ndarray:
         """The transposed map of ``readings`` (N, C), shape ``(B, C)``, in single precision."""
 
-    def of_paths(self, view: ReceiverView) -> np.ndarray:
+    def of_paths(self, view: View) -> np.ndarray:
         """Readings of unit power on each line-of-sight and mirror path, shape ``(L, N)`` float32."""
 
     def part(self, index: np.ndarray) -> Measurement:
         """Some of its readings."""
 
 
-def read(view: ReceiverView, measurement: Measurement, powers: PathPowers) -> np.ndarray:
+def read(gains: PathGains, measurement: Measurement) -> np.ndarray:
     """Readings of the paths of one receiver, shape ``(N,)``."""
+    view, together = gains.view, measurement.together
     bins, count = measurement.bins(view)
-    own, power = bins >= 0, powers.single + powers.further
-    table = np.bincount(bins[own], power[own], minlength=count)[:, None]
-    together = measurement.together
+    own = bins >= 0
+    table = np.bincount(bins[own], gains.by_ray()[own], minlength=count)[:, None]
     if together is None:
-        direct = powers.mirror.astype(np.float32) @ measurement.of_paths(view)
+        direct = gains.sharp.astype(np.float32) @ measurement.of_paths(view)
     else:
-        p = powers.parameters
-        amplitude = together.amplitudes(view.friis, view.path_groups, view.paths.cosine, view.paths.turn, p)[
-            0
-        ]
-        direct = p.gain * together.received(np.where(powers.mirror > 0, amplitude, 0.0))
+        p, sharp = gains.parameters, view.records[SHARP]
+        amplitude = together.amplitudes(sharp, p)[0]
+        direct = p.gain * together.received(np.where(gains.sharp > 0, amplitude, 0.0))
     return np.asarray(measurement.of_bins(table)[:, 0] + direct)
 
 
@@ -83,20 +84,25 @@ class SpectrumPixels:
     pixels: np.ndarray | None = None
     together: None = None
 
+    @cached_property
+    def _matrix(self) -> csr_matrix:
+        """The beam at the pixels."""
+        return self.beam.at(self.pixels)
+
     @property
     def alike(self) -> object:
         """Itself: receivers of one data set have one."""
         return id(self)
 
-    def bins(self, view: ReceiverView) -> tuple[np.ndarray, int]:
+    def bins(self, view: View) -> tuple[np.ndarray, int]:
         """A bin for each pixel."""
-        grid = view.transport.grid
+        grid = view.tracer.grid
         return np.arange(len(view.hits.face)) // grid.sub_pixels**2, grid.shape[0] * grid.shape[1]
 
     def of_bins(self, power: np.ndarray, *, quick: bool = False) -> np.ndarray:
         """Seen through the beam."""
         if self.pixels is not None:
-            return self.beam.at(self.pixels, power)
+            return self._matrix @ power.astype(np.float32, copy=False)
         return self.beam(power.reshape(*self.beam.shape, -1), quick=quick).reshape(power.shape)
 
     def to_bins(self, readings: np.ndarray) -> np.ndarray:
@@ -107,7 +113,7 @@ class SpectrumPixels:
             image[self.pixels] = readings
         return self.beam.adjoint(image.reshape(*self.beam.shape, -1), quick=True).reshape(image.shape)
 
-    def of_paths(self, view: ReceiverView) -> np.ndarray:
+    def of_paths(self, view: View) -> np.ndarray:
         """Each path's beam."""
         if view.beams is None:
             raise ValueError("view: it was traced without a receiver's beam, expected one of a spectrum")
@@ -124,9 +130,9 @@ Weigh = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 each, shape ``(N, K)``."""
 
 
-def direct_paths(view: ReceiverView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def direct_paths(view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Directions of arrival and departure (L, 3) and delays (L,) [s] of one receiver's line of sight and mirror paths."""
-    paths, transmitter = view.paths, view.transport.transmitter
+    paths, transmitter = view.paths, view.tracer.transmitter
     toward = np.where((paths.order > 0)[:, None], paths.point[:, 0], view.receivers[0]) - transmitter
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     return paths.arrival, toward, paths.length_m / SPEED_OF_LIGHT
@@ -156,16 +162,16 @@ class WeighedPaths:
         return id(self.of_bin), self.row.tobytes()
 
     @classmethod
-    def turned(cls, view: ReceiverView, weigh: Weigh, of_bin: np.ndarray, row: np.ndarray) -> WeighedPaths:
+    def turned(cls, view: View, weigh: Weigh, of_bin: np.ndarray, row: np.ndarray) -> WeighedPaths:
         """Those of one receiver that depend on arrival alone: bins are pixels, ``of_bin`` (D, B) that of their
         directions (:func:`pixel_means`), of which each reading is a ``row`` (N,)."""
-        hit = view.hits.face.numpy() >= 0
-        pixel = np.arange(len(hit)) // view.transport.grid.sub_pixels**2
+        hit = view.hits.face >= 0
+        pixel = np.arange(len(hit)) // view.tracer.grid.sub_pixels**2
         return cls(np.where(hit, pixel, -1), of_bin, row, _of_direct(view, weigh))
 
     @classmethod
     def of(
-        cls, view: ReceiverView, weigh: Weigh, *, arrival: bool, departure: bool, delay_step_s: float | None
+        cls, view: View, weigh: Weigh, *, arrival: bool, departure: bool, delay_step_s: float | None
     ) -> WeighedPaths:
         """Those of one receiver.
 
@@ -179,12 +185,12 @@ class WeighedPaths:
             departure: whether it depends on where a path left.
             delay_step_s: delays that differ by less are not told apart; None where they do not count.
         """
-        grid, transmitter, hit = view.transport.grid, view.transport.transmitter, view.hits.face.numpy() >= 0
+        grid, transmitter, hit = view.tracer.grid, view.tracer.transmitter, view.hits.face >= 0
         ray = np.flatnonzero(hit)
         toward = grid.directions[ray % len(grid.directions)]
         out = view.hits.points(ray) - transmitter
         length = np.linalg.norm(out, axis=1)
-        delay = (length + view.hits.range_m.numpy()[ray]) / SPEED_OF_LIGHT
+        delay = (length + view.hits.range_m[ray]) / SPEED_OF_LIGHT
         out /= np.maximum(length, 1e-9)[:, None]
         key = [ray // grid.sub_pixels**2 if arrival else np.zeros(len(ray), int)]
         if departure:
@@ -207,7 +213,7 @@ class WeighedPaths:
         of_bin = weigh(unit[0], unit[1], mean[2][:, 0] / np.maximum(count, 1)).astype(np.float32, copy=False)
         return cls(ray_bin, of_bin, np.arange(len(of_bin)), _of_direct(view, weigh))
 
-    def bins(self, view: ReceiverView) -> tuple[np.ndarray, int]:
+    def bins(self, view: View) -> tuple[np.ndarray, int]:
         """Bins of direction and delay."""
         return self.ray_bin, self.of_bin.shape[1]
 
@@ -227,7 +233,7 @@ class WeighedPaths:
         np.add.at(table, self.row, readings)
         return np.asarray(self.of_bin.T @ table)
 
-    def of_paths(self, view: ReceiverView) -> np.ndarray:
+    def of_paths(self, view: View) -> np.ndarray:
         """Each path's weights."""
         return self.path
 
@@ -241,7 +247,7 @@ class WeighedPaths:
         return 2 * len(self.row) < len(self.of_bin)
 
 
-def _of_direct(view: ReceiverView, weigh: Weigh) -> np.ndarray:
+def _of_direct(view: View, weigh: Weigh) -> np.ndarray:
     """Readings of unit power on each line-of-sight and mirror path, shape ``(L, N)`` float32."""
     return np.ascontiguousarray(weigh(*direct_paths(view)).T, np.float32)
 
@@ -267,16 +273,20 @@ class Superposition:
     ends: tuple[np.ndarray, np.ndarray]
 
     def amplitudes(
-        self, power: np.ndarray, path_group: np.ndarray, cosine: np.ndarray, turn: np.ndarray, p: Parameters
+        self, sharp: Records, p: Parameters, material: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Of each path ``(L,)``, real because half-spaces have no phase but their sign, and its derivatives to
-        ``log_excess`` of each group met ``(L, 3)``; those to ``log_mirror`` are half of it. The common gain apart.
+        ``log_excess`` of each mirror met ``(L, K)``; those to ``log_mirror`` are half of it. The common gain apart.
 
-        Args: as for :func:`warprrf.rf.fields.bistatic.materials.mirror_power`.
+        Args:
+            sharp: the paths.
+            p: parameters of materials.
+            material: of each group; by default groups are rows of ``p``.
         """
-        reflects = path_group >= 0
-        own = np.maximum(path_group, 0)
-        size = np.sqrt(power) * np.exp(0.5 * np.where(reflects, p.log_mirror[own], 0.0).sum(axis=1))
+        reflects, own = sharp.index >= 0, np.maximum(sharp.index, 0)
+        own = own if material is None else material[own]
+        size = np.sqrt(sharp.power) * np.exp(0.5 * np.where(reflects, p.log_mirror[own], 0.0).sum(axis=1))
+        cosine, turn = sharp.angle[..., 0], sharp.angle[..., 1]
         polarised, slope = chain_amplitude(p.log_excess[own], cosine, turn, reflects, self.ends)
         return size * polarised, size[:, None] * slope
 
@@ -318,11 +328,11 @@ class ArrayImage:
 
     @classmethod
     def of(
-        cls, view: ReceiverView, array: PlanarArray, directions: np.ndarray, length_std_m: float
+        cls, view: View, array: PlanarArray, directions: np.ndarray, length_std_m: float
     ) -> ArrayImage:
         """That of the one receiver of ``view``, steered to ``directions`` (N, 3); lengths of paths are known to
         ``length_std_m`` [m]."""
-        grid, paths = view.transport.grid, view.paths
+        grid, paths = view.tracer.grid, view.paths
         place = array.positions(1.0)
         lag = np.round((place[:, None] - place[None]).reshape(-1, 3), 9)
         first = np.take_along_axis(lag, (lag != 0).argmax(axis=1)[:, None], axis=1)
@@ -334,7 +344,7 @@ class ArrayImage:
         arriving = np.concatenate([np.cos(met), np.sin(met)], axis=1) * array.gain(pixels)[:, None]
         heard = array.response(paths.arrival, 1.0) @ array.response(directions, 1.0).conj().T / array.elements
         heard *= np.sqrt(array.gain(paths.arrival))[:, None]
-        wavelength = view.transport.wavelength_m
+        wavelength = view.tracer.wavelength_m
         kept = np.exp(-0.5 * (2.0 * np.pi * length_std_m / wavelength) ** 2)
         phase = np.exp(-2j * np.pi * np.mod(paths.length_m / wavelength, 1.0))
         together = Superposition(
@@ -344,9 +354,9 @@ class ArrayImage:
         )
         return cls(steered.astype(np.float32), np.ascontiguousarray(arriving.T, np.float32), together)
 
-    def bins(self, view: ReceiverView) -> tuple[np.ndarray, int]:
+    def bins(self, view: View) -> tuple[np.ndarray, int]:
         """A bin for each pixel of the rays' grid."""
-        grid = view.transport.grid
+        grid = view.tracer.grid
         return np.arange(len(view.hits.face)) // grid.sub_pixels**2, grid.shape[0] * grid.shape[1]
 
     def of_bins(self, power: np.ndarray, *, quick: bool = False) -> np.ndarray:
@@ -359,7 +369,7 @@ class ArrayImage:
         """By their lags, the other way."""
         return np.asarray(self.arriving.T @ (self.steered.T @ readings.astype(np.float32)))
 
-    def of_paths(self, view: ReceiverView) -> np.ndarray:
+    def of_paths(self, view: View) -> np.ndarray:
         """Of each path alone."""
         return np.asarray(np.abs(self.together.field) ** 2 + self.together.power)
 
@@ -370,13 +380,13 @@ class ArrayImage:
         return replace(self, steered=self.steered[index], together=fewer)
 
 
-def _vertical(view: ReceiverView) -> tuple[np.ndarray, np.ndarray]:
+def _vertical(view: View) -> tuple[np.ndarray, np.ndarray]:
     """Fields of vertical antennas at both ends of each path of one receiver, shape ``(L, 2)`` each."""
-    paths, surface = view.paths, view.transport.surface
+    paths, surface = view.paths, view.tracer.surface
     sent, received = np.zeros((len(paths), 2)), np.zeros((len(paths), 2))
     for order in np.unique(paths.order):
         own = np.flatnonzero(paths.order == order)
         ends = np.broadcast_to(view.receivers[0], (len(own), 3))
-        stops = stops_of(view.transport.transmitter, paths.point[own, :order], ends)
+        stops = stops_of(view.tracer.transmitter, paths.point[own, :order], ends)
         sent[own], received[own] = vertical_ends(stops, surface.plane_normal[paths.patch[own, :order]])
     return sent, received

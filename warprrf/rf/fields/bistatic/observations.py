@@ -1,10 +1,16 @@
-"""What a fit learns from: data sets of any kind, taken apart into places, one receiver under one transmitter each."""
+"""What a fit learns from: data sets of any kind, taken apart into places, one receiver under one transmitter each, and what
+was read there as observations that a fit can predict and linearise.
+
+A new kind of measurement is a class like :class:`_Spectra` in :data:`KINDS`: it says where it was taken, and how its readings
+come from paths (:mod:`warprrf.rf.fields.bistatic.measured`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -14,23 +20,25 @@ from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import Data, Measured
-from warprrf.rf.fields.bistatic.fit import NEPER, OWN_GAIN, Target, gain_of
-from warprrf.rf.fields.bistatic.materials import Parameters, Terms
-from warprrf.rf.fields.bistatic.measured import (
-    ArrayImage,
-    Measurement,
-    SpectrumPixels,
-    WeighedPaths,
-    pixel_means,
-)
-from warprrf.rf.fields.bistatic.response import predict, respond
-from warprrf.rf.fields.bistatic.transport import ReceiverView
+from warprrf.rf.fields.bistatic.interreflection import irradiance
+from warprrf.rf.fields.bistatic.materials import SETS, Effects, Layout, Model, Parameters
+from warprrf.rf.fields.bistatic.measured import ArrayImage, Measurement, SpectrumPixels, WeighedPaths, pixel_means, read
+from warprrf.rf.fields.bistatic.records import Bins, Evaluation
+from warprrf.rf.fields.bistatic.render import evaluation, path_gains
+from warprrf.rf.fields.bistatic.tracer import SHARP, View
 from warprrf.rf.positions import check_dataset, check_positions, question_unit, warn_of_unmodelled
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings, path_weights, question_readings
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, to_db
 
+NEPER = 10.0 / np.log(10.0)
+"""Decibels of a neper of power."""
+OWN_GAIN = -2
+"""In place of a measuring chain's index: readings of one place whose common gain is not known. Their sum tells it."""
+NOISE_DB = 3.0
+"""Standard deviation of an independent reading's error that priors are weighed against. Errors of a view's pixels hang
+together (one misplaced edge), which a larger value stands for."""
 READINGS_SHAPE = (60, 120)
 """Rows and columns of the rays around a receiver of whom no spectrum is known, and of its field's spectra."""
 PIXELS_PER_LAG = 4
@@ -40,6 +48,14 @@ READING_ERROR_DB = 1.0
 TOTAL_ERROR_DB = 0.5
 """The same of all power of a place: errors of single directions average out."""
 TAP_STEPS = 4.0  # that delays are told apart in, per tap
+
+
+def huber(error: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
+    """Loss and weight of each error: square up to ``threshold``, linear beyond (Huber 1964)."""
+    size = np.abs(error)
+    small = size <= threshold
+    loss = np.where(small, error**2, threshold * (2 * size - threshold))
+    return loss, np.where(small, 1.0, threshold / np.maximum(size, 1e-12))
 
 
 @dataclass(frozen=True)
@@ -52,8 +68,8 @@ class Place:
         transmitter, receiver: positions [m], shape ``(3,)``.
         frequency_hz: carrier.
         shape: rows and columns of its rays' grid.
-        beam_sigma_rad: width of the receiver's beam; None where no spectrum was read.
         air: whose absorption is in the readings.
+        beam_sigma_rad: width of the receiver's beam; None where no spectrum was read.
         chain: name of the measuring chain, "" where its gain is known.
     """
 
@@ -63,8 +79,8 @@ class Place:
     receiver: np.ndarray
     frequency_hz: float
     shape: tuple[int, int]
-    beam_sigma_rad: float | None
     air: Air | None
+    beam_sigma_rad: float | None = None
     chain: str = ""
 
     @property
@@ -97,67 +113,471 @@ def as_list(data: Data) -> list[Measured]:
     return several
 
 
-def transmitters_of(one: Measured) -> np.ndarray:
-    """Position of the transmitter of each of its receivers [m], shape ``(R, 3)``."""
-    if isinstance(one, SpectrumDataset):
-        return np.broadcast_to(one.transmitter, one.receivers.shape)
-    return one.transmitters
+@dataclass(frozen=True)
+class Target:
+    """What was read at one receiver, and how errors of it count.
 
-
-def places_of(data: Sequence[Measured], mesh: Mesh | None, device: DeviceLike) -> list[Place]:
-    """The places of data sets, in their order.
-
-    Raises:
-        ValueError: for a place where no field can hold; see :func:`warprrf.rf.positions.check_positions`.
+    Attributes:
+        db: readings, 10 log10(P / N0 + 1), shape ``(N,)``.
+        trust: by which errors are multiplied: 1 but for readings with noise of their own, 0 for those left out, shape
+            ``(N,)``; None for 1.
+        censored: readings that only say that there was no more, shape ``(N,)`` bool; None for none.
     """
-    found = []
-    for k, one in enumerate(data):
-        if isinstance(one, SpectrumDataset):
-            receivers, transmitter = check_dataset(mesh, one, device=device)
-            found += [
-                Place(
-                    k,
-                    np.array([r]),
-                    transmitter,
-                    receiver,
-                    one.frequency_hz,
-                    one.shape,
-                    one.beam_sigma_rad,
-                    one.air,
-                )
-                for r, receiver in enumerate(receivers)
-            ]
-            continue
-        _check_readings(mesh, one, device)
-        if isinstance(one, ArraySpectra):
-            found += [
-                Place(k, np.array([r]), *ends, one.frequency_hz, READINGS_SHAPE, None, one.air)
-                for r, ends in enumerate(zip(one.transmitters, one.receivers, strict=True))
-            ]
-            continue
+
+    db: np.ndarray
+    trust: np.ndarray | None = None
+    censored: np.ndarray | None = None
+
+    @classmethod
+    def joined(cls, targets: Sequence[Target]) -> Target:
+        """All readings of ``targets``, one after another."""
+        trust = [np.ones(len(t.db)) if t.trust is None else t.trust for t in targets]
+        censored = [np.zeros(len(t.db), bool) if t.censored is None else t.censored for t in targets]
+        return cls(
+            np.concatenate([t.db for t in targets]),
+            np.concatenate(trust) if any(t.trust is not None for t in targets) else None,
+            np.concatenate(censored) if any(t.censored is not None for t in targets) else None,
+        )
+
+    def part(self, index: np.ndarray) -> Target:
+        """Some of the readings."""
+        return Target(*(None if a is None else a[index] for a in (self.db, self.trust, self.censored)))  # type: ignore[arg-type]
+
+    def trusted(self, trust: np.ndarray) -> Target:
+        """The same with errors multiplied by ``trust`` (N,)."""
+        return replace(self, trust=trust * (1.0 if self.trust is None else self.trust))
+
+    def gain(self, power: np.ndarray) -> float:
+        """Under which predicted powers (N,) in units of the floor have the sum of what was read."""
+        known = 1.0 if self.trust is None else self.trust > 0
+        return float((known * np.expm1(self.db / NEPER)).sum() / max((known * power).sum(), 1e-300))
+
+    def error(self, power: np.ndarray) -> np.ndarray:
+        """Error of predicted powers ``(..., N)`` in units of the floor, as it counts [dB]."""
+        error = NEPER * np.log1p(power) - self.db
+        if self.censored is not None:
+            error = np.where(self.censored, np.maximum(error, 0.0), error)
+        return np.asarray(error if self.trust is None else self.trust * error)
+
+    def slope(self, power: np.ndarray) -> np.ndarray:
+        """Derivative of :meth:`error` to the power ``(N,)``."""
+        slope = NEPER / (1.0 + power)
+        if self.censored is not None:
+            slope = np.where(self.censored & (NEPER * np.log1p(power) <= self.db), 0.0, slope)
+        return np.asarray(slope if self.trust is None else self.trust * slope)
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """What was read at a place, and how it comes from paths.
+
+    Attributes:
+        place: where.
+        view: what is seen there.
+        measured: how the N readings come from paths.
+        target: what was read.
+        floor: path gain that readings are in units of.
+        chain: index of the measuring chain whose gain is unknown, -1 where it is known, or :data:`OWN_GAIN`.
+        ratio: carrier of the readings over that of the fit's parameters.
+        robust: whether single readings may be wrong, so that errors count as Huber has them.
+        prefers_direct: whether readings of line of sight alone, which hold no material, count for more.
+        rows: which of the place's readings these are, shape ``(N,)``; None for all.
+    """
+
+    place: Place
+    view: View = field(repr=False)
+    measured: Measurement = field(repr=False)
+    target: Target = field(repr=False)
+    floor: float
+    chain: int = -1
+    ratio: float = 1.0
+    robust: bool = True
+    prefers_direct: bool = False
+    rows: np.ndarray | None = None
+    _kept: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)
+
+    def part(self, index: np.ndarray) -> Observation:
+        """That of some of the readings."""
+        return replace(self, measured=self.measured.part(index), target=self.target.part(index), rows=index)
+
+    def losses(self, power: np.ndarray, huber_db: float) -> np.ndarray:
+        """Squared errors (N,) of predicted readings as they count [dB^2]."""
+        error = self.target.error(power)
+        return huber(error, huber_db)[0] if self.robust else error**2
+
+    def gain(self, p: Parameters, power: np.ndarray) -> float:
+        """Of the measuring chain, or of these readings, where ``power`` (N,) is predicted in units of the floor."""
+        if self.chain == OWN_GAIN:
+            return self.target.gain(power)
+        return float(np.exp(p.log_gains[self.chain])) if self.chain >= 0 else 1.0
+
+    def predicted(self, model: Model, materials: Evaluation) -> np.ndarray:
+        """Readings under a model of groups, residual and gains included, in units of the floor, shape ``(N,)``."""
+        power = np.maximum(read(path_gains(self.view, model, materials), self.measured), 0.0) / self.floor
+        return self.gain(model.parameters, power) * power
+
+    @property
+    def path(self) -> np.ndarray:
+        """Readings of unit power on each line of sight and mirror path, in units of the floor, shape ``(L, N)``."""
+        return self._once("path", lambda: self.measured.of_paths(self.view) / np.float32(self.floor))
+
+    def bins(self, name: str) -> Bins:
+        """Records of a sequence by what the readings cannot tell apart."""
+        own, count = self._ray_bins()
+        return self._once((name, "bins"), lambda: Bins.of(own[self.view.records[name].ray], count))
+
+    def groups(self, name: str) -> np.ndarray:
+        """Groups whose parameters the records of a sequence hang on."""
+        return self._once((name, "groups"), lambda: self.view.records[name].groups(self.view.tracer.surface.side_group))
+
+    def power(self, effects: Effects, materials: Evaluation) -> np.ndarray:
+        """Prediction without residual and chain's gain, in units of the floor, shape ``(N,)``."""
+        own, count = self._ray_bins()
+        table = np.zeros(count)
+        for name, records in self._tables(effects):
+            bins = own[records.ray]
+            table += np.bincount(bins + 1, records.powers(materials), count + 1)[1:]
+        found = np.maximum(self.measured.of_bins(table[:, None])[:, 0] / self.floor, 0.0)
+        return materials.parameters.gain * (found + self._direct(effects, materials)[0])
+
+    def slopes(
+        self, effects: Effects, materials: Evaluation, layout: Layout, material: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of :meth:`power` to the parameters of materials ``(C, N)`` float32, and their places ``(C,)``.
+
+        Args:
+            material: of each group, shape ``(G,)``.
+        """
+        tables = self._tables(effects)
+        groups = [self.groups(name) for name in (SHARP, *(name for name, _ in tables))]
+        seen = np.unique(material[np.concatenate(groups)])
+        index = (layout.stride * seen[:, None] + np.arange(layout.stride)).ravel()
+        place = np.zeros(layout.groups, np.int32)
+        place[seen] = layout.stride * np.arange(len(seen))
+        found = np.zeros((self._ray_bins()[1], len(index)), np.float32)
+        for name, records in tables:
+            records.add_slopes(materials, self.bins(name), place, found)
+        table = np.asarray(self.measured.of_bins(found, quick=True)).T / np.float32(self.floor)
+        direct, columns = self._direct_slopes(effects, materials, place, len(index))
+        table = table + direct.T.astype(np.float32) @ columns
+        return np.float32(materials.parameters.gain) * table, index
+
+    def _tables(self, effects: Effects) -> list[tuple[str, Any]]:
+        return [(name, records) for name, records in self.view.tables(effects).items() if name != SHARP]
+
+    def _direct(self, effects: Effects, materials: Evaluation) -> tuple[np.ndarray, np.ndarray]:
+        """Readings of line of sight and mirrors ``(N,)``, and what their slopes are multiplied by ``(L, N)``."""
+        kept, sharp = self.view.kept_paths(effects), self.view.records[SHARP]
+        if (together := self.measured.together) is None:
+            power = np.where(kept, sharp.powers(materials), 0.0)
+            return power.astype(np.float32) @ self.path, self.path
+        amplitude = np.where(kept, together.amplitudes(sharp, materials.parameters, materials.material)[0], 0.0)
+        slopes = together.slopes(amplitude) / self.floor
+        return 0.5 * amplitude @ slopes, slopes
+
+    def _direct_slopes(
+        self, effects: Effects, materials: Evaluation, place: np.ndarray, count: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of path powers, or amplitudes where phases count, ``(L, count)``, and what each reads ``(L, N)``."""
+        kept, sharp = self.view.kept_paths(effects), self.view.records[SHARP]
+        columns = self._direct(effects, materials)[1]
+        found = np.zeros((len(sharp), count))
+        if (together := self.measured.together) is None:
+            each = Bins.of(np.arange(len(sharp)), len(sharp))
+            sharp.add_slopes(materials, each, place, found)
+        else:
+            amplitude, rise = together.amplitudes(sharp, materials.parameters, materials.material)
+            for path, mirror in zip(*np.nonzero(sharp.index >= 0), strict=True):
+                at = place[materials.material[sharp.index[path, mirror]]] + len(materials.parameters.lobes)
+                found[path, at : at + 2] += rise[path, mirror], 0.5 * amplitude[path]
+        return found * kept[:, None], columns
+
+    def _ray_bins(self) -> tuple[np.ndarray, int]:
+        return self._once("rays", lambda: self.measured.bins(self.view))
+
+    def _once(self, key: Any, make: Any) -> Any:
+        if key not in self._kept:
+            self._kept[key] = make()
+        return self._kept[key]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What parameters of materials are fitted to: observations, and what is held meanwhile.
+
+    Attributes:
+        observations: of the training receivers.
+        effects: what is modelled.
+        material: of each group, shape ``(G,)``.
+        irradiance: what elements get of each other, by tracer and ratio of carriers; empty without that.
+        chains: measuring chains whose gain is unknown.
+        gain_offset: whether a gain common to all paths is free.
+        noise_db: see :data:`NOISE_DB`.
+        huber_db: larger errors count linearly [dB]: shadows that the geometry puts in the wrong place.
+        energy: deviation of scattered and mirrored shares from a sum of one.
+    """
+
+    observations: Sequence[Observation]
+    effects: Effects
+    material: np.ndarray
+    irradiance: dict[Any, np.ndarray]
+    chains: int = 0
+    gain_offset: bool = False
+    noise_db: float = NOISE_DB
+    huber_db: float = 3.0
+    energy: float = 0.25
+
+    def lit(self, p: Parameters) -> Problem:
+        """The same with what elements get of each other under parameters ``p`` of materials."""
+        found: dict[Any, np.ndarray] = {}
+        for o in self.observations:
+            key = id(o.view.tracer), o.ratio
+            if key not in found:
+                got = irradiance(o.view.tracer, p.at_ratio(o.ratio).take(self.material), self.effects)
+                found |= {} if got is None else {key: got}
+        return replace(self, irradiance=found)
+
+    def evaluated(self, p: Parameters) -> Iterator[tuple[Observation, Evaluation]]:
+        """Observations with the parameters ``p`` of materials as kernels take them."""
+        known: dict[Any, Evaluation] = {}
+        for o in self.observations:
+            key = id(o.view.tracer), o.ratio
+            if key not in known:
+                here, side, got = p.at_ratio(o.ratio), o.view.tracer.surface.side_group, self.irradiance.get(key)
+                radiance = None if got is None else got * here.scattered_share[self.material[side]] / np.pi
+                known[key] = Evaluation(here, self.material, side, radiance, device=o.view.tracer.grid.device)
+            yield o, known[key]
+
+    def powers(self, p: Parameters) -> list[np.ndarray]:
+        """Predictions without the gains of chains, in units of each floor."""
+        return [o.power(self.effects, materials) for o, materials in self.evaluated(p)]
+
+    def errors_db(self, p: Parameters) -> Iterator[np.ndarray]:
+        """Predictions less what was read, as it counts [dB]."""
+        for o, materials in self.evaluated(p):
+            power = o.power(self.effects, materials)
+            yield o.target.error(o.gain(p, power) * power)
+
+    def linearised(self, p: Parameters, layout: Layout) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """:meth:`errors_db` ``(N,)``, derivatives ``(C, N)`` float32, and the places of those parameters ``(C,)``."""
+        for o, materials in self.evaluated(p):
+            power = o.power(self.effects, materials)
+            table, index = o.slopes(self.effects, materials, layout, self.material)
+            if layout.gain:
+                table = np.concatenate([table, power[None].astype(np.float32)])
+                index = np.append(index, layout.common_gain)
+            if o.ratio != 1.0:
+                slopes = layout.slopes_at_ratio(p, o.ratio)[index]
+                index = np.unique(slopes.indices)
+                table = np.asarray(slopes[:, index].T @ table)
+            gain = o.gain(p, power)
+            if o.chain == OWN_GAIN:  # what changes all alike changes nothing
+                known = np.ones(len(power)) if o.target.trust is None else (o.target.trust > 0).astype(float)
+                alike = table @ known / max(float(known @ power), 1e-300)
+                table = table - alike[:, None] * power
+            if o.chain != -1:
+                power, table = gain * power, np.float32(gain) * table.astype(np.float32)
+            if o.chain >= 0:
+                table = np.concatenate([table, power[None].astype(np.float32)])
+                index = np.append(index, layout.first_chain + o.chain)
+            table *= o.target.slope(power).astype(np.float32)
+            yield o.target.error(power), table, index
+
+
+class Kind(Protocol):
+    """How one kind of data set is taken apart; made with its number among the data sets, and the set."""
+
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """Transmitter of each receiver and the receivers [m], shape ``(R, 3)`` each."""
+
+    def places(self, mesh: Mesh | None, device: DeviceLike) -> list[Place]:
+        """Where it was taken, checked."""
+
+    def observe(self, place: Place, view: View) -> Observation:
+        """What was read at ``place``, where ``view`` is seen."""
+
+    def frame(self) -> Frame:
+        """What a field's spectra are made with, if it is the first."""
+
+
+@dataclass(eq=False)
+class _Spectra:
+    """Whole spectra: pixels through a beam."""
+
+    number: int
+    one: SpectrumDataset
+    _whole: dict[Any, Any] = field(default_factory=dict)
+
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.broadcast_to(self.one.transmitter, self.one.receivers.shape), self.one.receivers
+
+    def places(self, mesh: Mesh | None, device: DeviceLike) -> list[Place]:
+        one = self.one
+        receivers, transmitter = check_dataset(mesh, one, device=device)
+        return [
+            Place(self.number, np.array([r]), transmitter, receiver, one.frequency_hz, one.shape, one.air, one.beam_sigma_rad)
+            for r, receiver in enumerate(receivers)
+        ]  # fmt: skip
+
+    def observe(self, place: Place, view: View) -> Observation:
+        one, key = self.one, str(view.tracer.grid.device)
+        if key not in self._whole:
+            self._whole[key] = SpectrumPixels(beam_operator(one.shape, one.beam_sigma_rad, key))
+        gain = one.path_gain[place.rows[0]].ravel()
+        known = np.isfinite(gain)
+        above = to_db(np.where(known, gain, 0.0), one.floor) - 10.0 * np.log10(one.floor)
+        target = Target(above, None if known.all() else known.astype(float))
+        return Observation(place, view, self._whole[key], target, float(one.floor), robust=False)
+
+    def frame(self) -> Frame:
+        one = self.one
+        return Frame(
+            one.transmitter, one.frequency_hz, one.shape, one.floor, one.range_db, one.beam_sigma_rad, one.air
+        )  # fmt: skip
+
+
+@dataclass(eq=False)
+class _Tables:
+    """Tables of readings: horns, power alone, taps of delay."""
+
+    number: int
+    one: Readings
+    _pointings: tuple[np.ndarray, np.ndarray] | None | bool = False
+
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.one.transmitters, self.one.receivers
+
+    def places(self, mesh: Mesh | None, device: DeviceLike) -> list[Place]:
+        one = self.one
+        question_readings(one)
+        _check_places(mesh, one, device)
         names, chain = np.unique(np.asarray(one.chain), return_inverse=True)
         key = np.column_stack([one.transmitters, one.receivers, chain])
         first, own, count = np.unique(
             key, axis=0, return_index=True, return_inverse=True, return_counts=True
         )[1:]
         every = np.split(np.argsort(own.reshape(-1), kind="stable"), np.cumsum(count)[:-1])
+        found = []
         for number in np.argsort(first):
             rows = every[number][np.isfinite(one.power[every[number]])]
             if len(rows):
                 at = int(first[number])
-                found.append(
-                    Place(
-                        k, rows, one.transmitters[at], one.receivers[at], one.frequency_hz, READINGS_SHAPE, None,
-                        one.air, str(names[chain[at]]),
-                    )
-                )  # fmt: skip
-    return found
+                ends = one.transmitters[at], one.receivers[at]
+                name = str(names[chain[at]])
+                found.append(Place(self.number, rows, *ends, one.frequency_hz, READINGS_SHAPE, one.air, chain=name))
+        return found
+
+    def observe(self, place: Place, view: View) -> Observation:
+        one, rows = self.one, place.rows
+        floors = np.asarray(one.floor)[rows]
+        floor = float(floors.min())
+        expected = one.expected_db[rows] - 10.0 * np.log10(floor)
+        above = NEPER * np.log1p(10.0 ** (expected / 10.0))
+        step = None if one.bandwidth_hz is None else 1.0 / (TAP_STEPS * one.bandwidth_hz)
+        weigh = partial(path_weights, one, rows, dtype=np.float32)
+        if self._pointings is False:
+            self._pointings = _pointings(one, view)
+        if self._pointings:
+            measured = WeighedPaths.turned(view, weigh, self._pointings[0], self._pointings[1][rows])
+        else:
+            told_apart = {"arrival": one.arrival is not None, "departure": one.departure is not None}
+            measured = WeighedPaths.of(view, weigh, **told_apart, delay_step_s=step)
+        unexplained = TOTAL_ERROR_DB if one.total else READING_ERROR_DB
+        trust = NOISE_DB / np.hypot(unexplained, one.noise_db[rows])
+        target = Target(above, trust, one.power[rows] <= floors)
+        return Observation(place, view, measured, target, floor, prefers_direct=not one.total)
+
+    def frame(self) -> Frame:
+        return _frame_of_powers(self.one)
 
 
-def _check_readings(mesh: Mesh | None, one: Readings | ArraySpectra, device: DeviceLike) -> None:
+@dataclass(eq=False)
+class _Arrays:
+    """Spectra of coherent arrays."""
+
+    number: int
+    one: ArraySpectra
+
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.one.transmitters, self.one.receivers
+
+    def places(self, mesh: Mesh | None, device: DeviceLike) -> list[Place]:
+        one = self.one
+        _check_places(mesh, one, device)
+        return [
+            Place(self.number, np.array([r]), *ends, one.frequency_hz, READINGS_SHAPE, one.air)
+            for r, ends in enumerate(zip(one.transmitters, one.receivers, strict=True))
+        ]
+
+    def observe(self, place: Place, view: View) -> Observation:
+        """Evenly chosen directions, some times as many as the array can tell apart, each trusted the less the more of it is
+        scattered: random phases give |c + n|^2, n complex Gaussian of power s, the variance s^2 + 2 s |c|^2."""
+        one = self.one
+        measured = ArrayImage.of(view, one.array, one.directions.reshape(-1, 3), one.length_std_m)
+        power = one.power[place.rows[0]].ravel()
+        known = np.flatnonzero(np.isfinite(power))
+        most = PIXELS_PER_LAG * measured.steered.shape[1]
+        if len(known) > most:
+            known = known[np.round(np.linspace(0, len(known) - 1, most)).astype(int)]
+        unit = 1.0
+        if one.relative:  # of a size that prediction's is comparable to
+            distance = float(np.linalg.norm(place.receiver - place.transmitter))
+            unit = (SPEED_OF_LIGHT / one.frequency_hz / (4.0 * np.pi * distance)) ** 2
+        target, chain = Target(NEPER * np.log1p(power[known] / one.floor)), OWN_GAIN if one.relative else -1
+        bare = Observation(place, view, measured.part(known), target, unit * one.floor, chain)
+        start = Parameters.prior(view.tracer.surface.groups)
+        materials, single = Evaluation(start, device=view.tracer.grid.device), SETS["single"]
+        total = bare.power(single, materials)
+        scattered = bare.power(replace(single, line_of_sight=False, mirrors=0), materials)
+        gain = bare.gain(start, total)
+        std_db = (
+            NEPER * gain * np.sqrt(scattered * np.maximum(2.0 * total - scattered, 0.0)) / (1.0 + gain * total)
+        )
+        return replace(bare, target=target.trusted(NOISE_DB / np.hypot(NOISE_DB, std_db)), robust=True)
+
+    def frame(self) -> Frame:
+        return _frame_of_powers(self.one)
+
+
+KINDS: dict[type, Any] = {SpectrumDataset: _Spectra, Readings: _Tables, ArraySpectra: _Arrays}
+"""How each kind of data set is taken apart."""
+
+
+def kinds_of(data: Sequence[Measured]) -> list[Kind]:
+    """What takes each of ``data`` apart."""
+    return [next(make for kind, make in KINDS.items() if isinstance(one, kind))(k, one) for k, one in enumerate(data)]
+
+
+def observe(
+    data: Sequence[Measured], places: Sequence[Place], views: Sequence[View], frequency_hz: float
+) -> tuple[list[Observation], list[str]]:
+    """What was read at each of ``places``, and the names of the chains whose gain is unknown.
+
+    Args:
+        views: what is seen at each place.
+        frequency_hz: carrier that a fit's parameters are of.
+    """
+    chains, kinds = sorted({p.chain for p in places} - {""}), kinds_of(data)
+    index = {name: k for k, name in enumerate(chains)}
+    found = []
+    for place, view in zip(places, views, strict=True):
+        one = kinds[place.data].observe(place, view)
+        found.append(replace(one, chain=index.get(place.chain, one.chain), ratio=float(place.frequency_hz / frequency_hz)))
+    return found, chains
+
+
+def _pointings(one: Readings, view: View) -> tuple[np.ndarray, np.ndarray] | None:
+    """What each pointing of a receiving antenna reads of unit power in each pixel, shape ``(D, P)`` float32, and which one
+    each reading is, shape ``(N,)``; None where arrival is not all that counts."""
+    if one.arrival is None or one.departure is not None or one.delay_s is not None:
+        return None
+    first, row = np.unique(one.arrival, axis=0, return_index=True, return_inverse=True)[1:]
+    toward = pixel_means(view.tracer.grid)
+    return path_weights(one, first, toward, toward, np.zeros(len(toward)), dtype=np.float32), row.reshape(-1)
+
+
+def _check_places(mesh: Mesh | None, one: Readings | ArraySpectra, device: DeviceLike) -> None:
     wavelength_m = SPEED_OF_LIGHT / one.frequency_hz
-    if isinstance(one, Readings):
-        question_readings(one)
     if mesh is not None:
         question_unit(mesh, wavelength_m)
     transmitters, under = np.unique(one.transmitters, axis=0, return_inverse=True)
@@ -166,121 +586,6 @@ def _check_readings(mesh: Mesh | None, one: Readings | ArraySpectra, device: Dev
         names = "ds.transmitters", "ds.receivers"
         check_positions(mesh, transmitter, receivers, wavelength_m, names=names, device=device)
         warn_of_unmodelled(mesh, transmitter, receivers, frequency_hz=one.frequency_hz, device=device)
-
-
-@dataclass(frozen=True)
-class Observed:
-    """What was read at a place.
-
-    Attributes:
-        place: where.
-        measured: how readings come from paths.
-        target: what was read.
-        floor: path gain that readings are in units of.
-        chain: index of the measuring chain whose gain is unknown, -1 where it is known, or :data:`OWN_GAIN`.
-    """
-
-    place: Place
-    measured: Measurement = field(repr=False)
-    target: Target = field(repr=False)
-    floor: float
-    chain: int
-
-
-def observe(
-    data: Sequence[Measured],
-    places: Sequence[Place],
-    views: Sequence[ReceiverView],
-    noise_db: float,
-) -> tuple[list[Observed], list[str]]:
-    """What was read at each of ``places``, and the names of the chains whose gain is unknown.
-
-    Args:
-        views: what is seen at each place.
-        noise_db: standard deviation of errors that are not noise [dB].
-    """
-    chains = sorted({p.chain for p in places} - {""})
-    index = {name: k for k, name in enumerate(chains)}
-    found: list[Observed] = []
-    whole: dict[tuple[tuple[int, int], float], SpectrumPixels] = {}
-    pointings: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
-    for place, view in zip(places, views, strict=True):
-        one = data[place.data]
-        if isinstance(one, SpectrumDataset):
-            key = one.shape, one.beam_sigma_rad
-            if key not in whole:
-                whole[key] = SpectrumPixels(beam_operator(*key, view.transport.grid.device))
-            gain = one.path_gain[place.rows[0]].ravel()
-            known = np.isfinite(gain)
-            above = to_db(np.where(known, gain, 0.0), one.floor) - 10.0 * np.log10(one.floor)
-            target = Target(above, None if known.all() else known.astype(float))
-            found.append(Observed(place, whole[key], target, float(one.floor), -1))
-            continue
-        if isinstance(one, ArraySpectra):
-            found.append(_observe_array(one, place, view, noise_db))
-            continue
-        rows, floors = place.rows, np.asarray(one.floor)[place.rows]
-        floor = float(floors.min())
-        expected = one.expected_db[rows] - 10.0 * np.log10(floor)
-        above = NEPER * np.log1p(10.0 ** (expected / 10.0))
-        step = None if one.bandwidth_hz is None else 1.0 / (TAP_STEPS * one.bandwidth_hz)
-        weigh = partial(path_weights, one, rows, dtype=np.float32)
-        if place.data not in pointings:
-            pointings[place.data] = _pointings(one, view)
-        if (known := pointings[place.data]) is not None:
-            measured = WeighedPaths.turned(view, weigh, known[0], known[1][rows])
-        else:
-            measured = WeighedPaths.of(
-                view,
-                weigh,
-                arrival=one.arrival is not None,
-                departure=one.departure is not None,
-                delay_step_s=step,
-            )
-        unexplained = TOTAL_ERROR_DB if one.total else READING_ERROR_DB
-        trust = noise_db / np.hypot(unexplained, one.noise_db[rows])
-        target = Target(above, trust, one.power[rows] <= floors)
-        found.append(Observed(place, measured, target, floor, index.get(place.chain, -1)))
-    return found, chains
-
-
-def _pointings(one: Readings, view: ReceiverView) -> tuple[np.ndarray, np.ndarray] | None:
-    """What each pointing of a receiving antenna reads of unit power in each pixel, shape ``(D, P)`` float32, and which one
-    each reading is, shape ``(N,)``; None where arrival is not all that counts."""
-    if one.arrival is None or one.departure is not None or one.delay_s is not None:
-        return None
-    first, row = np.unique(one.arrival, axis=0, return_index=True, return_inverse=True)[1:]
-    toward = pixel_means(view.transport.grid)
-    return path_weights(one, first, toward, toward, np.zeros(len(toward)), dtype=np.float32), row.reshape(-1)
-
-
-def _observe_array(one: ArraySpectra, place: Place, view: ReceiverView, noise_db: float) -> Observed:
-    """An array's spectrum: evenly chosen directions, some times as many as it can tell apart, each trusted the less the
-    more of it is scattered.
-
-    Random phases give |c + n|^2, n complex Gaussian of power s, the variance s^2 + 2 s |c|^2.
-    """
-    measured = ArrayImage.of(view, one.array, one.directions.reshape(-1, 3), one.length_std_m)
-    power = one.power[place.rows[0]].ravel()
-    known = np.flatnonzero(np.isfinite(power))
-    most = PIXELS_PER_LAG * measured.steered.shape[1]
-    if len(known) > most:
-        known = known[np.round(np.linspace(0, len(known) - 1, most)).astype(int)]
-    unit = 1.0
-    if one.relative:  # of a size that prediction's is comparable to
-        distance = float(np.linalg.norm(place.receiver - place.transmitter))
-        unit = (SPEED_OF_LIGHT / one.frequency_hz / (4.0 * np.pi * distance)) ** 2
-    target, measured = Target(NEPER * np.log1p(power[known] / one.floor)), measured.part(known)
-    chain, floor, terms = OWN_GAIN if one.relative else -1, unit * one.floor, Terms()
-    response = respond(view, measured, terms, floor)
-    start = Parameters.prior(view.transport.surface.groups, len(terms.lobes))
-    total = predict(response, start)
-    scattered = predict(replace(response, path_power=np.zeros(len(response.path_power))), start)
-    gain = gain_of(chain, start, target, total)
-    std_db = (
-        NEPER * gain * np.sqrt(scattered * np.maximum(2.0 * total - scattered, 0.0)) / (1.0 + gain * total)
-    )
-    return Observed(place, measured, target.trusted(noise_db / np.hypot(noise_db, std_db)), floor, chain)
 
 
 @dataclass(frozen=True)
@@ -300,31 +605,23 @@ class Frame:
     beam_sigma_rad: float
     air: Air | None
 
-    @classmethod
-    def of(cls, data: Sequence[Measured]) -> Frame:
-        """That of data sets; floor and range of readings are those of their powers."""
-        for one in data:
-            if isinstance(one, SpectrumDataset):
-                return cls(
-                    one.transmitter,
-                    one.frequency_hz,
-                    one.shape,
-                    one.floor,
-                    one.range_db,
-                    one.beam_sigma_rad,
-                    one.air,
-                )
-        first = data[0]
-        if isinstance(first, SpectrumDataset):
-            raise TypeError(f"ds: got {type(first).__name__}, expected Readings or ArraySpectra")
-        floor = float(np.min(first.floor))
-        levels = 10.0 * float(np.log10(floor)), 10.0 * float(np.log10(np.nanmax(first.power)))
-        return cls(
-            first.transmitters[0],
-            first.frequency_hz,
-            READINGS_SHAPE,
-            floor,
-            levels,
-            BEAM_SIGMA_RAD,
-            first.air,
-        )
+
+def _frame_of_powers(one: Readings | ArraySpectra) -> Frame:
+    """Floor and range are those of the powers."""
+    floor = float(np.min(one.floor))
+    levels = 10.0 * float(np.log10(floor)), 10.0 * float(np.log10(np.nanmax(one.power)))
+    return Frame(one.transmitters[0], one.frequency_hz, READINGS_SHAPE, floor, levels, BEAM_SIGMA_RAD, one.air)
+
+
+def frame_of(data: Sequence[Measured]) -> Frame:
+    """That of the first data set of spectra, else of the first."""
+    return min(kinds_of(data), key=lambda kind: not isinstance(kind, _Spectra)).frame()
+
+
+def places_of(data: Sequence[Measured], mesh: Mesh | None, device: DeviceLike) -> list[Place]:
+    """The places of data sets, in their order.
+
+    Raises:
+        ValueError: for a place where no field can hold; see :func:`warprrf.rf.positions.check_positions`.
+    """
+    return [place for kind in kinds_of(data) for place in kind.places(mesh, device)]

@@ -8,8 +8,8 @@ import numpy as np
 
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.fields.bistatic.render import Rendered
-from warprrf.rf.fields.bistatic.transport import ReceiverView
+from warprrf.rf.fields.bistatic.render import PathGains
+from warprrf.rf.fields.bistatic.tracer import View
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.spectrum import angles_from_directions, strongest_rays
 
@@ -17,64 +17,60 @@ PATH_SHARE = 1.0 / 200.0
 """A ray's part of the power that scattering brings to a pixel, at 64 rays a pixel and a beam of 3."""
 
 
-def paths_of(
-    view: ReceiverView, rendered: Rendered, floor: float, air: Air | None, max_paths: int | None
-) -> Paths:
+def paths_of(gains: PathGains, image: np.ndarray, floor: float, air: Air | None, max_paths: int | None) -> Paths:
     """Paths of one receiver, strongest first; see :meth:`BistaticField.paths`.
 
     Args:
-        view: what the receiver sees.
-        rendered: its spectrum.
+        gains: what the receiver gets.
+        image: its spectrum, shape ``(H, W)``.
         floor: pixels below it have no diffuse path of their own.
         air: that the path gains hold the absorption of.
         max_paths: strongest to keep; None for all.
     """
-    powers, found = rendered.powers, view.paths
-    exact = np.flatnonzero(powers.mirror > 0)
-    sharp, vertices = powers.mirror[exact], found.point[exact]
+    view, found = gains.view, gains.view.paths
+    exact = np.flatnonzero(gains.sharp > 0)
+    sharp, vertices = gains.sharp[exact], found.point[exact]
     kinds = np.where(found.order[exact] == 0, "los", "mirror").astype("<U7")
-    diffuse = powers.single.reshape(*rendered.image.shape, -1).sum(axis=-1) + rendered.further
-    point = _bounce_points(view, powers.single, floor)
+    diffuse = gains.by_ray().reshape(*image.shape, -1).sum(axis=-1)
+    point = _bounce_points(view, gains.single, floor)
     kept = diffuse > floor
     if not kept.any() and diffuse.max() > 0:
         kept = diffuse == diffuse.max()
     power = diffuse[kept]
     if len(power):
-        power = power * max(float(rendered.image.sum()) - sharp.sum(), 0.0) / power.sum()
+        power = power * max(float(image.sum()) - sharp.sum(), 0.0) / power.sum()
     over = np.full((len(power), *vertices.shape[1:]), np.nan)
     over[:, 0] = point[kept]
     whole = np.isfinite(over[:, 0]).all(axis=1)
     power, over = power[whole] * (power.sum() / max(power[whole].sum(), 1e-300)), over[whole]
     paths = Paths._from_points(
-        view.transport.transmitter,
+        view.tracer.transmitter,
         view.receivers[0],
         np.concatenate([vertices, over]),
         np.sqrt(np.concatenate([sharp, power])).astype(complex),
         np.concatenate([kinds, np.full(len(power), "diffuse", dtype="<U7")]),
-        SPEED_OF_LIGHT / view.transport.wavelength_m,
+        view.tracer.frequency_hz,
     )
     order = np.argsort(-np.abs(paths.gain), kind="stable")[:max_paths]
     return replace(paths.select(order), air=air)
 
 
-def strongest(view: ReceiverView, rendered: Rendered, beam_sigma_rad: float) -> tuple[np.ndarray, np.ndarray]:
+def strongest(gains: PathGains, image: np.ndarray, beam_sigma_rad: float) -> tuple[np.ndarray, np.ndarray]:
     """Delay [s] ``(H, W)`` and angles of departure [rad] ``(H, W, 2)`` of each pixel's strongest path through the
     receiver's beam; NaN where empty."""
-    grid, receiver, transmitter = view.transport.grid, view.receivers[0], view.transport.transmitter
-    power = rendered.powers.mirror
-    ray = strongest_rays(
-        grid.device_directions, rendered.powers.single, grid.shape, beam_sigma_rad, device=grid.device
-    )
+    view, power = gains.view, gains.sharp
+    grid, receiver, transmitter = view.tracer.grid, view.receivers[0], view.tracer.transmitter
+    ray = strongest_rays(grid.device_directions, gains.single, grid.shape, beam_sigma_rad, device=grid.device)
     dark = ray < 0
     ray = np.maximum(ray, 0)
-    range_m = np.where(dark, np.nan, view.hits.range_m.numpy()[ray])
+    range_m = np.where(dark, np.nan, view.hits.range_m[ray])
     point = receiver + range_m[..., None] * grid.directions[ray]
     outward = np.where(dark[..., None], 1.0, point - transmitter)
     length = np.where(dark, np.nan, np.linalg.norm(outward, axis=-1) + range_m)
     if len(power) and view.beams is not None:
         beams = power[:, None, None] * view.beams
         which = beams.argmax(axis=0)
-        diffuse = np.maximum(rendered.image - beams.sum(axis=0), 0.0)
+        diffuse = np.maximum(image - beams.sum(axis=0), 0.0)
         direct = np.take_along_axis(beams, which[None], axis=0)[0] > PATH_SHARE * diffuse
         first = view.paths.point[:, 0]
         first = np.where(np.isnan(first), receiver, first) - transmitter
@@ -86,10 +82,10 @@ def strongest(view: ReceiverView, rendered: Rendered, beam_sigma_rad: float) -> 
     return length / SPEED_OF_LIGHT, np.where(np.isnan(length)[..., None], np.nan, aod).astype(np.float32)
 
 
-def _bounce_points(view: ReceiverView, power: np.ndarray, floor: float) -> np.ndarray:
+def _bounce_points(view: View, power: np.ndarray, floor: float) -> np.ndarray:
     """The point that each pixel's strongest ray hits, shape ``(H, W, 3)``; any, where only further bounces light it."""
-    grid = view.transport.grid
-    any_hit = np.where(view.hits.face.numpy() >= 0, 1e-12 * floor * grid.solid_angle, 0.0)
-    per_pixel = (power + any_hit).reshape(-1, grid.sub_pixels**2)
+    grid = view.tracer.grid
+    any_hit = np.where(view.hits.face >= 0, 1e-12 * floor * grid.solid_angle, 0.0)
+    per_pixel = (power + any_hit).reshape(-1, grid.per_pixel)
     best = per_pixel.argmax(axis=1) + np.arange(len(per_pixel)) * per_pixel.shape[1]
     return view.hits.points(best).reshape(*grid.shape, 3)

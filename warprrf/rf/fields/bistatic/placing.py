@@ -17,11 +17,11 @@ from scipy.optimize import least_squares
 
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import Measured
-from warprrf.rf.fields.bistatic.fit import GroupFit, Target
-from warprrf.rf.fields.bistatic.materials import Parameters, mirror_power
+from warprrf.rf.fields.bistatic.materials import Parameters
 from warprrf.rf.fields.bistatic.measured import direct_paths
-from warprrf.rf.fields.bistatic.observations import Place
-from warprrf.rf.fields.bistatic.transport import ReceiverView
+from warprrf.rf.fields.bistatic.observations import NOISE_DB, Observation, Place
+from warprrf.rf.fields.bistatic.records import Evaluation
+from warprrf.rf.fields.bistatic.tracer import SHARP, View
 from warprrf.rf.spectra.readings import Readings, path_weights
 
 STRONGEST = 20  # paths that count
@@ -30,7 +30,7 @@ MOST_OFFSET = 2.0  # standard deviations, along each axis
 
 
 def with_azimuths(
-    data: Sequence[Measured], places: Sequence[Place], views: Sequence[ReceiverView]
+    data: Sequence[Measured], places: Sequence[Place], views: Sequence[View]
 ) -> tuple[list[Measured], dict[str, float]]:
     """``data`` with azimuths that count from x, and by data set's name what was added to those of unknown zero [degrees].
 
@@ -54,7 +54,7 @@ def with_azimuths(
     return found, zeros
 
 
-def _zero(one: Readings, seen: Sequence[tuple[Place, ReceiverView]]) -> float:
+def _zero(one: Readings, seen: Sequence[tuple[Place, View]]) -> float:
     """Angle to add to azimuths [rad], in (-pi, pi]."""
     arrival = np.asarray(one.arrival)
     angles = np.linspace(-np.pi, np.pi, STEPS, endpoint=False)
@@ -72,10 +72,10 @@ def _zero(one: Readings, seen: Sequence[tuple[Place, ReceiverView]]) -> float:
     return float(angles[best] + (0.5 * (low - high) / bend if bend < 0 else 0.0) * 2.0 * np.pi / STEPS)
 
 
-def _strongest(view: ReceiverView) -> tuple[np.ndarray, ...]:
+def _strongest(view: View) -> tuple[np.ndarray, ...]:
     """Powers of its strongest direct paths before any measurement, directions of arrival and departure, delays."""
-    prior = Parameters.prior(view.transport.surface.groups, 1)
-    power = mirror_power(view.friis, view.path_groups, view.paths.cosine, view.paths.turn, prior)[0]
+    prior = Parameters.prior(view.tracer.surface.groups)
+    power = view.records[SHARP].powers(Evaluation(prior, device=view.tracer.grid.device))
     kept = np.argsort(-power)[:STRONGEST]
     return power[kept], *(values[kept] for values in direct_paths(view))
 
@@ -89,20 +89,19 @@ def moved(one: Readings, offsets: Sequence[tuple[Place, np.ndarray]]) -> Reading
 
 
 def position_offset(
-    one: Readings, place: Place, view: ReceiverView, target: Target, other: np.ndarray, power: np.ndarray, fit: GroupFit
-) -> np.ndarray:  # fmt: skip
+    one: Readings, o: Observation, other: np.ndarray, power: np.ndarray, huber_db: float
+) -> np.ndarray:
     """Offset of a receiver from where it is said to be [m], shape ``(3,)``: the one that readings and prior like best.
 
     Args:
         one: table that holds its readings.
-        place: receiver, and which rows are its readings.
-        view: what is seen where it is said to be.
-        target: what was read.
+        o: what was read where it is said to be.
         other: prediction without line of sight and mirrors, shape ``(N,)``.
-        power: of those paths, shape ``(L,)``; both in the units of ``target``, gain of the chain included.
-        fit: how errors count.
+        power: of those paths, shape ``(L,)``; both in the units of the target, gain of the chain included.
+        huber_db: larger errors count linearly [dB].
     """
-    s, paths, std = view.transport.surface, view.paths, one.position_std_m
+    place, paths, std = o.place, o.view.paths, one.position_std_m
+    s = o.view.tracer.surface
     image = place.receiver + paths.arrival * paths.length_m[:, None]
     turn = np.tile(-np.eye(3), (len(paths), 1, 1))  # from arrival to departure
     normals = np.concatenate([s.plane_normal, np.zeros((1, 3))])  # the last, -1, turns nothing
@@ -116,10 +115,10 @@ def position_offset(
         arrival = out / length[:, None]
         departure = (turn @ arrival[:, :, None])[..., 0]
         weight = path_weights(one, place.rows, arrival, departure, length / SPEED_OF_LIGHT)
-        missed = target.error(other + weight @ power) / fit.noise_db
+        missed = o.target.error(other + weight @ power) / NOISE_DB
         return np.concatenate([missed, offset / std])
 
-    scale = fit.huber_db / fit.noise_db
+    scale = huber_db / NOISE_DB
     found = least_squares(
         error, np.zeros(3), bounds=(-MOST_OFFSET * std, MOST_OFFSET * std), loss="huber", f_scale=scale,
         x_scale=std, diff_step=1e-3,

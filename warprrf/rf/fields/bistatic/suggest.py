@@ -15,18 +15,16 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from warprrf.device import Progress
-from warprrf.rf.fields.bistatic.fit import NEPER
-from warprrf.rf.fields.bistatic.materials import Materials
-from warprrf.rf.fields.bistatic.observations import READING_ERROR_DB
-from warprrf.rf.fields.bistatic.render import path_powers, sent_radiance
-from warprrf.rf.fields.bistatic.transport import Transport
+from warprrf.rf.fields.bistatic.materials import Model
+from warprrf.rf.fields.bistatic.observations import NEPER, NOISE_DB, READING_ERROR_DB
+from warprrf.rf.fields.bistatic.records import Evaluation
+from warprrf.rf.fields.bistatic.render import path_gains
+from warprrf.rf.fields.bistatic.tracer import SHARP, Tracer
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_of
 
 SHAPE = (40, 80)
 """Pixels that are told apart around a receiver: as wide as a usual beam."""
-PIXEL_ERROR_DB = 3.0
-"""Standard deviation of a pixel's error, as in fits."""
 SHARED = (1.0, 0.3, 1.0)
 OWN = (0.5, 0.3, 0.3)
 """Standard deviations of a material's gain, and of a surface's own over it [nepers]: for single bounces, for light that
@@ -57,9 +55,9 @@ class Unknowns:
     own: np.ndarray
 
     @classmethod
-    def of(cls, transport: Transport, material: np.ndarray) -> Unknowns:
+    def of(cls, tracer: Tracer, material: np.ndarray) -> Unknowns:
         """Those of a surface; ``material`` (G,) is that of each group."""
-        element, count = material[transport.surface.element_group], int(material.max()) + 1
+        element, count = material[tracer.surface.element_group], int(material.max()) + 1
         return cls(
             np.concatenate([element, count + element, 2 * count + material]),
             np.repeat(SHARED, count),
@@ -79,34 +77,35 @@ class Sensitivity:
     """How readings and predictions at places depend on the gains.
 
     Args:
-        transport: the geometry under the transmitter, on a grid of :data:`SHAPE`.
-        materials: of its surfaces.
+        tracer: the geometry under the transmitter, on a grid of :data:`SHAPE`.
+        model: of its surfaces.
+        materials: evaluation of it under the transmitter.
         floor: path gain of a pixel, and of a reading, below which nothing is told.
     """
 
-    def __init__(self, transport: Transport, materials: Materials, floor: float) -> None:
-        self.transport, self.materials, self.floor = transport, materials, floor
-        self._sent = sent_radiance(transport, materials)
+    def __init__(self, tracer: Tracer, model: Model, materials: Evaluation, floor: float) -> None:
+        self.tracer, self.model, self.materials, self.floor = tracer, model, materials, floor
 
     def powers(self, place: np.ndarray) -> tuple[csr_matrix, np.ndarray]:
         """Power that is due to each gain in each pixel at ``place`` (3,), shape ``(P, U)``, and all power ``(P,)``."""
-        t, view = self.transport, self.transport.view(place, self.materials.terms)
-        found = path_powers(view, self.materials, self._sent)
-        s, face, sent, count = t.surface, view.hits.face.numpy(), found.sent, SHAPE[0] * SHAPE[1]
-        elements, single, on = len(s.element_area), np.flatnonzero(found.single > 0), np.flatnonzero(sent > 0)
+        view = self.tracer.view(place, self.model.effects.mirrors)
+        found = path_gains(view, self.model, self.materials)
+        s, count = self.tracer.surface, SHAPE[0] * SHAPE[1]
+        elements, element = len(s.element_area), s.element.take(view.hits.face, mode="wrap")
         pixel = np.ravel_multi_index(pixel_of(view.paths.arrival, SHAPE), SHAPE)
-        mirror = view.path_groups[:, 0]
+        mirror = view.records[SHARP].index[:, 0]
         own = mirror >= 0
-        parts = (
-            (single, s.element[face[single]], found.single[single]),
-            (on, elements + s.element[face[on]], sent[on]),
-            (pixel[own], 2 * elements + mirror[own], found.mirror[own]),
-        )
+        parts, rest = [(pixel[own], 2 * elements + mirror[own], found.sharp[own])], [(pixel[~own], found.sharp[~own])]
+        for name, power in found.tables.items():
+            ray, gain = view.records[name].ray, view.records[name].gain
+            if gain >= 0:
+                parts.append((ray, elements * gain + element[ray], power))
+            elif name != SHARP:
+                rest.append((ray, power))  # what mirrors show is taken for known, as line of sight is
         row, unknown, power = (np.concatenate(column) for column in zip(*parts, strict=True))
         table = csr_matrix((power, (row, unknown)), shape=(count, 2 * elements + s.groups))
-        ray, shown = found.shown  # known, as line of sight is
-        rest = np.bincount(np.append(ray, pixel[~own]), np.append(shown, found.mirror[~own]), minlength=count)
-        return table, np.asarray(table.sum(axis=1)).ravel() + rest
+        known = np.bincount(*map(np.concatenate, zip(*rest, strict=True)), minlength=count)
+        return table, np.asarray(table.sum(axis=1)).ravel() + known
 
     def of(self, place: np.ndarray, pointings: Pointings | None) -> tuple[np.ndarray, csr_matrix]:
         """Of a spectrum at ``place``: squared derivatives, summed over its pixels [dB^2/neper^2], shape ``(U,)``. And the
@@ -116,7 +115,7 @@ class Sensitivity:
         square.data = (table.data * np.repeat(NEPER / (total + self.floor), np.diff(table.indptr))) ** 2
         summed = np.asarray(square.sum(axis=0)).ravel()
         if pointings is None:
-            return summed, csr_matrix(summed / PIXEL_ERROR_DB**2)
+            return summed, csr_matrix(summed / NOISE_DB**2)
         cosine = pointings.toward @ pixel_directions(SHAPE).reshape(-1, 3).T
         gain = sample_pattern(pointings.pattern, np.arccos(np.clip(cosine, -1.0, 1.0)))
         slope = NEPER * (gain @ table) / (gain @ total + self.floor)[:, None]
@@ -126,7 +125,7 @@ class Sensitivity:
         self, places: np.ndarray, pointings: Pointings | None = None, progress: Progress | None = None
     ) -> np.ndarray:
         """With which readings at all of ``places`` (R, 3) tell the gains [1/neper^2], shape ``(U,)``."""
-        surface = self.transport.surface
+        surface = self.tracer.surface
         known = np.zeros(2 * len(surface.element_area) + surface.groups)
         for k, place in enumerate(places):
             known += np.asarray(self.of(place, pointings)[1].sum(axis=0)).ravel()

@@ -23,7 +23,6 @@ from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh, components, smoot
 from warprrf.geometry.photos.snapping import is_scan, scanned_patches
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.splats.gaussians import gaussians_of
-from warprrf.kernels.radio import bounce
 from warprrf.rf.em.materials import is_name_alone
 from warprrf.rf.fields.bistatic.colours import Colours, colour_groups
 from warprrf.rf.fields.bistatic.shapes import SHAPES, shape_groups
@@ -199,19 +198,18 @@ class Surface:
             two_sided=sides, **_elements(mesh, patch, group, element_m),
         )  # fmt: skip
 
-    def on_device(self, device: DeviceLike) -> Any:
-        """The kernels' view of this surface."""
+    @cached_property
+    def side_group(self) -> np.ndarray:
+        """Group of each element's side."""
+        return np.tile(self.element_group, 1 + self.two_sided)
+
+    def on_device(self, device: DeviceLike) -> tuple[wp.array, wp.array]:
+        """Normals of the faces, and those that scattering uses, as kernels take them."""
         where = _device.resolve(device)
 
-        def upload() -> Any:
-            s = bounce.Surface()
-            s.flat_normal = wp.array(self.mesh.face_normals, dtype=wp.vec3d, device=where)
-            s.normal = wp.array(self.normal, dtype=wp.vec3, device=where)
-            s.group = wp.array(self.group, dtype=wp.int32, device=where)
-            s.side_normal = wp.array(self.side_normal, dtype=wp.vec3d, device=where)
-            s.element = wp.array(self.element, dtype=wp.int32, device=where)
-            s.second_side = self.element_sides - len(self.element_area)
-            return s
+        def upload() -> tuple[wp.array, wp.array]:
+            flat = wp.array(self.mesh.face_normals, dtype=wp.vec3d, device=where)
+            return flat, wp.array(self.normal, dtype=wp.vec3, device=where)
 
         return self._uploaded.get(str(where), upload)
 

@@ -17,13 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warprrf.checks import Expected, check_arrays, lengths
-from warprrf.rf.fields.bistatic.fit import NEPER
-from warprrf.rf.fields.bistatic.materials import Layout, Materials
-from warprrf.rf.fields.bistatic.measured import SpectrumPixels
-from warprrf.rf.fields.bistatic.render import Rendered
-from warprrf.rf.fields.bistatic.response import jacobian, respond
-from warprrf.rf.fields.bistatic.transport import ReceiverView
-from warprrf.rf.spectra.beam import BeamOperator
+from warprrf.rf.fields.bistatic.observations import NEPER
 
 STEEPNESS_DB = (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, 3.5, 6.0, 10.0, 20.0)  # lower ends of the bins
 LEVEL_DB = (0.0, 0.02, 0.3, 3.0, 12.0, 30.0)
@@ -82,39 +76,6 @@ class ErrorModel:
         part = self.covariance[np.ix_(index, index)].astype(np.float32)
         laplace = np.maximum(((part @ slopes) * slopes).sum(axis=0), 0.0).reshape(image_db.shape)
         return np.sqrt(rest**2 + laplace)
-
-
-def predicted_std_db(
-    errors: ErrorModel,
-    view: ReceiverView,
-    rendered: Rendered,
-    materials: Materials,
-    material: np.ndarray,
-    beam: BeamOperator,
-    floor: float,
-) -> np.ndarray:
-    """Standard deviation of a spectrum's dB image per pixel, shape ``(H, W)``.
-
-    Args:
-        errors: what was learned.
-        view: what the receiver sees.
-        rendered: its spectrum.
-        materials: of the groups.
-        material: of each group, shape ``(G,)``; ``errors.covariance`` is of materials.
-        beam: of the receiver.
-        floor: N0.
-    """
-    terms = materials.terms
-    p = materials.parameters.take(np.unique(material, return_index=True)[1])
-    size = Layout(*p.log_weight.shape, indirect=terms.indirect, gain=False).size
-    gain = size < len(errors.covariance)
-    layout = Layout(*p.log_weight.shape, indirect=terms.indirect, gain=gain)
-    measured = SpectrumPixels(beam, np.arange(rendered.image.size))
-    response = respond(view, measured, terms, floor).tied(material)
-    slopes, index = jacobian(response, p, layout)[1:]
-    image = rendered.image / floor
-    slopes *= (NEPER / (1.0 + image.ravel())).astype(np.float32)
-    return errors.std_db(NEPER * np.log1p(image), view.receivers[0], slopes, index)
 
 
 def steepness(image_db: np.ndarray) -> np.ndarray:

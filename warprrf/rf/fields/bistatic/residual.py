@@ -18,99 +18,73 @@ import numpy as np
 from scipy.sparse import block_diag, csr_matrix, hstack, identity, vstack
 from scipy.sparse.linalg import LinearOperator, cg
 
-from warprrf.rf.fields.bistatic.fit import Target, huber
-from warprrf.rf.fields.bistatic.materials import Materials
+from warprrf.rf.fields.bistatic.materials import Model
 from warprrf.rf.fields.bistatic.measured import Measurement, read
-from warprrf.rf.fields.bistatic.render import path_powers
+from warprrf.rf.fields.bistatic.observations import NOISE_DB, Observation, Target, huber
+from warprrf.rf.fields.bistatic.records import Evaluation
+from warprrf.rf.fields.bistatic.render import path_gains
 from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.transport import ReceiverView
+from warprrf.rf.fields.bistatic.tracer import SHARP
 
-
-@dataclass(frozen=True)
-class ResidualFit:
-    """How the gains of elements and cells are fitted.
-
-    Attributes:
-        deviations: a priori of the gains of elements and of cells from 1 [nepers]: for single bounces, and for light
-            that is sent on.
-        largest: gain [nepers].
-        longest: step of a gain, in standard deviations.
-        rounds: Gauss-Newton steps.
-        conjugate_steps: of conjugate gradients in each.
-        noise_db, huber_db: as of :class:`warprrf.rf.fields.bistatic.fit.GroupFit`.
-    """
-
-    deviations: tuple[tuple[float, float], tuple[float, float]] = ((0.5, 0.5), (1.0, 2.0))
-    largest: float = 4.0
-    longest: float = 3.0
-    rounds: int = 4
-    conjugate_steps: int = 12
-    noise_db: float = 3.0
-    huber_db: float = 3.0
-
-
-QUICK = ResidualFit(rounds=2, conjugate_steps=8)
-"""A third of the steps, which find three quarters of what is to be found."""
+DEVIATIONS = ((0.5, 0.5), (1.0, 2.0))
+"""A priori of the gains of elements and of cells from 1 [nepers]: for single bounces, and for light that is sent on."""
+LARGEST = 4.0  # gain [nepers]
+LONGEST = 3.0  # step of a gain, in standard deviations
+STEPS, QUICK_STEPS = (4, 12), (2, 8)
+"""Gauss-Newton steps and of conjugate gradients in each; the few of a quick fit find three quarters of what is to be found."""
+HUBER_DB = 3.0
 
 
 @dataclass(frozen=True)
 class Shares:
     """What cells give the bins that a measurement of one receiver sums rays in, and the rest of what it reads, in units
-    of N0.
+    of the floor.
 
     Attributes:
-        single: single bounces, sparse, shape ``(B, X)``.
-        further: light that is sent on, likewise.
+        power: of both kinds of light, sparse, shape ``(B, 2 X)``.
         rest: readings of everything else, shape ``(N,)``.
         measured: how readings come from bins.
         target: what was read.
     """
 
-    single: csr_matrix
-    further: csr_matrix
+    power: csr_matrix
     rest: np.ndarray
     measured: Measurement
     target: Target
 
 
-def gather_shares(
-    bins: np.ndarray, count: int, face: np.ndarray, power: np.ndarray, surface: Surface
-) -> csr_matrix:
-    """Power of rays (K,) gathered by their bin, -1 for none, and surface cell, shape ``(count, X)`` float32."""
-    k = np.flatnonzero((power > 0) & (bins >= 0))
-    triples = power[k].astype(np.float32), (bins[k], surface.cell[face[k]])
-    return csr_matrix(triples, shape=(count, surface.cells))
-
-
-def shares_of(
-    view: ReceiverView,
-    materials: Materials,
-    sent: np.ndarray | None,
-    measured: Measurement,
-    unit: float,
-    target: Target,
-) -> Shares:
-    """What cells give the readings of one receiver under ``materials``, whose residual does not count.
-
-    Args:
-        sent: see :func:`warprrf.rf.fields.bistatic.render.sent_radiance`.
-        unit: path gain that the readings are in units of.
-        target: what was read.
-    """
-    bare, surface = replace(materials, terms=replace(materials.terms, residual=False)), view.transport.surface
-    powers, (bins, count) = path_powers(view, bare, sent), measured.bins(view)
-    face = view.hits.face.numpy()
-    own = gather_shares(bins, count, face, powers.single / unit, surface)
+def shares_of(o: Observation, model: Model, materials: Evaluation) -> Shares:
+    """What cells give the readings of one receiver under ``model``, whose residual does not count."""
+    bare = replace(model, effects=replace(model.effects, residual=False))
+    gains, view = path_gains(o.view, bare, materials), o.view
+    unit = o.floor
+    if o.chain != -1:
+        unit = o.floor / o.gain(model.parameters, np.maximum(read(gains, o.measured), 0.0) / o.floor)
+    (bins, count), cells = o.measured.bins(view), view.tracer.surface.cells
     # Gains of light sent on are learned under one transmitter alone.
-    learned = powers.sent / unit * np.array_equal(view.transport.transmitter, materials.transmitter)
-    further = gather_shares(bins, count, face, learned, surface)
-    known = np.asarray((own + further).sum(axis=1)).reshape(-1, 1)
-    rest = np.maximum(read(view, measured, powers) / unit - measured.of_bins(known)[:, 0], 0.0)
-    return Shares(own, further, rest, measured, target)
+    learned = 1 + np.array_equal(view.tracer.transmitter, model.transmitter)
+    rows, columns, powers = [], [], []
+    for name, power in gains.tables.items():
+        records = view.records[name]
+        if name == SHARP or not 0 <= records.gain < learned:
+            continue
+        k = np.flatnonzero((power > 0) & (bins[records.ray] >= 0))
+        ray = records.ray[k]
+        rows.append(bins[ray])
+        columns.append(cells * records.gain + view.cell[ray])
+        powers.append(power[k] / unit)
+    if not rows:
+        own = csr_matrix((count, 2 * cells), dtype=np.float32)
+    else:
+        places = np.concatenate(rows), np.concatenate(columns)
+        own = csr_matrix((np.concatenate(powers).astype(np.float32), places), shape=(count, 2 * cells))
+    known = np.asarray(own.sum(axis=1)).reshape(-1, 1)
+    rest = np.maximum(read(gains, o.measured) / unit - o.measured.of_bins(known)[:, 0], 0.0)
+    return Shares(own, rest, o.measured, o.target)
 
 
 def fit_residual(
-    shares: Sequence[Shares], surface: Surface, options: ResidualFit | None = None
+    shares: Sequence[Shares], surface: Surface, *, quick: bool = False, noise_db: float = NOISE_DB
 ) -> np.ndarray:
     """ln of each cell's gains over its group's, shape ``(2, X)``; zero where nothing is seen of it.
 
@@ -120,15 +94,16 @@ def fit_residual(
     Args:
         shares: one for each training receiver.
         surface: whose cells they are.
-        options: priors and steps.
+        quick: with few steps.
+        noise_db: standard deviation of a reading's error.
     """
-    o = options or ResidualFit()
-    power = vstack([hstack([s.single, s.further]) for s in shares], format="csr")
+    rounds, conjugate = QUICK_STEPS if quick else STEPS
+    power = vstack([s.power for s in shares], format="csr")
     rest = np.concatenate([s.rest for s in shares])
     target = Target.joined([s.target for s in shares])
     # Receivers that are measured alike go through the measurement together.
     batches = [list(own) for _, own in groupby(shares, key=lambda s: s.measured.alike)]
-    bins = np.cumsum([0, *(len(b) * b[0].single.shape[0] for b in batches)])
+    bins = np.cumsum([0, *(len(b) * b[0].power.shape[0] for b in batches)])
     rows = np.cumsum([0, *(len(b) * len(b[0].rest) for b in batches)])
 
     def spread(values: np.ndarray, quick: bool = True) -> np.ndarray:
@@ -150,14 +125,14 @@ def fit_residual(
     cell = np.arange(surface.cells)
     member = csr_matrix((np.ones(len(cell)), (cell, surface.cell_element)))
     gains = block_diag(
-        [hstack([element * member, own * identity(len(cell))]) for element, own in o.deviations], format="csr"
+        [hstack([element * member, own * identity(len(cell))]) for element, own in DEVIATIONS], format="csr"
     )
     unknown = np.zeros(gains.shape[1])
-    for _ in range(o.rounds):
-        gain = np.exp(np.clip(gains @ unknown, -o.largest, o.largest))
+    for _ in range(rounds):
+        gain = np.exp(np.clip(gains @ unknown, -LARGEST, LARGEST))
         total = np.maximum(spread(gain, quick=False), 0.0) + rest
         error, slope = target.error(total), target.slope(total)
-        robust = huber(error, o.huber_db)[1] / o.noise_db**2
+        robust = huber(error, HUBER_DB)[1] / noise_db**2
 
         def curvature(
             v: np.ndarray, gain: np.ndarray = gain, weight: np.ndarray = slope**2 * robust
@@ -167,6 +142,6 @@ def fit_residual(
 
         gradient = gains.T @ (gain * gather(slope * robust * error)) + unknown
         system = LinearOperator((len(unknown),) * 2, matvec=curvature, dtype=np.float64)
-        step = cg(system, -gradient, rtol=0.0, atol=1e-6, maxiter=o.conjugate_steps)[0]
-        unknown += np.clip(step, -o.longest, o.longest)
-    return np.clip(gains @ unknown, -o.largest, o.largest).reshape(2, -1)
+        step = cg(system, -gradient, rtol=0.0, atol=1e-6, maxiter=conjugate)[0]
+        unknown += np.clip(step, -LONGEST, LONGEST)
+    return np.clip(gains @ unknown, -LARGEST, LARGEST).reshape(2, -1)

@@ -1,0 +1,259 @@
+"""Power of path records and its logarithmic slopes: the one place where an interaction is written down.
+
+A record is a power that geometry fixes and up to :data:`MOST` interactions from the transmitter to the receiver. Mirrors
+multiply Jones matrices in (TE, TM), real because half-spaces have no phase but their sign (ITU-R P.2040-4, eqs. (37a),
+(37b)); between two of them the axes turn. One interaction may be rough, which leaves light unpolarised: a surface that
+scatters, after Degli-Esposti et al. (2007), or an element that sends what it got of others. All records of a table have
+the same sequence, so its rough interaction stands in one column.
+
+Angles of a mirror: cosine of incidence, turn of the plane of incidence [rad]; of a scattering surface: cosines of incidence
+and of scattering, and that of the angle to the mirror direction.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from warprrf.cache import once
+
+MOST = 3
+"""Interactions on a record at most."""
+SCATTER, SOURCE = 1, 2
+"""Kinds of a rough interaction: a surface that scatters, an element that sends."""
+MOMENTS = 3
+"""Components that a family of Fresnel curves is resolved into."""
+
+
+@once
+def build(real: type) -> Any:
+    """Kernels in precision ``real``: power of each record, its slopes summed by bins, and sums by group and component."""
+    vec2, vec3 = wp.types.vector(2, real), wp.types.vector(3, real)
+    mat2 = wp.types.matrix((2, 2), real)
+
+    @wp.struct
+    class Materials:
+        """Rows are materials: lobe weights, epsilon_r - 1, mirrored share, slope of ln even reflection to ln(epsilon_r - 1);
+        ``scale`` is a table over the cosine for each lobe; ``row`` and ``side_row`` are the material of each group and
+        of each element's side, ``radiance`` what that sends."""
+
+        weight: wp.array2d(dtype=real)
+        excess: wp.array(dtype=real)
+        mirror: wp.array(dtype=real)
+        even_slope: wp.array(dtype=real)
+        row: wp.array(dtype=wp.int32)
+        side_row: wp.array(dtype=wp.int32)
+        radiance: wp.array(dtype=real)
+        exponent: wp.array(dtype=wp.int32)
+        scale: wp.array2d(dtype=real)
+        reciprocal: int
+
+    @wp.struct
+    class Table:
+        """Records of one sequence: power without interactions; group of each interaction, side of an element where it
+        sends, -1 for none; angles; column and kind of the rough one; half the cosine's stretch that a ray stands for."""
+
+        power: wp.array(dtype=real)
+        index: wp.array2d(dtype=wp.int32)
+        angle: wp.array2d(dtype=vec3)
+        rough: int
+        kind: int
+        half_width: real
+
+    @wp.func
+    def half_space(x: real, c: real):
+        """Reflection (TE, TM) of a half-space of epsilon_r = 1 + x at cosine c."""
+        root = wp.sqrt(x + c * c)
+        dense = (real(1.0) + x) * c
+        return vec2((c - root) / (c + root), (dense - root) / (dense + root))
+
+    @wp.func
+    def half_space_slope(x: real, c: real):
+        """Its derivative to ln x."""
+        root = wp.sqrt(x + c * c)
+        dense = (real(1.0) + x) * c
+        bend = real(0.5) * x / root
+        te = real(-2.0) * c * bend / ((c + root) * (c + root))
+        tm = real(2.0) * (x * c * root - dense * bend) / ((dense + root) * (dense + root))
+        return vec2(te, tm)
+
+    @wp.func
+    def mirrors(t: Table, m: Materials, excess: wp.array(dtype=real), i: int, begin: int, end: int, raised: int):
+        """Jones matrix of the mirrors in columns ``begin`` to ``end``; of ``raised`` the derivative to ln x."""
+        whole = mat2(real(1.0), real(0.0), real(0.0), real(1.0))
+        for k in range(wp.static(MOST)):
+            if k >= begin and k < end and k < t.index.shape[1]:
+                g = t.index[i, k]
+                if g >= 0:
+                    x = excess[m.row[g]]
+                    r = half_space(x, t.angle[i, k][0])
+                    if k == raised:
+                        r = half_space_slope(x, t.angle[i, k][0])
+                    c = wp.cos(t.angle[i, k][1])
+                    s = wp.sin(t.angle[i, k][1])
+                    whole = wp.diag(r) * (mat2(c, s, -s, c) * whole)
+        return whole
+
+    @wp.func
+    def at(table: wp.array2d(dtype=real), row: int, cosine: real):
+        """Row of a table over cosine in [0, 1], interpolated linearly."""
+        last = table.shape[1] - 1
+        x = cosine * real(last)
+        i = wp.min(int(x), last - 1)
+        s = x - real(i)
+        return (real(1.0) - s) * table[row, i] + s * table[row, i + 1]
+
+    @wp.func
+    def lobe(m: Materials, which: int, angle: vec3, half_width: real):
+        """f_s / cos(theta_s) [1/sr] of a lobe; exponent 0 is Lambertian, whose cosine cancels. Else 1 / cos(theta_s) is
+        replaced by its mean over what the ray stands for, what lies below the horizon left out."""
+        value = real(0.3183098861837907)
+        n = int(m.exponent[which])
+        if n > 0:
+            value = wp.pow(wp.max(real(0.5) * (real(1.0) + angle[2]), real(0.0)), real(n)) * at(m.scale, which, angle[0])
+            if m.reciprocal == 1:
+                value *= at(m.scale, which, angle[1])
+            else:
+                high = angle[1] + half_width
+                low = wp.max(angle[1] - half_width, real(0.01) * half_width)
+                value *= wp.log(high / low) / (high - low)
+        return value
+
+    @wp.func
+    def unpolarised(x: real, angle: vec3, reciprocal: int):
+        """|Gamma|^2, mean of TE and TM, at incidence; of reciprocal lobes the mean of that at both angles."""
+        r = half_space(x, angle[0])
+        value = real(0.5) * wp.dot(r, r)
+        if reciprocal == 1:
+            s = half_space(x, angle[1])
+            value = real(0.5) * (value + real(0.5) * wp.dot(s, s))
+        return value
+
+    @wp.func
+    def mixed(t: Table, m: Materials, weight: wp.array2d(dtype=real), i: int, row: int):
+        """Sum of weight times lobe at the rough interaction of record i."""
+        value = real(0.0)
+        for j in range(m.exponent.shape[0]):
+            value += weight[row, j] * lobe(m, j, t.angle[i, t.rough], t.half_width)
+        return value
+
+    @wp.func
+    def power_of(
+        t: Table,
+        m: Materials,
+        weight: wp.array2d(dtype=real),
+        excess: wp.array(dtype=real),
+        mirror: wp.array(dtype=real),
+        i: int,
+    ):
+        """Power of record i."""
+        before = mirrors(t, m, excess, i, 0, t.rough, -1)
+        after = mirrors(t, m, excess, i, t.rough + 1, wp.static(MOST), -1)
+        p = t.power[i] * real(0.5) * wp.ddot(before, before) * real(0.5) * wp.ddot(after, after)
+        for k in range(wp.static(MOST)):
+            if k != t.rough and k < t.index.shape[1]:
+                if t.index[i, k] >= 0:
+                    p = p * mirror[m.row[t.index[i, k]]]
+        if t.kind == wp.static(SCATTER):
+            row = m.row[t.index[i, t.rough]]
+            p = p * mixed(t, m, weight, i, row) * unpolarised(excess[row], t.angle[i, t.rough], m.reciprocal)
+        if t.kind == wp.static(SOURCE):
+            p = p * m.radiance[t.index[i, t.rough]]
+        return p
+
+    @wp.kernel(module="unique")
+    def record_power(
+        offset: int,
+        t: Table,
+        m: Materials,
+        weight: wp.array2d(dtype=real),
+        excess: wp.array(dtype=real),
+        mirror: wp.array(dtype=real),
+        out: wp.array(dtype=real),
+    ):
+        """Power of each record. What is differentiated stands beside the struct, where Warp's tape sees it."""
+        i = offset + wp.tid()
+        out[i] = power_of(t, m, weight, excess, mirror, i)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def bin_slopes(
+        offset: int,
+        first: wp.array(dtype=wp.int32),
+        order: wp.array(dtype=wp.int32),
+        t: Table,
+        m: Materials,
+        place: wp.array(dtype=wp.int32),
+        slope: wp.array2d(dtype=real),
+    ):
+        """Derivatives of the power of each bin's records, ``order[first[b]]`` on, to the logarithms of a material's
+        lobe weights, epsilon_r - 1 and mirrored share, which stand from column ``place`` of it on."""
+        b = offset + wp.tid()
+        lobes = m.exponent.shape[0]
+        for s in range(first[b], first[b + 1]):
+            i = order[s]
+            p = power_of(t, m, m.weight, m.excess, m.mirror, i)
+            if p > real(0.0):
+                for k in range(wp.static(MOST)):
+                    if k != t.rough and k < t.index.shape[1]:
+                        if t.index[i, k] >= 0:
+                            column = place[m.row[t.index[i, k]]] + lobes
+                            begin = int(0)
+                            end = t.rough
+                            if k > t.rough:
+                                begin = t.rough + 1
+                                end = wp.static(MOST)
+                            run = mirrors(t, m, m.excess, i, begin, end, -1)
+                            raised = mirrors(t, m, m.excess, i, begin, end, k)
+                            size = wp.ddot(run, run)
+                            if size > real(0.0):
+                                slope[b, column] += real(2.0) * p * wp.ddot(run, raised) / size
+                            slope[b, column + 1] += p
+                if t.kind == wp.static(SCATTER):
+                    row = m.row[t.index[i, t.rough]]
+                    angle = t.angle[i, t.rough]
+                    sum = mixed(t, m, m.weight, i, row)
+                    for j in range(lobes):
+                        slope[b, place[row] + j] += p * m.weight[row, j] * lobe(m, j, angle, t.half_width) / sum
+                    r = half_space(m.excess[row], angle[0])
+                    rise = wp.dot(r, half_space_slope(m.excess[row], angle[0]))
+                    if m.reciprocal == 1:
+                        r2 = half_space(m.excess[row], angle[1])
+                        rise = real(0.5) * (rise + wp.dot(r2, half_space_slope(m.excess[row], angle[1])))
+                    slope[b, place[row] + lobes] += p * rise / unpolarised(m.excess[row], angle, m.reciprocal)
+                if t.kind == wp.static(SOURCE):
+                    row = m.side_row[t.index[i, t.rough]]
+                    whole = real(0.0)
+                    for j in range(lobes):
+                        whole += m.weight[row, j]
+                    if whole > real(0.0):
+                        for j in range(lobes):
+                            slope[b, place[row] + j] += p * m.weight[row, j] / whole
+                    slope[b, place[row] + lobes] += p * m.even_slope[row]
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def bin_components(
+        offset: int,
+        first: wp.array(dtype=wp.int32),
+        order: wp.array(dtype=wp.int32),
+        t: Table,
+        m: Materials,
+        place: wp.array(dtype=wp.int32),
+        moments: wp.array2d(dtype=real),
+        out: wp.array2d(dtype=real),
+    ):
+        """What each group, lobe and Fresnel component scatters into each bin at unit weight: column (group's place, lobe,
+        component)."""
+        b = offset + wp.tid()
+        lobes = m.exponent.shape[0]
+        for s in range(first[b], first[b + 1]):
+            i = order[s]
+            angle = t.angle[i, t.rough]
+            base = place[t.index[i, t.rough]] * lobes * wp.static(MOMENTS)
+            for j in range(lobes):
+                value = t.power[i] * lobe(m, j, angle, t.half_width)
+                for c in range(wp.static(MOMENTS)):
+                    part = at(moments, c, angle[0])
+                    if m.reciprocal == 1:
+                        part = real(0.5) * (part + at(moments, c, angle[1]))
+                    out[b, base + j * wp.static(MOMENTS) + c] += value * part
+
+    return Materials, Table, record_power, bin_slopes, bin_components

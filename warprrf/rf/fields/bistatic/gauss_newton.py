@@ -1,0 +1,158 @@
+"""Fitting material parameters to readings: damped Gauss-Newton in dB on the slopes of path records.
+
+Of each material the fit learns the weights of its scattering lobes, one permittivity (the Fresnel curve that lobes and
+mirror share) and the strength of its mirror reflection. All are positive, so their logarithms are fitted. Priors keep
+what no spectrum shows near plausible values and tie a surface's scattered and mirrored shares together, because they
+split one reflection (S^2 and 1 - S^2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import solve
+from scipy.linalg.blas import ssyrk
+
+from warprrf.rf.fields.bistatic.materials import ROUGHNESS, Layout, Parameters
+from warprrf.rf.fields.bistatic.observations import NEPER, Problem, huber
+
+WEIGHT, EXCESS, MIRROR = 2.0, 0.8, 1.5
+"""Standard deviations a priori of lobe weights, permittivity less one and mirrored share from where a fit starts [nepers]."""
+ENERGY = 0.25
+"""That of scattered and mirrored shares from a sum of one."""
+GAIN, CHAIN = 1.0, 10.0
+"""Those of the common gain and of a measuring chain's unknown gain from one [nepers]."""
+CARRIER = 1.0
+"""That of the power of the carrier that roughness goes with, from Ament's 2."""
+LONGEST = 1.5  # change of a logarithm in one step
+TOLERANCE = 1e-3  # relative fall of the objective that ends a fit
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Result of :func:`gauss_newton`.
+
+    Attributes:
+        parameters: the fitted parameters.
+        covariance: of the free ones (Laplace), shape ``(F, F)``; see :class:`Layout`.
+        losses: objective after each step, per reading [dB^2].
+    """
+
+    parameters: Parameters
+    covariance: np.ndarray
+    losses: list[float]
+
+
+def layout_of(problem: Problem, start: Parameters) -> Layout:
+    """What is free."""
+    carriers = {o.ratio for o in problem.observations}
+    return Layout(
+        *start.log_weight.shape, gain=problem.gain_offset, roughness=bool(carriers - {1.0}), chains=len(start.log_gains)
+    )  # fmt: skip
+
+
+def priors(
+    p: Parameters, start: Parameters, layout: Layout, energy: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals of the priors ``(K,)`` and their Jacobian ``(K, F)``: distance to the start, energy kept."""
+    own = np.arange(layout.groups)
+    residuals, rows = [], []
+
+    def add(values: np.ndarray, places: np.ndarray, slope: np.ndarray | float) -> None:
+        block = np.zeros((len(values), layout.size))
+        np.put_along_axis(block, places.reshape(len(values), -1), slope, axis=1)
+        residuals.append(values)
+        rows.append(block)
+
+    for j, places in enumerate(layout.weight(own).T):
+        add((p.log_weight[:, j] - start.log_weight[:, j]) / WEIGHT, places, 1.0 / WEIGHT)
+    add((p.log_excess - start.log_excess) / EXCESS, layout.excess(own), 1.0 / EXCESS)
+    add((p.log_mirror - start.log_mirror) / MIRROR, layout.mirror(own), 1.0 / MIRROR)
+    if layout.gain:
+        add(np.array([p.log_gain / GAIN]), np.array([layout.common_gain]), 1.0 / GAIN)
+    if layout.roughness:
+        add(np.array([(p.roughness - ROUGHNESS) / CARRIER]), np.array([layout.carrier_power]), 1.0 / CARRIER)
+    if layout.chains:
+        add(p.log_gains / CHAIN, layout.first_chain + np.arange(layout.chains), 1.0 / CHAIN)
+    shares = np.column_stack([p.weight, np.exp(p.log_mirror)])  # S^2 by lobes, and 1 - S^2
+    places = np.column_stack([layout.weight(own), layout.mirror(own)])
+    add((shares.sum(axis=1) - 1.0) / energy, places, shares / energy)
+    return np.concatenate(residuals), np.concatenate(rows)
+
+
+def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Fitted:
+    """Levenberg-Marquardt on the parameters of materials.
+
+    Args:
+        problem: observations, and which groups are of one material.
+        start: where the fit starts and the priors centre.
+        steps: most steps.
+    """
+    if len(start.log_gains) != problem.chains:
+        start = replace(start, log_gains=np.array([_first_gain(problem, start, c) for c in range(problem.chains)]))
+    layout = layout_of(problem, start)
+    vector, damping, weight = layout.pack(start), 1e-3, 1.0 / problem.noise_db**2
+    count = max(sum(len(o.target.db) for o in problem.observations), 1)
+    hessian, losses = np.eye(layout.size), []
+
+    def total(x: np.ndarray) -> float:
+        p = layout.unpack(x, start)
+        prior = priors(p, start, layout, problem.energy)[0]
+        errors = problem.errors_db(p)
+        return weight * sum(float(huber(e, problem.huber_db)[0].sum()) for e in errors) + float((prior**2).sum())
+
+    current = total(vector)
+    for _ in range(steps):
+        p = layout.unpack(vector, start)
+        hessian, gradient = _normal_equations(problem, p, layout)
+        r, j = priors(p, start, layout, problem.energy)
+        hessian += j.T @ j
+        gradient += j.T @ r
+        improved = False
+        for _ in range(8):
+            move = solve(hessian + damping * np.diag(np.diag(hessian)), -gradient, assume_a="pos")
+            move = np.clip(move, -LONGEST, LONGEST)
+            value = total(vector + move)
+            improved = value < current
+            if improved:
+                break
+            damping *= 5.0
+        if not improved:
+            break
+        # Steps that were cut short, or do worse than the quadratic model says, are no sign of having arrived.
+        expected = -float(move @ (2.0 * gradient + hessian @ move))
+        honest = current - value > 0.5 * expected
+        fall = (current - value) / current
+        vector, current = vector + move, value
+        damping = max(damping * 0.3, 1e-6) if honest else damping * 3.0
+        losses.append(current / weight / count)
+        if fall < TOLERANCE and honest and (np.abs(move) < LONGEST).all():
+            break
+    return Fitted(layout.unpack(vector, start), np.linalg.inv(hessian), losses)
+
+
+def _normal_equations(problem: Problem, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Newton matrix and gradient of the data term."""
+    hessian, gradient = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
+    for error, table, index in problem.linearised(p, layout):
+        if len(index) == 0:  # nothing that it sees is lit
+            continue
+        root = np.sqrt(huber(error, problem.huber_db)[1]) / problem.noise_db
+        table *= root.astype(np.float32)
+        hessian[np.ix_(index, index)] += ssyrk(1.0, table.T, trans=1)  # its upper triangle
+        gradient[index] += table @ (root * error).astype(np.float32)
+    return np.triu(hessian) + np.triu(hessian, 1).T, gradient
+
+
+def _first_gain(problem: Problem, start: Parameters, chain: int) -> float:
+    """ln of the gain that makes the chain's readings agree with what ``start`` predicts, in the median of their power."""
+    ratio = [np.zeros(0)]
+    for o, expected in zip(problem.observations, problem.powers(start), strict=True):
+        read = np.expm1(o.target.db / NEPER)
+        known = (read > 0) & (expected > 0) & (True if o.target.censored is None else ~o.target.censored)
+        if o.chain == chain:
+            ratio.append(np.log(read[known] / expected[known]))
+    every = np.concatenate(ratio)
+    return float(np.median(every)) if len(every) else 0.0

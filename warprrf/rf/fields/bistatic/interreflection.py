@@ -1,0 +1,111 @@
+"""How surfaces light each other: radiance of elements, a source that records may start from in the transmitter's place.
+
+Rays from every side of an element, density by the cosine, see what the transmitter lights; that is what the element gets of
+first scatterings. What elements get of others after that is even over each. Elements are half a metre wide in a room.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.sparse import csr_matrix
+
+from warprrf.geometry.mesh import vectors_across
+from warprrf.rf.fields.bistatic.materials import Effects, Parameters
+from warprrf.rf.fields.bistatic.records import Evaluation, Records
+from warprrf.rf.fields.bistatic.surface import Surface
+from warprrf.rf.fields.bistatic.tracer import LIFT_M, Tracer, _Rays
+
+RAYS = 128  # from each element, over its hemisphere
+
+
+class Interreflection:
+    """Geometry of light between the elements of a surface under one transmitter.
+
+    Args:
+        tracer: casts the rays.
+
+    Attributes:
+        lit: what the rays of sides see of first scatterings: records whose ray is the side, of irradiance where the
+            transmitter gives cos(theta_i) / d1^2 [1/m^2].
+        between: irradiance of sides (rows) by radiance of sides (columns), shape ``(E, E)``: those of first sides, and of
+            second ones that light can reach; solids' inner ones are left dark.
+    """
+
+    def __init__(self, tracer: Tracer) -> None:
+        surface, grid = tracer.surface, tracer.grid
+        point, normal = _sample_points(surface)
+        known = np.arange(len(point))
+        if surface.two_sided:
+            point, normal = np.tile(point, (2, 1)), np.concatenate([normal, -normal])
+            face = grid.hit(tracer.transmitter).face
+            ray = np.flatnonzero(face >= 0)
+            known = np.union1d(known, surface.side_met(face[ray], grid.directions[ray]))
+        shift = np.random.default_rng(0).random((2, len(surface.element_area)))
+        scale = np.float32(np.pi / RAYS * (4.0 * np.pi / tracer.wavelength_m) ** 2)
+        self.surface, self._device = surface, grid.device
+        self.lit: list[Records] = []
+        rows, columns, values, new = [], [], [], known
+        while len(new):
+            directions = _hemispheres(normal[new], shift[:, new % shift.shape[1]])
+            hits = grid.hit_along(point[new] + LIFT_M * normal[new], directions, np.ones(len(directions)))
+            hit = np.flatnonzero(hits.face >= 0)
+            side, met = np.repeat(new, RAYS), surface.side_met(hits.face[hit], directions[hit])
+            found = tracer.lit(_Rays(hits, side))
+            self.lit.append(replace(found, power=scale * found.power))
+            rows.append(side[hit])
+            columns.append(met)
+            values.append(np.pi / RAYS * np.broadcast_to(grid.transmittance(hits.range_m[hit]), len(hit)))
+            new = np.setdiff1d(met, known)
+            known = np.union1d(known, new)
+        pairs = tuple(map(np.concatenate, (rows, columns)))
+        self.between = csr_matrix((np.concatenate(values), pairs), shape=(surface.element_sides,) * 2)
+
+    @classmethod
+    def of(cls, tracer: Tracer) -> Interreflection:
+        """That under the transmitter of ``tracer``, which keeps it."""
+        return tracer.kept.get("interreflection", lambda: cls(tracer.of_transmitter))
+
+    def irradiance(self, p: Parameters, effects: Effects, onto: Records | None) -> np.ndarray:
+        """What sides get of surfaces that scattered before, in units in which the transmitter gives an irradiance of
+        cos(theta_i) / d1^2 [1/m^2], shape ``(E,)``; ``onto`` is light that mirrors throw on sides."""
+        materials, sides = Evaluation(p, device=self._device), self.surface.element_sides
+        share = p.scattered_share[self.surface.side_group] / np.pi
+        got = sum(np.bincount(r.ray, r.powers(materials), minlength=sides) for r in self.lit)
+        if onto is not None:
+            got = got + self.between @ (share * np.bincount(onto.ray, onto.powers(materials), minlength=sides))
+        first = got
+        for _ in range(2, effects.scatterings):
+            got = first + self.between @ (share * got)
+        return np.asarray(got)
+
+
+def irradiance(tracer: Tracer, p: Parameters, effects: Effects) -> np.ndarray | None:
+    """Irradiance of elements' sides by other surfaces under parameters of groups, shape ``(E,)``; None where ``effects``
+    hold no second scattering."""
+    if effects.scatterings < 2:
+        return None
+    onto = tracer.mirrored.onto if effects.mirror_scatter else None
+    return Interreflection.of(tracer).irradiance(p, effects, onto)
+
+
+def _sample_points(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """A place on each element, and its first side's normal: the centre of the face nearest to its middle."""
+    centre = surface.mesh.triangles.mean(axis=1)
+    gap = np.linalg.norm(centre - surface.element_centre[surface.element], axis=1)
+    order = np.lexsort((gap, surface.element))
+    first = order[np.searchsorted(surface.element[order], np.arange(len(surface.element_area)))]
+    return centre[first], surface.side_normal[first]
+
+
+def _hemispheres(normal: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """``RAYS`` directions for each normal (T, 3), density proportional to the cosine, shape ``(T * RAYS, 3)``."""
+    k = np.arange(RAYS)
+    u = np.mod(k * 0.7548776662466927 + shift[0, :, None], 1.0)  # R2 sequence (Roberts 2018), shifted
+    v = np.mod(k * 0.5698402909980532 + shift[1, :, None], 1.0)
+    radius, turn = np.sqrt(u), 2.0 * np.pi * v
+    a, b = vectors_across(normal)
+    x, y, z = radius * np.cos(turn), radius * np.sin(turn), np.sqrt(np.maximum(1.0 - u, 0.0))
+    d = x[..., None] * a[:, None] + y[..., None] * b[:, None] + z[..., None] * normal[:, None]
+    return d.reshape(-1, 3)

@@ -1,0 +1,230 @@
+"""Which surfaces are of one material: decided by their look first, then by what the spectra say.
+
+Colours or shapes tell materials apart only so far. Once materials have parameters, each group of faces is tried as every other
+material: what the objective would rise or fall by is known without a new fit, because a spectrum is linear in what its
+groups scatter. Materials that are as well described by another one join it, and a group that another material describes
+better goes over. Fewer parameters, and purer materials, are learned better from the same spectra.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from warprrf.rf.em.fresnel import fresnel_curves
+from warprrf.rf.fields.bistatic.materials import Effects, Parameters
+from warprrf.rf.fields.bistatic.measured import Measurement
+from warprrf.rf.fields.bistatic.observations import Observation, Problem, huber
+from warprrf.rf.fields.bistatic.records import Evaluation
+from warprrf.rf.fields.bistatic.tracer import SHARP, View
+
+
+@dataclass(frozen=True)
+class Merging:
+    """What it takes to be of one material, in units of the fit's objective.
+
+    Attributes:
+        look_cost: of one unit of difference in look, squared.
+        join: rise that a material of its own must be worth.
+        move: fall that a group must bring to go over.
+    """
+
+    look_cost: float = 3.0
+    join: float = 30.0
+    move: float = 4.0
+
+
+BY_SHAPE = Merging(look_cost=1.0, join=15.0, move=30.0)
+"""For groups that only shapes tell apart: place and extent say less of a material than colour, a thing's parts more."""
+MOST_LOOK = 9.0
+"""Largest squared difference of looks that counts: those that differ more tell no more."""
+
+
+def merge(
+    problem: Problem, p: Parameters, look: np.ndarray, area: np.ndarray, options: Merging
+) -> tuple[np.ndarray, Parameters]:
+    """Materials of the groups anew, shape ``(G,)``, numbered without gaps, and the parameters of those left.
+
+    Args:
+        problem: observations, and the material of each group now.
+        p: parameters of the materials.
+        look: of each group, shape ``(G, K)``; see :class:`warprrf.rf.fields.bistatic.surface.Surface`.
+        area: of each group [m^2].
+        options: what it takes.
+    """
+    o, count, material = options, len(p.log_excess), problem.material
+    typical = _mean_look(look, material, area, count)
+    columns = [_Columns.of(one, problem.effects, materials) for one, materials in problem.evaluated(p)]
+
+    # whole materials first, small ones before large ones
+    cost = _costs(problem, columns, p, material, np.arange(count))
+    cost += _look_cost(typical, typical, o)
+    np.fill_diagonal(cost, np.inf)
+    size = np.bincount(material, area, minlength=count)
+    target = np.arange(count)
+    touched = np.zeros(count, bool)
+    for m in np.argsort(size):
+        if touched[m]:
+            continue
+        k = int(np.where(target == np.arange(count), cost[m], np.inf).argmin())
+        if cost[m, k] < o.join:
+            target[m] = k
+            touched[k] = True  # what takes others in stays itself this time
+    material = target[material]
+
+    # then single groups
+    typical = _mean_look(look, material, area, count)
+    alive = np.unique(material)
+    cost = _costs(problem, columns, p, np.arange(len(material)), material) + _look_cost(look, typical, o)
+    rows = np.arange(len(material))
+    change = cost - cost[rows, material][:, None]
+    change[:, np.setdiff1d(np.arange(count), alive)] = np.inf
+    best = change.argmin(axis=1)
+    moves = change[rows, best] < -o.move
+    material = np.where(moves, best, material)
+    left, material = np.unique(material, return_inverse=True)
+    return material.reshape(-1), p.take(left)
+
+
+def _mean_look(look: np.ndarray, material: np.ndarray, area: np.ndarray, count: int) -> np.ndarray:
+    """Mean look of each material, shape ``(count, K)``."""
+    size = np.maximum(np.bincount(material, area, minlength=count), 1e-12)
+    sums = [np.bincount(material, area * channel, minlength=count) for channel in look.T]
+    return np.stack(sums, axis=1) / size[:, None]
+
+
+def _look_cost(look: np.ndarray, typical: np.ndarray, o: Merging) -> np.ndarray:
+    gap = ((look[:, None] - typical[None]) ** 2).sum(axis=2)
+    return o.look_cost * np.minimum(np.nan_to_num(gap, nan=MOST_LOOK), MOST_LOOK)
+
+
+@dataclass(frozen=True, eq=False)
+class _Columns:
+    """What is read at a place as sums over groups, in units of the floor.
+
+    Attributes:
+        groups: that scatter what the transmitter lights, shape ``(A,)``.
+        scattered: their readings at unit weight, by lobe and Fresnel component, shape ``(A, L, 3, N)`` float32.
+        senders: groups that send on light of others, shape ``(C,)``.
+        sent: what they send per unit of what they scatter of even light, shape ``(C, N)`` float32.
+    """
+
+    groups: np.ndarray
+    scattered: np.ndarray
+    senders: np.ndarray
+    sent: np.ndarray
+
+    @classmethod
+    def of(cls, o: Observation, effects: Effects, materials: Evaluation) -> _Columns:
+        """Those of an observation."""
+        tables, count = o.view.tables(effects), len(o.target.db)
+        groups, scattered = np.zeros(0, int), np.zeros((0, len(materials.parameters.lobes), 3, count), np.float32)
+        senders, sent = np.zeros(0, int), np.zeros((0, count), np.float32)
+        if "S" in tables:
+            key = "columns", materials.parameters.lobes
+
+            def components() -> tuple[np.ndarray, np.ndarray]:
+                found, sums = tables["S"].components(materials, o.bins("S"))
+                read = o.measured.of_bins(sums.reshape(len(sums), -1), quick=True) / np.float32(o.floor)
+                return found, np.ascontiguousarray(read.T).reshape(*sums.shape[1:], count)
+
+            groups, scattered = o._once(key, components)
+        if any(records.gain == 1 for records in tables.values()):
+            senders, sent = _sent(o.view, effects, o.measured, materials)
+            share = materials.parameters.scattered_share[materials.material[senders]]
+            sent = (sent / (o.floor * np.maximum(share, 1e-12))[:, None]).astype(np.float32)
+        return cls(groups, scattered, senders, sent)
+
+    def members(self, unit_of: np.ndarray) -> np.ndarray:
+        """Units whose light is read."""
+        return np.unique(unit_of[np.concatenate([self.groups, self.senders])])
+
+
+def _sent(
+    view: View, effects: Effects, measured: Measurement, materials: Evaluation
+) -> tuple[np.ndarray, np.ndarray]:
+    """Groups that send on light of others, and what is read of each, shape ``(C, N)``."""
+    bins, count = measured.bins(view)
+    group = view.tracer.surface.group[view.hits.face]
+    power = np.zeros(len(bins))
+    for records in view.tables(effects).values():
+        if records.gain == 1:
+            power += np.bincount(records.ray, records.powers(materials), len(bins))
+    ray = np.flatnonzero((bins >= 0) & (power > 0))
+    found, column = np.unique(group[ray], return_inverse=True)
+    cell = bins[ray] * len(found) + column.reshape(-1)
+    table = np.bincount(cell, power[ray], minlength=count * len(found)).reshape(count, len(found))
+    return found, np.maximum(measured.of_bins(table).T, 0.0)
+
+
+def _costs(
+    problem: Problem, columns: Sequence[_Columns], p: Parameters, unit_of: np.ndarray, owner: np.ndarray
+) -> np.ndarray:
+    """Rise of the objective if one unit alone became each material, ``(units, materials)``.
+
+    Args:
+        unit_of: unit of each group: its material, or itself.
+        owner: material of each unit now.
+    """
+    curves, common, count = fresnel_curves(), p, len(p.log_excess)
+    alpha = curves.at(curves.coordinates, p.log_excess)[0]
+    out = np.zeros((len(owner), count))
+    for (o, materials), c in zip(problem.evaluated(common), columns, strict=True):
+        p = materials.parameters
+        mix = (p.weight[:, :, None] * alpha[:, None, :]).reshape(count, -1).astype(np.float32)
+        share = p.scattered_share.astype(np.float32)
+        power = o.power(problem.effects, materials)
+        gain = o.gain(p, power)
+        power, gain = gain * power, gain * p.gain
+        loss = huber(o.target.error(power), problem.huber_db)[0].sum()
+        mirrors = _mirror_changes(o, problem, materials, unit_of)
+        for unit in np.unique(np.concatenate([c.members(unit_of), np.array(list(mirrors), int)])):
+            change = mirrors.get(int(unit), np.zeros((count, len(power)), np.float32)).copy()
+            for a in np.flatnonzero(unit_of[c.groups] == unit):
+                change += (mix - mix[owner[unit]]) @ c.scattered[a].reshape(-1, len(power))
+            for a in np.flatnonzero(unit_of[c.senders] == unit):
+                change += (share - share[owner[unit]])[:, None] * c.sent[a]
+            error = o.target.error(np.maximum(power + gain * change, 0.0))
+            rise = huber(error, problem.huber_db)[0].sum(axis=1) - loss
+            out[unit] += rise / problem.noise_db**2
+    return out
+
+
+def _mirror_changes(
+    o: Observation, problem: Problem, materials: Evaluation, unit_of: np.ndarray
+) -> dict[int, np.ndarray]:
+    """By unit the change of readings, shape ``(materials, N)``, by paths that meet it if it became each material."""
+    p, sharp, found = materials.parameters, o.view.records[SHARP], {}
+    sharp = sharp.take(np.flatnonzero(o.view.kept_paths(problem.effects)))
+    meets, count = sharp.index >= 0, len(p.log_excess)
+    unit = np.where(meets, unit_of[np.maximum(sharp.index, 0)], -1)
+    now = np.where(meets, materials.material[np.maximum(sharp.index, 0)], -1).astype(np.int32)
+    path = o.path[o.view.kept_paths(problem.effects)]
+    rows = Evaluation(p, device=materials.device)
+    before = replace(sharp, index=now).powers(rows)
+    for one in np.unique(unit[meets]):
+        if o.measured.together is not None:
+            found[int(one)] = _heard(o, problem, now, unit == one, p)
+            continue
+        own = np.flatnonzero((unit == one).any(axis=1))
+        trial = np.where(unit[own] == one, np.arange(count, dtype=np.int32)[:, None, None], now[own])
+        several = replace(sharp.take(np.tile(own, count)), index=trial.reshape(-1, now.shape[1]).astype(np.int32))
+        new = several.powers(rows).reshape(count, -1)
+        found[int(one)] = (new - before[own]).astype(np.float32) @ path[own]
+    return found
+
+
+def _heard(o: Observation, problem: Problem, now: np.ndarray, own: np.ndarray, p: Parameters) -> np.ndarray:
+    """The same where phases count: of all paths, ``own`` (L, K) of whose mirrors change."""
+    kept = o.view.kept_paths(problem.effects)
+    together, sharp = o.measured.together, o.view.records[SHARP].take(np.flatnonzero(kept))
+    if together is None:
+        raise TypeError("measured: got one that hears powers alone, expected phases")
+    together = together.subset(kept)
+    heard = [
+        together.received(together.amplitudes(replace(sharp, index=index), p)[0]) / o.floor
+        for index in (now, *(np.where(own, material, now) for material in range(len(p.log_excess))))
+    ]
+    return np.asarray(heard[1:], np.float32) - np.float32(heard[0])

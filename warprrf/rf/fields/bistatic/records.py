@@ -1,0 +1,195 @@
+"""Records of paths as geometry fixes them, and what parameters make of them: powers, slopes, columns.
+
+A table holds the paths of one sequence of interactions, named from the transmitter to the receiver: ``M`` a mirror, ``S`` a
+surface that scatters, ``E`` an element of the surface that sends on what it got of others. Mirrors and line of sight, paths
+of one direction each, are the table ``"sharp"``. All kinds are evaluated by :mod:`warprrf.kernels.radio.records`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warprrf import device as _device
+from warprrf.cache import Cache
+from warprrf.device import DeviceLike
+from warprrf.kernels.radio import records as kernels
+from warprrf.rf.em.fresnel import COSINES, fresnel_curves, lobe_norm, reciprocal_factor
+from warprrf.rf.fields.bistatic.materials import Parameters
+
+REALS = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
+
+
+@dataclass(frozen=True, eq=False)
+class Records:
+    """Paths of one sequence: N records of K interactions from the transmitter to the receiver.
+
+    Attributes:
+        power: path gain without interactions, shape ``(N,)``; its precision is that of the evaluation.
+        ray: ray of the receiver's grid that sees it, or row of a sharp path, or side of an element that is lit, ``(N,)``.
+        index: group that each interaction meets, or side of the element that sends, -1 for none, shape ``(N, K)`` int32.
+        angle: its angles, see :mod:`warprrf.kernels.radio.records`, shape ``(N, K, 3)``.
+        rough: column of what leaves light unpolarised, K where there is none.
+        kind: of that, ``kernels.SCATTER`` or ``kernels.SOURCE``; 0 for none.
+        gain: which gain of the residual the cell has that its ray sees, -1 for none.
+        half_width: half of the cosine's stretch that a ray stands for.
+    """
+
+    power: np.ndarray
+    ray: np.ndarray
+    index: np.ndarray
+    angle: np.ndarray
+    rough: int
+    kind: int = 0
+    gain: int = -1
+    half_width: float = 0.0
+
+    def __len__(self) -> int:
+        return len(self.power)
+
+    def take(self, rows: np.ndarray) -> Records:
+        """The records ``rows``."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in ("power", "ray", "index", "angle")})
+
+    def groups(self, side_group: np.ndarray) -> np.ndarray:
+        """Groups that its interactions meet; ``side_group`` (E,) is that of each side of an element."""
+        index = self.index.copy()
+        if self.kind == kernels.SOURCE:
+            index[:, self.rough] = side_group[index[:, self.rough]]
+        return np.unique(index[index >= 0])
+
+    def powers(self, materials: Evaluation) -> np.ndarray:
+        """Power of each under ``materials``, shape ``(N,)``."""
+        if len(self) == 0:
+            return np.zeros(0)
+        table, m, launch = self._table(materials)
+        out = wp.empty(len(self), dtype=REALS[self.power.dtype], device=materials.device)
+        launch(kernels.build(REALS[self.power.dtype])[2], len(self), [table, m, m.weight, m.excess, m.mirror, out])
+        return np.asarray(out.numpy(), np.float64)
+
+    def add_slopes(self, materials: Evaluation, bins: Bins, place: np.ndarray, slopes: np.ndarray) -> None:
+        """Add to ``slopes`` (B, C) the derivatives of the powers summed in ``bins`` to logarithms of parameters; those of
+        material m stand from column ``place[m]`` on: lobe weights, epsilon_r - 1, mirrored share."""
+        self._add(3, materials, bins, [wp.array(place, dtype=wp.int32, device=materials.device)], slopes)
+
+    def components(self, materials: Evaluation, bins: Bins) -> tuple[np.ndarray, np.ndarray]:
+        """What groups scatter into each bin at unit weight: the groups that do, shape ``(A,)``, and sums by lobe and
+        component of :class:`warprrf.rf.em.fresnel.FresnelCurves`, shape ``(B, A, L, 3)``."""
+        own = bins.order[bins.first[0] : bins.first[-1]]
+        groups = np.unique(self.index[own, self.rough])
+        place = np.zeros(int(self.index.max(initial=0)) + 1, np.int32)
+        place[groups] = np.arange(len(groups))
+        real, lobes = REALS[self.power.dtype], len(materials.parameters.lobes)
+        more = [
+            wp.array(place, dtype=wp.int32, device=materials.device),
+            wp.array(fresnel_curves().moments, dtype=real, device=materials.device),
+        ]
+        found = np.zeros((bins.count, len(groups) * lobes * kernels.MOMENTS), self.power.dtype)
+        self._add(4, materials, bins, more, found)
+        return groups, found.reshape(bins.count, len(groups), lobes, kernels.MOMENTS)
+
+    def _add(self, kernel: int, materials: Evaluation, bins: Bins, more: list[Any], sums: np.ndarray) -> None:
+        if sums.size == 0 or len(self) == 0:
+            return
+        real, where = REALS[self.power.dtype], materials.device
+        out = wp.array(sums, dtype=real, device=where, copy=False)
+        table, m, launch = self._table(materials)
+        ordered = [wp.array(a, dtype=wp.int32, device=where, copy=False) for a in (bins.first, bins.order)]
+        launch(kernels.build(real)[kernel], bins.count, [*ordered, table, m, *more, out])
+        if out.ptr != sums.ctypes.data:  # it was a copy: of another precision, or on another device
+            sums[...] = out.numpy()
+
+    def _table(self, materials: Evaluation) -> tuple[Any, Any, Any]:
+        real, where = REALS[self.power.dtype], materials.device
+        table = kernels.build(real)[1]()
+        table.power = wp.array(self.power, dtype=real, device=where, copy=False)
+        table.index = wp.array(self.index, dtype=wp.int32, device=where, copy=False)
+        table.angle = wp.array(self.angle, dtype=wp.types.vector(3, real), device=where, copy=False)
+        table.rough, table.kind, table.half_width = self.rough, self.kind, self.half_width
+        return table, materials.on_device(real), lambda *given: _device.launch(*given, device=where)
+
+
+@dataclass(frozen=True, eq=False)
+class Bins:
+    """Records in the order of the bins that they are summed in.
+
+    Attributes:
+        first: where each bin's records begin in ``order``, shape ``(B + 1,)`` int32.
+        order: records by bin, shape ``(N,)`` int32.
+    """
+
+    first: np.ndarray
+    order: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """Number of bins."""
+        return len(self.first) - 1
+
+    @classmethod
+    def of(cls, own: np.ndarray, count: int) -> Bins:
+        """Those of records in the bins ``own`` (N,) of ``count``, -1 for none."""
+        order = np.argsort(own, kind="stable").astype(np.int32)
+        return cls(np.searchsorted(own[order], np.arange(count + 1)).astype(np.int32), order)
+
+
+class Evaluation:
+    """Parameters as kernels take them.
+
+    Args:
+        parameters: of M materials.
+        material: row of each group in them, shape ``(G,)``; by default groups are rows.
+        side_group: group of each element's side, shape ``(E,)``; None where no element sends.
+        radiance: that each side sends [1/(m^2 sr)], in units of (4 pi / lambda)^2, shape ``(E,)``.
+        device: where powers are computed.
+    """
+
+    def __init__(
+        self,
+        parameters: Parameters,
+        material: np.ndarray | None = None,
+        side_group: np.ndarray | None = None,
+        radiance: np.ndarray | None = None,
+        *,
+        device: DeviceLike = None,
+    ) -> None:
+        self.parameters, self.device = parameters, str(_device.resolve(device))
+        self.material = np.arange(len(parameters.log_excess)) if material is None else material
+        self._side_group = np.zeros(0, int) if side_group is None else side_group
+        self._radiance = np.zeros(0) if radiance is None else radiance
+        self._made = Cache(2)  # which a pickle leaves behind
+
+    def by_materials(self, parameters: Parameters, material: np.ndarray) -> Evaluation:
+        """The same with parameters of materials in place of those of groups; ``material`` (G,) is that of each."""
+        return Evaluation(parameters, material, self._side_group, self._radiance, device=self.device)
+
+    def on_device(self, real: Any) -> Any:
+        """The kernels' view of it."""
+        return self._made.get(real, lambda: self._upload(real))
+
+    def _upload(self, real: Any) -> Any:
+        p, m, where = self.parameters, kernels.build(real)[0](), self.device
+        even, slope = fresnel_curves().even(p.log_excess)
+        values = {
+            "weight": p.weight, "excess": p.excess, "mirror": np.exp(p.log_mirror), "even_slope": slope / even,
+            "radiance": self._radiance,
+        }  # fmt: skip
+        for name, value in values.items():
+            setattr(m, name, wp.array(np.ascontiguousarray(value), dtype=real, device=where))
+        rows = self.material, self.material[self._side_group]
+        m.row, m.side_row = (wp.array(own, dtype=wp.int32, device=where) for own in rows)
+        m.exponent, m.scale = _lobes(p.lobes, p.reciprocal, real, where)
+        m.reciprocal = int(p.reciprocal)
+        return m
+
+
+@lru_cache(maxsize=8)
+def _lobes(exponents: tuple[int, ...], reciprocal: bool, real: Any, device: str) -> tuple[wp.array, wp.array]:
+    """Exponents of lobes, and a table over the cosine of each: 1 / norm, or the factor of a reciprocal one."""
+    cosine = np.linspace(0.0, 1.0, COSINES)
+    scale = [reciprocal_factor(n, cosine) if reciprocal else 1.0 / lobe_norm(n, cosine) for n in exponents]
+    return wp.array(exponents, dtype=wp.int32, device=device), wp.array(np.stack(scale), dtype=real, device=device)

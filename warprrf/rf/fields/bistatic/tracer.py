@@ -1,0 +1,385 @@
+"""The tracer: from a receiver backwards to records of paths, whatever the materials. It alone knows sequences by name.
+
+Rays fill the sphere around a receiver. What they hit is connected to the transmitter (``S``) and to its images in mirrors
+(``MS``); some go on turned at a mirror and are connected there (``SM``, ``MSM``). Elements of the surface send on what they
+got of others (:mod:`warprrf.rf.fields.bistatic.interreflection`), and are seen directly (``E``) or in a mirror (``EM``). Line
+of sight and mirrors alone come from the image method (:mod:`warprrf.rf.paths.mirror_paths`).
+
+A :class:`Tracer` belongs to a surface, a transmitter and a grid of rays; what it traced gives the :class:`View` of a receiver.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from warprrf.cache import Cache, making
+from warprrf.device import DeviceLike, Progress, resolve
+from warprrf.kernels.radio.records import SCATTER, SOURCE
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.fields.bistatic.materials import Effects
+from warprrf.rf.fields.bistatic.rays import NEAREST_M, Hits, RayGrid
+from warprrf.rf.fields.bistatic.records import Records
+from warprrf.rf.fields.bistatic.surface import Surface
+from warprrf.rf.paths.images import MirrorImages
+from warprrf.rf.paths.mirror_paths import MirrorPaths, ZoneRays, zone_paths
+from warprrf.rf.spectra.spectrum import unit_beams
+
+MIRROR_SLACK_M = 0.1
+"""How far beside its faces a patch may still mirror [m]: outlines of a reconstructed mesh are torn."""
+LIFT_M = 0.02  # rays that start on a surface start so far off it
+THROUGH_MIRRORS = 3  # rays of a pixel that look for light by way of mirrors
+INTO_MIRRORS = 5  # that go on at mirrors: what these show is seen a second time already
+SHARP = "sharp"
+"""Name of the table of line of sight and mirrors."""
+SENT_ON = ("E", "EM")
+"""Sequences that start at an element."""
+_TRACED = Cache(6)  # a lobby's take up to 90 MB each; the bound is the process's, not a surface's
+
+
+def sequences(effects: Effects) -> tuple[str, ...]:
+    """Names of the tables that ``effects`` want besides :data:`SHARP`."""
+    found = ["S", *["MS"] * effects.mirror_scatter, *["SM"] * effects.scatter_mirror] * (effects.scatterings > 0)
+    found += ["MSM"] * (effects.scatterings > 0 and effects.mirror_scatter and effects.scatter_mirror)
+    found += ["E", *["EM"] * effects.scatter_mirror] * (effects.scatterings > 1)
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class View:
+    """What R receivers see of the geometry under one transmitter; their rays, K each, stand one after another.
+
+    Attributes:
+        tracer: surface, transmitter and grid.
+        receivers: positions [m], shape ``(R, 3)``.
+        hits: what the rays hit.
+        paths: line of sight and mirror paths, L in all.
+        records: tables by sequence, of those that were asked for; of line of sight and mirrors under :data:`SHARP`, one row
+            for each of ``paths``.
+        beams: unit beam of each path over the pixels, shape ``(L, H, W)`` float32; None where none was asked for.
+    """
+
+    tracer: Tracer
+    receivers: np.ndarray
+    hits: Hits
+    paths: MirrorPaths
+    records: dict[str, Records] = field(repr=False)
+    beams: np.ndarray | None = field(default=None, repr=False)
+
+    @property
+    def cell(self) -> np.ndarray:
+        """Surface cell that each ray meets, shape ``(R K,)``; any where it meets nothing."""
+        return self.tracer.surface.cell.take(self.hits.face, mode="wrap")
+
+    def tables(self, effects: Effects) -> dict[str, Records]:
+        """The tables that count under ``effects``; they are traced when they are first asked for."""
+        wanted = (SHARP, *sequences(effects))
+        if not self.records.keys() >= set(wanted):
+            with making:
+                self.records.update(self.tracer.trace(self, [n for n in wanted if n not in self.records]))
+        return {name: self.records[name] for name in wanted}
+
+    def kept_paths(self, effects: Effects) -> np.ndarray:
+        """Which line of sight and mirror paths count, shape ``(L,)`` bool."""
+        order = self.paths.order
+        return np.asarray((order <= effects.mirrors) & ((order > 0) | effects.line_of_sight))
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """Rays and what they hit: ``ray`` of the receiver's grid that each belongs to, and the interaction between the hit and
+    the receiver, if any: group ``(N,)`` and cosine ``(N,)`` of a mirror."""
+
+    hits: Hits
+    ray: np.ndarray
+    group: np.ndarray | None = None
+    cosine: np.ndarray | None = None
+
+
+class Tracer:
+    """Geometry under one transmitter.
+
+    Args:
+        surface: what is hit.
+        transmitter: position (3,) [m].
+        frequency_hz: carrier.
+        grid: rays of a receiver.
+        beam_sigma_rad: width of the receiver's beam; None where no beams are asked for.
+
+    Attributes:
+        wavelength_m: wavelength.
+        kept: what belongs to the transmitter, by name.
+    """
+
+    def __init__(
+        self,
+        surface: Surface,
+        transmitter: np.ndarray,
+        frequency_hz: float,
+        grid: RayGrid,
+        beam_sigma_rad: float | None = None,
+    ) -> None:
+        self.surface, self.grid, self.beam_sigma_rad = surface, grid, beam_sigma_rad
+        self.transmitter = np.array(transmitter, np.float64)
+        self.frequency_hz = frequency_hz
+        self.wavelength_m = SPEED_OF_LIGHT / frequency_hz
+        self._first_grid = grid
+        self.kept = Cache(4)
+
+    @classmethod
+    def of(
+        cls,
+        surface: Surface,
+        transmitter: np.ndarray,
+        frequency_hz: float,
+        shape: tuple[int, int],
+        sub_pixels: int,
+        *,
+        beam_sigma_rad: float | None = None,
+        loss_per_m: float = 0.0,
+        device: DeviceLike = None,
+    ) -> Tracer:
+        """That of a grid of ``shape`` with ``sub_pixels`` squared rays a pixel; the last few are kept."""
+        place = np.asarray(transmitter, np.float64).tobytes()
+        where = str(resolve(device))
+        key = surface, place, frequency_hz, shape, sub_pixels, beam_sigma_rad, loss_per_m, where
+
+        def make() -> Tracer:
+            grid = RayGrid(surface, shape, sub_pixels, loss_per_m=loss_per_m, device=device)
+            return cls(surface, transmitter, frequency_hz, grid, beam_sigma_rad)
+
+        return _TRACED.get(key, make)
+
+    @property
+    def again(self) -> Callable[[], Tracer]:
+        """Makes the same again, in another process: it holds the surface, not what was traced."""
+        g = self._first_grid
+        return partial(
+            Tracer.of, self.surface, self.transmitter, self.frequency_hz, g.shape, g.sub_pixels,
+            beam_sigma_rad=self.beam_sigma_rad, loss_per_m=g.loss_per_m, device=str(g.device),
+        )  # fmt: skip
+
+    def on_grid(self, shape: tuple[int, int], sub_pixels: int) -> Tracer:
+        """The same for receivers with other rays and no beams; what belongs to the transmitter is shared."""
+        other, g = copy(self), self.grid
+        other.grid = RayGrid(self.surface, shape, sub_pixels, loss_per_m=g.loss_per_m, device=g.device)
+        other.beam_sigma_rad = None
+        return other
+
+    @property
+    def of_transmitter(self) -> Tracer:
+        """The same on the grid that it was made with: what belongs to the transmitter hangs on no other."""
+        first = copy(self)
+        first.grid = self._first_grid
+        return first
+
+    @property
+    def mirrored(self) -> MirroredLight:
+        """Images of the transmitter that light faces."""
+        return self.kept.get("mirrored", lambda: MirroredLight(self))
+
+    @property
+    def images(self) -> MirrorImages:
+        """Images of the transmitter in the surface's mirrors."""
+        return self.kept.get("images", lambda: images_of(self.surface, self.transmitter, self.grid.device))
+
+    def paths(self, receivers: np.ndarray, order: int, progress: Progress | None = None) -> MirrorPaths:
+        """Line of sight and mirror paths of ``receivers`` (R, 3) with at most ``order`` reflections."""
+        return zone_paths(self.images, receivers, order, self.wavelength_m, self.surface.skin_m, progress)
+
+    def view(self, receivers: np.ndarray, mirrors: int, *, paths: MirrorPaths | None = None) -> View:
+        """What ``receivers``, (3,) or (R, 3) [m], see.
+
+        Args:
+            receivers: positions, off the surface.
+            mirrors: most reflections of mirror paths.
+            paths: line of sight and mirror paths, if they are known.
+        """
+        places = np.asarray(receivers, np.float64).reshape(-1, 3)
+        found = self.paths(places, mirrors) if paths is None else paths
+        beams = None
+        if self.beam_sigma_rad is not None:
+            beams = unit_beams(found.arrival, self.grid.shape, self.beam_sigma_rad)
+        return View(self, places, self.grid.hit(places), found, {SHARP: self._sharp(found)}, beams)
+
+    def trace(self, view: View, names: Sequence[str]) -> dict[str, Records]:
+        """Tables of sequences that a receiver sees, by name."""
+        first, turned = _Rays(view.hits, np.arange(len(view.hits.face))), None
+        if any(name.endswith("M") for name in names):
+            turned = self._turned(view)
+        return {name: self._trace(name, turned if name.endswith("M") and turned else first) for name in names}
+
+    def _trace(self, name: str, rays: _Rays) -> Records:
+        """Records of one sequence."""
+        if name.startswith("E"):
+            return self.seen(rays)
+        return self.lit_by_mirrors(rays) if name.startswith("M") else self.lit(rays)
+
+    def _sharp(self, p: MirrorPaths) -> Records:
+        """Line of sight and mirror paths as records, in double precision."""
+        friis = (self.wavelength_m / (4.0 * np.pi * p.length_m)) ** 2 * p.share**2
+        group = np.where(p.patch >= 0, self.surface.patch_group.take(p.patch, mode="clip"), -1) if p.patch.size else p.patch
+        angle = np.stack([p.cosine, np.where(p.patch >= 0, p.turn, 0.0), 0.0 * p.cosine], axis=2)
+        power = friis * self.grid.transmittance(p.length_m)
+        return Records(power, np.arange(len(p), dtype=np.int32), group.astype(np.int32), angle, group.shape[1])
+
+    def lit(self, rays: _Rays) -> Records:
+        """What rays see of surfaces that the transmitter lights."""
+        light = self.grid.light(rays.hits, self.transmitter)
+        row = np.flatnonzero(light.strength > 0)
+        return self._scattered(rays, row, light.strength[row], light.angle[row])
+
+    def lit_by_mirrors(self, rays: _Rays) -> Records:
+        """What some rays of each pixel see of surfaces that images of the transmitter light."""
+        places = places_of_rays(self.grid.per_pixel, INTO_MIRRORS)[::2]
+        if rays.group is None:
+            places = places_of_rays(self.grid.per_pixel, THROUGH_MIRRORS)
+        chosen = np.flatnonzero(np.isin(rays.ray % self.grid.per_pixel, places) & (rays.hits.face >= 0))
+        times = ((self.grid.per_pixel if rays.group is None else min(INTO_MIRRORS, self.grid.per_pixel))) / len(places)
+        row, image = self.mirrored.pairs(rays.hits.face[chosen])
+        row, m = chosen[row], self.mirrored
+        light = self.grid.light_through(rays.hits, m.image[image], row)
+        k = np.flatnonzero(light.strength > 0)
+        patch = m.patch[image[k]]
+        way = m.image[image[k]] - light.point[k]
+        way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
+        cosine = np.abs(np.einsum("ni,ni->n", way, self.surface.plane_normal[patch]))
+        before = self.surface.patch_group[patch], cosine
+        return self._scattered(rays, row[k], light.strength[k] * np.float32(times), light.angle[k], before)
+
+    def seen(self, rays: _Rays) -> Records:
+        """What rays see of elements."""
+        hits, s = rays.hits, self.surface
+        row = np.flatnonzero(hits.face >= 0)
+        each = row % len(hits.directions)
+        side = s.side_met(hits.face[row], hits.directions[each])
+        solid_angle = hits.solid_angle[row % len(hits.solid_angle)]
+        power = (self.wavelength_m / (4.0 * np.pi)) ** 2 * solid_angle * self.grid.transmittance(hits.range_m[row])
+        return self._records(rays, row, power, side, np.zeros((len(row), 3), np.float32), SOURCE)
+
+    def _scattered(
+        self,
+        rays: _Rays,
+        row: np.ndarray,
+        strength: np.ndarray,
+        angle: np.ndarray,
+        before: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> Records:
+        """Records of scattering where the rays ``row`` hit, after a mirror of group and cosine ``before``."""
+        group = self.surface.group[rays.hits.face[row]]
+        return self._records(rays, row, self.wavelength_m**2 * strength, group, angle, SCATTER, before)
+
+    def _records(
+        self,
+        rays: _Rays,
+        row: np.ndarray,
+        power: np.ndarray,
+        index: np.ndarray,
+        angle: np.ndarray,
+        kind: int,
+        before: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> Records:
+        after = None if rays.group is None or rays.cosine is None else (rays.group[row], rays.cosine[row])
+        columns, angles = [index], [angle]
+        for mirror, where in ((before, 0), (after, len(columns) + (before is not None))):
+            if mirror is not None:
+                columns.insert(where, mirror[0])
+                angles.insert(where, np.column_stack([mirror[1], 0.0 * mirror[1], 0.0 * mirror[1]]))
+        gain = -1 if after is not None else int(kind == SOURCE or before is not None)
+        return Records(
+            np.asarray(power, np.float32), rays.ray[row].astype(np.int32), np.stack(columns, axis=1).astype(np.int32),
+            np.stack(angles, axis=1).astype(np.float32), int(before is not None), kind, gain, self.grid.half_width,
+        )  # fmt: skip
+
+    def _turned(self, view: View) -> _Rays:
+        """Some rays of each pixel turned at the mirrors that they hit, and what they hit there."""
+        s, grid, hits = self.surface, self.grid, view.hits
+        places = places_of_rays(grid.per_pixel, INTO_MIRRORS)
+        times = grid.per_pixel / len(places)
+        ray = np.flatnonzero(np.isin(np.arange(len(hits.face)) % grid.per_pixel, places))
+        face = hits.face[ray]
+        own = (face >= 0) & (s.patch.take(face, mode="wrap") >= 0)
+        ray, face = ray[own], face[own]
+        each = ray % len(grid.directions)
+        direction, normal = grid.directions[each], s.plane_normal[s.patch[face]]
+        normal = np.where((direction * normal).sum(axis=1, keepdims=True) > 0, -normal, normal)
+        cosine = -(direction * normal).sum(axis=1)
+        turned = direction + 2.0 * cosine[:, None] * normal
+        solid_angle = grid.solid_angle[each] * times * grid.transmittance(hits.range_m[ray])
+        found = grid.hit_along(hits.points(ray) + LIFT_M * normal, turned, solid_angle)
+        return _Rays(found, ray, s.group[face], cosine)
+
+    def adopted(self, view: View) -> View:
+        """What :func:`traced` found, as a view of this tracer."""
+        own: dict[str, Any] = {"directions": self.grid.directions, "solid_angle": self.grid.solid_angle}
+        return replace(view, tracer=self, hits=replace(view.hits, **own))
+
+
+def places_of_rays(per_pixel: int, count: int) -> np.ndarray:
+    """Which ``count`` of the rays of a pixel stand for all of them, shape ``(count,)``, or all if they are fewer."""
+    count = min(count, per_pixel)
+    return ((np.arange(count) + 0.5) * per_pixel / count).astype(int)
+
+
+def traced(
+    again: Callable[[], Tracer], effects: Effects, part: tuple[np.ndarray, MirrorPaths]
+) -> View:
+    """What a receiver (3,) of known line of sight and mirror paths sees, without what all receivers share."""
+    view = again().view(part[0], effects.mirrors, paths=part[1])
+    view.tables(effects)
+    none: dict[str, Any] = {"directions": None, "solid_angle": None}
+    return replace(view, tracer=None, hits=replace(view.hits, **none))  # type: ignore[arg-type]
+
+
+def images_of(surface: Surface, transmitter: np.ndarray, device: DeviceLike) -> MirrorImages:
+    """Images of ``transmitter`` (3,) in a surface's mirrors, whose outlines may be torn."""
+    return MirrorImages(surface.patches, transmitter, slack_m=MIRROR_SLACK_M, device=device)
+
+
+class MirroredLight:
+    """Images of the transmitter in single mirrors that light each face, found once at the middles of the faces.
+
+    Attributes:
+        image: of each pair of a face and an image that lights it [m], shape ``(N, 3)``.
+        patch: its mirror, shape ``(N,)``.
+        onto: its light on the sides of elements: records whose ray is the side, of irradiance where the transmitter gives
+            cos(theta_i) / d1^2 [1/m^2].
+    """
+
+    def __init__(self, tracer: Tracer) -> None:
+        s, transmitter, grid = tracer.surface, tracer.transmitter, tracer.grid
+        centre, image = s.mesh.triangles.mean(axis=1), s.images(transmitter)[0]
+        face, patch, point = images_of(s, transmitter, grid.device).candidates(centre, 1)
+        # Light must come from in front of the face, of either side if it has two, and not from its own patch.
+        normal = s.front_normal[face]
+        side = ((point[:, 0] - centre[face]) * normal).sum(axis=1)
+        normal = np.where(s.two_sided & (side < 0)[:, None], -normal, normal)
+        own = np.flatnonzero((s.two_sided | (side > 0)) & (s.patch[face] != patch[:, 0]))
+        face, patch, point, normal = face[own], patch[own], point[own], normal[own]
+        rays = ZoneRays(s.patches, transmitter, 0.0, s.skin_m, grid.device)
+        free = rays.reached(centre[face], patch, point, s.skin_m * normal)
+        face, patch, normal = face[free], patch[free, 0], normal[free]
+        order = np.lexsort((patch, face))
+        face, patch, normal = face[order], patch[order], normal[order]
+        self.image, self.patch = image[patch], patch
+        self._first = np.searchsorted(face, np.arange(len(s.mesh.faces) + 1))
+        way = self.image - centre[face]
+        length = np.linalg.norm(way, axis=1)
+        toward = way / np.maximum(length, 1e-12)[:, None]
+        cos_in = np.maximum((toward * normal).sum(axis=1), 0.0)
+        share = s.mesh.areas[face] / s.element_area[s.element[face]]
+        power = share * cos_in / np.maximum(length, NEAREST_M) ** 2 * grid.transmittance(length)
+        cosine = np.abs((toward * s.plane_normal[patch]).sum(axis=1))
+        angle = np.column_stack([cosine, 0.0 * cosine, 0.0 * cosine])[:, None]
+        self.onto = Records(power, s.side_met(face, -normal), s.patch_group[patch][:, None], angle, 1)
+
+    def pairs(self, face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of ``face`` (N,) and images that light them, one for each pair."""
+        count = self._first[face + 1] - self._first[face]
+        within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        return np.repeat(np.arange(len(face)), count), np.repeat(self._first[face], count) + within
