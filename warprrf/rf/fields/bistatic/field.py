@@ -533,7 +533,7 @@ class BistaticField(RadioField):
         layout = Layout(len(rows), len(self.parameters.lobes))
         place = Place(0, rows[:1], view.tracer.transmitter, view.receivers[0], self.frequency_hz, self.shape, self.air)
         o = Observation(place, view, SpectrumPixels(self._beam), Target(np.zeros(image.size)), self.floor)
-        slopes, index = o.slopes(self.effects, materials, layout, self.material)
+        slopes, index = o.slopes(self.effects, materials, layout)
         power = image.ravel() / self.floor
         if len(self.errors.covariance) > layout.size:  # of a common gain
             slopes, index = np.concatenate([slopes, power[None].astype(np.float32)]), np.append(index, layout.size)

@@ -22,7 +22,7 @@ from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.fields.base import Data, Measured
-from warprrf.rf.fields.bistatic.gauss_newton import Fitted, gauss_newton
+from warprrf.rf.fields.bistatic.gauss_newton import Fitted, Problem, gauss_newton
 from warprrf.rf.fields.bistatic.materials import LOBES, SETS, Effects, Model, Parameters
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, WeighedPaths, read
 from warprrf.rf.fields.bistatic.merging import BY_SHAPE, Merging, merge
@@ -31,8 +31,8 @@ from warprrf.rf.fields.bistatic.observations import (
     NOISE_DB,
     Observation,
     Place,
-    Problem,
     as_list,
+    columns_of,
     frame_of,
     observe,
     places_of,
@@ -448,10 +448,10 @@ class Training:
 
     def problem(self, effects: Effects, material: np.ndarray, places: Iterable[int], p: Parameters) -> Problem:
         """What is fitted to readings of ``places``, lit as under parameters ``p`` of materials."""
-        own = [self.parts[k] for k in places]
-        bare = Problem(own, effects, material, {}, len(self.chains), self.options.gain_offset, NOISE_DB, self.huber_db,
-                       1.0 if self.totals else 0.25)  # fmt: skip
-        return bare.lit(p)
+        return Problem.of(
+            [self.parts[k] for k in places], effects, material, p, chains=len(self.chains),
+            gain_offset=self.options.gain_offset, huber_db=self.huber_db, **({"energy": 1.0} if self.totals else {}),
+        )  # fmt: skip
 
     @property
     def huber_db(self) -> float:
@@ -502,8 +502,8 @@ class Training:
         if len(self.held) <= LEAST_RECEIVERS:
             return self.loss(self.model(choice), self.held)
         problem = self.problem(choice.effects, choice.material, self.held, choice.parameters)
-        powers = zip(problem.observations, problem.powers(choice.parameters), strict=True)
-        losses = [o.losses(o.gain(choice.parameters, x) * x, self.huber_db) for o, x in powers]
+        p = choice.parameters
+        losses = [o.losses(o.gain(p, x) * x, self.huber_db) for o, _, _, x in problem.evaluated(p)]
         return float(np.mean(np.concatenate(losses)))
 
     def note(self, what: str, kept: bool, loss: float) -> None:
@@ -514,9 +514,9 @@ class Training:
 def _line_of_sight_share(o: Observation, effects: Effects, p: Parameters) -> np.ndarray:
     """Share of readings (N,) that comes straight from the transmitter."""
     materials = Evaluation(p, device=o.view.tracer.grid.device)
-    direct = replace(effects, mirrors=0, scatterings=0)
-    power = o.power(direct, materials)
-    return np.asarray(power / np.maximum(o.power(effects, materials), np.maximum(power, 1e-300)))
+    power = o.direct(replace(effects, mirrors=0), materials)
+    total = columns_of(o, effects, materials).power(p) + o.direct(effects, materials)
+    return np.asarray(power / np.maximum(total, np.maximum(power, 1e-300)))
 
 
 @dataclass

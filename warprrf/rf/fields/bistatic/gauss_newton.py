@@ -1,4 +1,4 @@
-"""Fitting material parameters to readings: damped Gauss-Newton in dB on the slopes of path records.
+"""Fitting material parameters to readings: damped Gauss-Newton in dB.
 
 Of each material the fit learns the weights of its scattering lobes, one permittivity (the Fresnel curve that lobes and
 mirror share) and the strength of its mirror reflection. All are positive, so their logarithms are fitted. Priors keep
@@ -8,15 +8,27 @@ split one reflection (S^2 and 1 - S^2).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve
 from scipy.linalg.blas import ssyrk
 
-from warprrf.rf.fields.bistatic.materials import ROUGHNESS, Layout, Parameters
-from warprrf.rf.fields.bistatic.observations import NEPER, Problem, huber
+from warprrf.cache import cached_property
+from warprrf.rf.fields.bistatic.materials import ROUGHNESS, Effects, Layout, Model, Parameters
+from warprrf.rf.fields.bistatic.observations import (
+    NEPER,
+    NOISE_DB,
+    OWN_GAIN,
+    Columns,
+    Observation,
+    columns_of,
+    huber,
+)
+from warprrf.rf.fields.bistatic.records import Evaluation
+from warprrf.rf.fields.bistatic.render import evaluation
 
 WEIGHT, EXCESS, MIRROR = 2.0, 0.8, 1.5
 """Standard deviations a priori of lobe weights, permittivity less one and mirrored share from where a fit starts [nepers]."""
@@ -28,6 +40,103 @@ CARRIER = 1.0
 """That of the power of the carrier that roughness goes with, from Ament's 2."""
 LONGEST = 1.5  # change of a logarithm in one step
 TOLERANCE = 1e-3  # relative fall of the objective that ends a fit
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What parameters of materials are fitted to: observations, and how light comes to what scatters it last.
+
+    Attributes:
+        observations: of the training receivers.
+        columns: what scatters in each, by groups.
+        effects: what is modelled.
+        material: of each group, shape ``(G,)``.
+        chains: measuring chains whose gain is unknown.
+        gain_offset: whether a gain common to all paths is free.
+        huber_db: larger errors count linearly [dB]: shadows that the geometry puts in the wrong place.
+        energy: deviation of scattered and mirrored shares from a sum of one.
+    """
+
+    observations: Sequence[Observation]
+    columns: Sequence[Columns]
+    effects: Effects
+    material: np.ndarray
+    chains: int = 0
+    gain_offset: bool = False
+    huber_db: float = 3.0
+    energy: float = ENERGY
+
+    @classmethod
+    def of(
+        cls, observations: Sequence[Observation], effects: Effects, material: np.ndarray, p: Parameters, **settings: Any
+    ) -> Problem:
+        """That of observations where light comes as under parameters ``p`` of materials."""
+        known: dict[Any, Evaluation] = {}
+        columns = []
+        for o in observations:
+            key = id(o.view.tracer), o.ratio
+            if key not in known:
+                groups = p.at_ratio(o.ratio).take(material)
+                model = Model(effects, groups, np.zeros((2, 0)), o.place.transmitter)
+                known[key] = evaluation(o.view.tracer, model)
+            columns.append(columns_of(o, effects, known[key]))
+        return cls(observations, columns, effects, material, **settings)
+
+    @cached_property
+    def by_materials(self) -> list[Columns]:
+        """Columns of materials instead of groups."""
+        return [c.by_materials(self.material) for c in self.columns]
+
+    def evaluated(self, p: Parameters) -> Iterator[tuple[Observation, Columns, Evaluation, np.ndarray]]:
+        """Observations with the columns of their materials, the parameters ``p`` at their carriers as kernels take them,
+        and predictions without the gains of chains, in units of each floor."""
+        known: dict[float, Evaluation] = {}
+        for o, columns in zip(self.observations, self.by_materials, strict=True):
+            if o.ratio not in known:
+                known[o.ratio] = Evaluation(p.at_ratio(o.ratio), self.material, device=o.view.tracer.grid.device)
+            here = known[o.ratio].parameters
+            power = here.gain * (columns.power(here) + o.direct(self.effects, known[o.ratio]))
+            yield o, columns, known[o.ratio], power
+
+    def errors_db(self, p: Parameters) -> Iterator[np.ndarray]:
+        """Predictions less what was read, as it counts [dB]."""
+        for o, _, _, power in self.evaluated(p):
+            yield o.target.error(o.gain(p, power) * power)
+
+    def linearised(self, p: Parameters, layout: Layout) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """:meth:`errors_db` ``(N,)``, derivatives ``(C, N)`` float32, and the places of those parameters ``(C,)``."""
+        for o, columns, materials, power in self.evaluated(p):
+            table, index = _joined(
+                columns.slopes(materials.parameters, layout), o.slopes(self.effects, materials, layout, sharp=True)
+            )
+            table *= np.float32(materials.parameters.gain)
+            if layout.gain:
+                table = np.concatenate([table, power[None].astype(np.float32)])
+                index = np.append(index, layout.common_gain)
+            if o.ratio != 1.0:
+                slopes = layout.slopes_at_ratio(p, o.ratio)[index]
+                index = np.unique(slopes.indices)
+                table = np.asarray(slopes[:, index].T @ table)
+            gain = o.gain(p, power)
+            if o.chain == OWN_GAIN:  # what changes all alike changes nothing
+                known = np.ones(len(power)) if o.target.trust is None else (o.target.trust > 0).astype(float)
+                alike = table @ known / max(float(known @ power), 1e-300)
+                table = table - alike[:, None] * power
+            if o.chain != -1:
+                power, table = gain * power, np.float32(gain) * table.astype(np.float32)
+            if o.chain >= 0:
+                table = np.concatenate([table, power[None].astype(np.float32)])
+                index = np.append(index, layout.first_chain + o.chain)
+            yield o.target.error(power), (table * o.target.slope(power)).astype(np.float32), index
+
+
+def _joined(*parts: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of tables (C, N) added by their places (C,)."""
+    index = np.unique(np.concatenate([places for _, places in parts]))
+    table = np.zeros((len(index), parts[0][0].shape[1]), np.float32)
+    for rows, places in parts:
+        table[np.searchsorted(index, places)] += rows
+    return table, index
 
 
 @dataclass(frozen=True)
@@ -93,7 +202,7 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Fitted:
     if len(start.log_gains) != problem.chains:
         start = replace(start, log_gains=np.array([_first_gain(problem, start, c) for c in range(problem.chains)]))
     layout = layout_of(problem, start)
-    vector, damping, weight = layout.pack(start), 1e-3, 1.0 / problem.noise_db**2
+    vector, damping, weight = layout.pack(start), 1e-3, 1.0 / NOISE_DB**2
     count = max(sum(len(o.target.db) for o in problem.observations), 1)
     hessian, losses = np.eye(layout.size), []
 
@@ -139,7 +248,7 @@ def _normal_equations(problem: Problem, p: Parameters, layout: Layout) -> tuple[
     for error, table, index in problem.linearised(p, layout):
         if len(index) == 0:  # nothing that it sees is lit
             continue
-        root = np.sqrt(huber(error, problem.huber_db)[1]) / problem.noise_db
+        root = np.sqrt(huber(error, problem.huber_db)[1]) / NOISE_DB
         table *= root.astype(np.float32)
         hessian[np.ix_(index, index)] += ssyrk(1.0, table.T, trans=1)  # its upper triangle
         gradient[index] += table @ (root * error).astype(np.float32)
@@ -149,7 +258,7 @@ def _normal_equations(problem: Problem, p: Parameters, layout: Layout) -> tuple[
 def _first_gain(problem: Problem, start: Parameters, chain: int) -> float:
     """ln of the gain that makes the chain's readings agree with what ``start`` predicts, in the median of their power."""
     ratio = [np.zeros(0)]
-    for o, expected in zip(problem.observations, problem.powers(start), strict=True):
+    for o, _, _, expected in problem.evaluated(start):
         read = np.expm1(o.target.db / NEPER)
         known = (read > 0) & (expected > 0) & (True if o.target.censored is None else ~o.target.censored)
         if o.chain == chain:

@@ -8,17 +8,16 @@ better goes over. Fewer parameters, and purer materials, are learned better from
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from warprrf.rf.em.fresnel import fresnel_curves
-from warprrf.rf.fields.bistatic.materials import Effects, Parameters
-from warprrf.rf.fields.bistatic.measured import Measurement
-from warprrf.rf.fields.bistatic.observations import Observation, Problem, huber
+from warprrf.rf.fields.bistatic.gauss_newton import Problem
+from warprrf.rf.fields.bistatic.materials import Parameters
+from warprrf.rf.fields.bistatic.observations import NOISE_DB, Observation, huber
 from warprrf.rf.fields.bistatic.records import Evaluation
-from warprrf.rf.fields.bistatic.tracer import SHARP, View
+from warprrf.rf.fields.bistatic.tracer import SHARP
 
 
 @dataclass(frozen=True)
@@ -56,10 +55,9 @@ def merge(
     """
     o, count, material = options, len(p.log_excess), problem.material
     typical = _mean_look(look, material, area, count)
-    columns = [_Columns.of(one, problem.effects, materials) for one, materials in problem.evaluated(p)]
 
     # whole materials first, small ones before large ones
-    cost = _costs(problem, columns, p, material, np.arange(count))
+    cost = _costs(problem, p, material, np.arange(count))
     cost += _look_cost(typical, typical, o)
     np.fill_diagonal(cost, np.inf)
     size = np.bincount(material, area, minlength=count)
@@ -77,7 +75,7 @@ def merge(
     # then single groups
     typical = _mean_look(look, material, area, count)
     alive = np.unique(material)
-    cost = _costs(problem, columns, p, np.arange(len(material)), material) + _look_cost(look, typical, o)
+    cost = _costs(problem, p, np.arange(len(material)), material) + _look_cost(look, typical, o)
     rows = np.arange(len(material))
     change = cost - cost[rows, material][:, None]
     change[:, np.setdiff1d(np.arange(count), alive)] = np.inf
@@ -100,67 +98,8 @@ def _look_cost(look: np.ndarray, typical: np.ndarray, o: Merging) -> np.ndarray:
     return o.look_cost * np.minimum(np.nan_to_num(gap, nan=MOST_LOOK), MOST_LOOK)
 
 
-@dataclass(frozen=True, eq=False)
-class _Columns:
-    """What is read at a place as sums over groups, in units of the floor.
-
-    Attributes:
-        groups: that scatter what the transmitter lights, shape ``(A,)``.
-        scattered: their readings at unit weight, by lobe and Fresnel component, shape ``(A, L, 3, N)`` float32.
-        senders: groups that send on light of others, shape ``(C,)``.
-        sent: what they send per unit of what they scatter of even light, shape ``(C, N)`` float32.
-    """
-
-    groups: np.ndarray
-    scattered: np.ndarray
-    senders: np.ndarray
-    sent: np.ndarray
-
-    @classmethod
-    def of(cls, o: Observation, effects: Effects, materials: Evaluation) -> _Columns:
-        """Those of an observation."""
-        tables, count = o.view.tables(effects), len(o.target.db)
-        groups, scattered = np.zeros(0, int), np.zeros((0, len(materials.parameters.lobes), 3, count), np.float32)
-        senders, sent = np.zeros(0, int), np.zeros((0, count), np.float32)
-        if "S" in tables:
-            key = "columns", materials.parameters.lobes
-
-            def components() -> tuple[np.ndarray, np.ndarray]:
-                found, sums = tables["S"].components(materials, o.bins("S"))
-                read = o.measured.of_bins(sums.reshape(len(sums), -1), quick=True) / np.float32(o.floor)
-                return found, np.ascontiguousarray(read.T).reshape(*sums.shape[1:], count)
-
-            groups, scattered = o._once(key, components)
-        if any(records.gain == 1 for records in tables.values()):
-            senders, sent = _sent(o.view, effects, o.measured, materials)
-            share = materials.parameters.scattered_share[materials.material[senders]]
-            sent = (sent / (o.floor * np.maximum(share, 1e-12))[:, None]).astype(np.float32)
-        return cls(groups, scattered, senders, sent)
-
-    def members(self, unit_of: np.ndarray) -> np.ndarray:
-        """Units whose light is read."""
-        return np.unique(unit_of[np.concatenate([self.groups, self.senders])])
-
-
-def _sent(
-    view: View, effects: Effects, measured: Measurement, materials: Evaluation
-) -> tuple[np.ndarray, np.ndarray]:
-    """Groups that send on light of others, and what is read of each, shape ``(C, N)``."""
-    bins, count = measured.bins(view)
-    group = view.tracer.surface.group[view.hits.face]
-    power = np.zeros(len(bins))
-    for records in view.tables(effects).values():
-        if records.gain == 1:
-            power += np.bincount(records.ray, records.powers(materials), len(bins))
-    ray = np.flatnonzero((bins >= 0) & (power > 0))
-    found, column = np.unique(group[ray], return_inverse=True)
-    cell = bins[ray] * len(found) + column.reshape(-1)
-    table = np.bincount(cell, power[ray], minlength=count * len(found)).reshape(count, len(found))
-    return found, np.maximum(measured.of_bins(table).T, 0.0)
-
-
 def _costs(
-    problem: Problem, columns: Sequence[_Columns], p: Parameters, unit_of: np.ndarray, owner: np.ndarray
+    problem: Problem, p: Parameters, unit_of: np.ndarray, owner: np.ndarray
 ) -> np.ndarray:
     """Rise of the objective if one unit alone became each material, ``(units, materials)``.
 
@@ -171,24 +110,23 @@ def _costs(
     curves, common, count = fresnel_curves(), p, len(p.log_excess)
     alpha = curves.at(curves.coordinates, p.log_excess)[0]
     out = np.zeros((len(owner), count))
-    for (o, materials), c in zip(problem.evaluated(common), columns, strict=True):
+    for (o, _, materials, power), c in zip(problem.evaluated(common), problem.columns, strict=True):
         p = materials.parameters
         mix = (p.weight[:, :, None] * alpha[:, None, :]).reshape(count, -1).astype(np.float32)
         share = p.scattered_share.astype(np.float32)
-        power = o.power(problem.effects, materials)
         gain = o.gain(p, power)
         power, gain = gain * power, gain * p.gain
         loss = huber(o.target.error(power), problem.huber_db)[0].sum()
         mirrors = _mirror_changes(o, problem, materials, unit_of)
-        for unit in np.unique(np.concatenate([c.members(unit_of), np.array(list(mirrors), int)])):
+        for unit in np.unique(np.concatenate([unit_of[c.groups], unit_of[c.senders], np.array(list(mirrors), int)])):
             change = mirrors.get(int(unit), np.zeros((count, len(power)), np.float32)).copy()
             for a in np.flatnonzero(unit_of[c.groups] == unit):
-                change += (mix - mix[owner[unit]]) @ c.scattered[a].reshape(-1, len(power))
+                change += (mix - mix[owner[unit]]) @ c.single[a].reshape(-1, len(power))
             for a in np.flatnonzero(unit_of[c.senders] == unit):
-                change += (share - share[owner[unit]])[:, None] * c.sent[a]
+                change += (share - share[owner[unit]])[:, None] * c.further[a]
             error = o.target.error(np.maximum(power + gain * change, 0.0))
             rise = huber(error, problem.huber_db)[0].sum(axis=1) - loss
-            out[unit] += rise / problem.noise_db**2
+            out[unit] += rise / NOISE_DB**2
     return out
 
 

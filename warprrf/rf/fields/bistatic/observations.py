@@ -7,24 +7,25 @@ come from paths (:mod:`warprrf.rf.fields.bistatic.measured`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 
+from warprrf.cache import cached_property
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.em.absorption import Air
+from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import Data, Measured
-from warprrf.rf.fields.bistatic.interreflection import irradiance
 from warprrf.rf.fields.bistatic.materials import SETS, Effects, Layout, Model, Parameters
 from warprrf.rf.fields.bistatic.measured import ArrayImage, Measurement, SpectrumPixels, WeighedPaths, pixel_means, read
-from warprrf.rf.fields.bistatic.records import Bins, Evaluation
-from warprrf.rf.fields.bistatic.render import evaluation, path_gains
+from warprrf.rf.fields.bistatic.records import Bins, Evaluation, Records
+from warprrf.rf.fields.bistatic.render import path_gains
 from warprrf.rf.fields.bistatic.tracer import SHARP, View
 from warprrf.rf.positions import check_dataset, check_positions, question_unit, warn_of_unmodelled
 from warprrf.rf.spectra.beam import beam_operator
@@ -221,49 +222,64 @@ class Observation:
         """Readings of unit power on each line of sight and mirror path, in units of the floor, shape ``(L, N)``."""
         return self._once("path", lambda: self.measured.of_paths(self.view) / np.float32(self.floor))
 
-    def bins(self, name: str) -> Bins:
-        """Records of a sequence by what the readings cannot tell apart."""
-        own, count = self._ray_bins()
-        return self._once((name, "bins"), lambda: Bins.of(own[self.view.records[name].ray], count))
+    def single(self, materials: Evaluation) -> tuple[np.ndarray, np.ndarray]:
+        """What groups scatter straight from the transmitter, in units of the floor: groups ``(A,)``, and readings at unit
+        weight by lobe and Fresnel component, shape ``(A, L, 3, N)`` float32."""
 
-    def groups(self, name: str) -> np.ndarray:
-        """Groups whose parameters the records of a sequence hang on."""
-        return self._once((name, "groups"), lambda: self.view.records[name].groups(self.view.tracer.surface.side_group))
+        def components() -> tuple[np.ndarray, np.ndarray]:
+            own, count = self.ray_bins
+            (records,) = (t for name, t in self.view.tables(SETS["single"]).items() if name != SHARP)
+            groups, sums = records.components(materials, Bins.of(own[records.ray], count))
+            found = self.measured.of_bins(sums.reshape(count, -1), quick=True) / np.float32(self.floor)
+            return groups, np.ascontiguousarray(found.T).reshape(*sums.shape[1:], found.shape[0])
 
-    def power(self, effects: Effects, materials: Evaluation) -> np.ndarray:
-        """Prediction without residual and chain's gain, in units of the floor, shape ``(N,)``."""
-        own, count = self._ray_bins()
-        table = np.zeros(count)
-        for name, records in self._tables(effects):
-            bins = own[records.ray]
-            table += np.bincount(bins + 1, records.powers(materials), count + 1)[1:]
-        found = np.maximum(self.measured.of_bins(table[:, None])[:, 0] / self.floor, 0.0)
-        return materials.parameters.gain * (found + self._direct(effects, materials)[0])
+        return self._once((materials.parameters.lobes, materials.parameters.reciprocal), components)
+
+    def further(self, effects: Effects, materials: Evaluation) -> tuple[np.ndarray, np.ndarray]:
+        """What comes over more than one surface, by the group that scatters it last or sends it on: groups ``(C,)``, and
+        readings in units of the floor, shape ``(C, N)``."""
+        own, count = self.ray_bins
+        group, bins, power = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0)]
+        for records in self.further_tables(effects):
+            group.append(records.rough_groups(self.view.tracer.surface.side_group))
+            bins.append(own[records.ray])
+            power.append(records.powers(materials))
+        every = np.concatenate(power)
+        k = np.flatnonzero((np.concatenate(bins) >= 0) & (every > 0))
+        found, column = np.unique(np.concatenate(group)[k], return_inverse=True)
+        cell = np.concatenate(bins)[k] * len(found) + column.reshape(-1)
+        table = np.bincount(cell, every[k], minlength=count * len(found)).reshape(count, len(found))
+        return found, np.maximum(self.measured.of_bins(table.astype(np.float32), quick=True).T, 0.0) / np.float32(self.floor)
+
+    def further_tables(self, effects: Effects) -> list[Records]:
+        """Of paths over more than one surface, at least one of which scatters."""
+        single = self.view.tables(SETS["single"])
+        return [table for name, table in self.view.tables(effects).items() if name not in single]
+
+    def direct(self, effects: Effects, materials: Evaluation) -> np.ndarray:
+        """Readings of line of sight and mirrors in units of the floor, shape ``(N,)``."""
+        return self._direct(effects, materials)[0]
 
     def slopes(
-        self, effects: Effects, materials: Evaluation, layout: Layout, material: np.ndarray
+        self, effects: Effects, materials: Evaluation, layout: Layout, *, sharp: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of :meth:`power` to the parameters of materials ``(C, N)`` float32, and their places ``(C,)``.
-
-        Args:
-            material: of each group, shape ``(G,)``.
-        """
-        tables = self._tables(effects)
-        groups = [self.groups(name) for name in (SHARP, *(name for name, _ in tables))]
-        seen = np.unique(material[np.concatenate(groups)])
+        """Derivatives of readings to the parameters of materials ``(C, N)`` float32, and their places ``(C,)``; those of
+        line of sight and mirrors alone, if ``sharp``."""
+        tables = [] if sharp else [(n, r) for n, r in self.view.tables(effects).items() if n != SHARP]
+        side, (own, count) = self.view.tracer.surface.side_group, self.ray_bins
+        groups = [r.groups(side) for r in (self.view.records[SHARP], *(r for _, r in tables))]
+        seen = np.unique(materials.material[np.concatenate(groups)])
         index = (layout.stride * seen[:, None] + np.arange(layout.stride)).ravel()
         place = np.zeros(layout.groups, np.int32)
         place[seen] = layout.stride * np.arange(len(seen))
-        found = np.zeros((self._ray_bins()[1], len(index)), np.float32)
-        for name, records in tables:
-            records.add_slopes(materials, self.bins(name), place, found)
-        table = np.asarray(self.measured.of_bins(found, quick=True)).T / np.float32(self.floor)
         direct, columns = self._direct_slopes(effects, materials, place, len(index))
-        table = table + direct.T.astype(np.float32) @ columns
-        return np.float32(materials.parameters.gain) * table, index
-
-    def _tables(self, effects: Effects) -> list[tuple[str, Any]]:
-        return [(name, records) for name, records in self.view.tables(effects).items() if name != SHARP]
+        table = direct.T.astype(np.float32) @ columns
+        if tables:
+            sums = np.zeros((count, len(index)), np.float32)
+            for _, records in tables:
+                records.add_slopes(materials, Bins.of(own[records.ray], count), place, sums)
+            table = table + np.asarray(self.measured.of_bins(sums, quick=True)).T / np.float32(self.floor)
+        return table, index
 
     def _direct(self, effects: Effects, materials: Evaluation) -> tuple[np.ndarray, np.ndarray]:
         """Readings of line of sight and mirrors ``(N,)``, and what their slopes are multiplied by ``(L, N)``."""
@@ -292,8 +308,10 @@ class Observation:
                 found[path, at : at + 2] += rise[path, mirror], 0.5 * amplitude[path]
         return found * kept[:, None], columns
 
-    def _ray_bins(self) -> tuple[np.ndarray, int]:
-        return self._once("rays", lambda: self.measured.bins(self.view))
+    @cached_property
+    def ray_bins(self) -> tuple[np.ndarray, int]:
+        """What the readings sum rays in: bin of each ray, -1 for none, and how many bins there are."""
+        return self.measured.bins(self.view)
 
     def _once(self, key: Any, make: Any) -> Any:
         if key not in self._kept:
@@ -302,86 +320,71 @@ class Observation:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
-    """What parameters of materials are fitted to: observations, and what is held meanwhile.
+class Columns:
+    """Readings of scattered light as sums over groups, or materials, in units of the floor: a table collapsed.
+
+    Fits and merging ask for powers so often that evaluating every record would take ten times as long. What comes over more
+    than one surface follows the share that the last one scatters of even light; all else of it is held.
 
     Attributes:
-        observations: of the training receivers.
-        effects: what is modelled.
-        material: of each group, shape ``(G,)``.
-        irradiance: what elements get of each other, by tracer and ratio of carriers; empty without that.
-        chains: measuring chains whose gain is unknown.
-        gain_offset: whether a gain common to all paths is free.
-        noise_db: see :data:`NOISE_DB`.
-        huber_db: larger errors count linearly [dB]: shadows that the geometry puts in the wrong place.
-        energy: deviation of scattered and mirrored shares from a sum of one.
+        groups: that scatter straight from the transmitter, shape ``(A,)``.
+        single: their readings at unit weight, by lobe and Fresnel component, shape ``(A, L, 3, N)`` float32.
+        senders: that scatter or send on light that came over other surfaces, shape ``(C,)``.
+        further: what they bring per unit of that share, shape ``(C, N)`` float32.
     """
 
-    observations: Sequence[Observation]
-    effects: Effects
-    material: np.ndarray
-    irradiance: dict[Any, np.ndarray]
-    chains: int = 0
-    gain_offset: bool = False
-    noise_db: float = NOISE_DB
-    huber_db: float = 3.0
-    energy: float = 0.25
+    groups: np.ndarray
+    single: np.ndarray
+    senders: np.ndarray
+    further: np.ndarray
 
-    def lit(self, p: Parameters) -> Problem:
-        """The same with what elements get of each other under parameters ``p`` of materials."""
-        found: dict[Any, np.ndarray] = {}
-        for o in self.observations:
-            key = id(o.view.tracer), o.ratio
-            if key not in found:
-                got = irradiance(o.view.tracer, p.at_ratio(o.ratio).take(self.material), self.effects)
-                found |= {} if got is None else {key: got}
-        return replace(self, irradiance=found)
+    def by_materials(self, material: np.ndarray) -> Columns:
+        """Those of materials; ``material`` (G,) is that of each group."""
+        return Columns(*_summed(material[self.groups], self.single), *_summed(material[self.senders], self.further))
 
-    def evaluated(self, p: Parameters) -> Iterator[tuple[Observation, Evaluation]]:
-        """Observations with the parameters ``p`` of materials as kernels take them."""
-        known: dict[Any, Evaluation] = {}
-        for o in self.observations:
-            key = id(o.view.tracer), o.ratio
-            if key not in known:
-                here, side, got = p.at_ratio(o.ratio), o.view.tracer.surface.side_group, self.irradiance.get(key)
-                radiance = None if got is None else got * here.scattered_share[self.material[side]] / np.pi
-                known[key] = Evaluation(here, self.material, side, radiance, device=o.view.tracer.grid.device)
-            yield o, known[key]
+    def power(self, p: Parameters) -> np.ndarray:
+        """Readings, shape ``(N,)``."""
+        curves = fresnel_curves()
+        mixed = p.weight[self.groups][:, :, None] * curves.at(curves.coordinates, p.log_excess[self.groups])[0][:, None]
+        single = mixed.astype(np.float32).ravel() @ self.single.reshape(mixed.size, -1)
+        return np.asarray(np.maximum(single, 0.0) + p.scattered_share[self.senders].astype(np.float32) @ self.further, float)
 
-    def powers(self, p: Parameters) -> list[np.ndarray]:
-        """Predictions without the gains of chains, in units of each floor."""
-        return [o.power(self.effects, materials) for o, materials in self.evaluated(p)]
+    def slopes(self, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of the readings to parameters ``(C, N)`` float32, and their places ``(C,)``."""
+        curves, seen = fresnel_curves(), np.union1d(self.groups, self.senders)
+        found = np.zeros((len(seen), layout.stride, self.single.shape[-1]), np.float32)
+        alpha, rise = curves.at(curves.coordinates, p.log_excess)
+        for g, columns in zip(self.groups, self.single, strict=True):
+            row = found[np.searchsorted(seen, g)]
+            row[: layout.lobes] += (p.weight[g] * np.einsum("c,lcn->nl", alpha[g].astype(np.float32), columns)).T
+            row[layout.lobes] += p.weight[g] @ np.einsum("c,lcn->ln", rise[g].astype(np.float32), columns)
+        even, steeper = curves.even(p.log_excess)
+        for g, column in zip(self.senders, self.further, strict=True):
+            row = found[np.searchsorted(seen, g)]
+            row[: layout.lobes] += (p.weight[g] * even[g])[:, None] * column
+            row[layout.lobes] += p.weight[g].sum() * steeper[g] * column
+        index = layout.stride * seen[:, None] + np.arange(layout.stride)
+        return found.reshape(index.size, -1), index.ravel()
 
-    def errors_db(self, p: Parameters) -> Iterator[np.ndarray]:
-        """Predictions less what was read, as it counts [dB]."""
-        for o, materials in self.evaluated(p):
-            power = o.power(self.effects, materials)
-            yield o.target.error(o.gain(p, power) * power)
 
-    def linearised(self, p: Parameters, layout: Layout) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """:meth:`errors_db` ``(N,)``, derivatives ``(C, N)`` float32, and the places of those parameters ``(C,)``."""
-        for o, materials in self.evaluated(p):
-            power = o.power(self.effects, materials)
-            table, index = o.slopes(self.effects, materials, layout, self.material)
-            if layout.gain:
-                table = np.concatenate([table, power[None].astype(np.float32)])
-                index = np.append(index, layout.common_gain)
-            if o.ratio != 1.0:
-                slopes = layout.slopes_at_ratio(p, o.ratio)[index]
-                index = np.unique(slopes.indices)
-                table = np.asarray(slopes[:, index].T @ table)
-            gain = o.gain(p, power)
-            if o.chain == OWN_GAIN:  # what changes all alike changes nothing
-                known = np.ones(len(power)) if o.target.trust is None else (o.target.trust > 0).astype(float)
-                alike = table @ known / max(float(known @ power), 1e-300)
-                table = table - alike[:, None] * power
-            if o.chain != -1:
-                power, table = gain * power, np.float32(gain) * table.astype(np.float32)
-            if o.chain >= 0:
-                table = np.concatenate([table, power[None].astype(np.float32)])
-                index = np.append(index, layout.first_chain + o.chain)
-            table *= o.target.slope(power).astype(np.float32)
-            yield o.target.error(power), table, index
+def columns_of(o: Observation, effects: Effects, materials: Evaluation) -> Columns:
+    """Those of an observation's groups, as light comes to them under ``materials``."""
+    p, count = materials.parameters, len(o.target.db)
+    groups, single = np.zeros(0, int), np.zeros((0, len(p.lobes), 3, count), np.float32)
+    if effects.scatterings:
+        groups, single = o.single(materials)
+    senders, further = o.further(effects, materials)
+    share = np.maximum(p.scattered_share[materials.material[senders]], 1e-12)
+    return Columns(groups, single, senders, (further / share[:, None]).astype(np.float32))
+
+
+def _summed(owner: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns (C, ...) summed by ``owner`` (C,): the owners, and the sum of each."""
+    found, place = np.unique(owner, return_inverse=True)
+    out = np.zeros((len(found), *columns.shape[1:]), np.float32)
+    for a, k in enumerate(place.reshape(-1)):
+        out[k] += columns[a]
+    return found, out
 
 
 class Kind(Protocol):
@@ -527,8 +530,8 @@ class _Arrays:
         bare = Observation(place, view, measured.part(known), target, unit * one.floor, chain)
         start = Parameters.prior(view.tracer.surface.groups)
         materials, single = Evaluation(start, device=view.tracer.grid.device), SETS["single"]
-        total = bare.power(single, materials)
-        scattered = bare.power(replace(single, line_of_sight=False, mirrors=0), materials)
+        scattered = columns_of(bare, single, materials).power(start)
+        total = scattered + bare.direct(single, materials)
         gain = bare.gain(start, total)
         std_db = (
             NEPER * gain * np.sqrt(scattered * np.maximum(2.0 * total - scattered, 0.0)) / (1.0 + gain * total)

@@ -55,12 +55,17 @@ class Records:
         """The records ``rows``."""
         return replace(self, **{name: getattr(self, name)[rows] for name in ("power", "ray", "index", "angle")})
 
+    def rough_groups(self, side_group: np.ndarray) -> np.ndarray:
+        """Group that scatters or sends in each, shape ``(N,)``; ``side_group`` (E,) is that of each side of an element."""
+        own = self.index[:, self.rough]
+        return side_group[own] if self.kind == kernels.SOURCE else own
+
     def groups(self, side_group: np.ndarray) -> np.ndarray:
-        """Groups that its interactions meet; ``side_group`` (E,) is that of each side of an element."""
-        index = self.index.copy()
-        if self.kind == kernels.SOURCE:
-            index[:, self.rough] = side_group[index[:, self.rough]]
-        return np.unique(index[index >= 0])
+        """Groups that any of its interactions meets."""
+        found = [own for k, own in enumerate(self.index.T) if k != self.rough]
+        found += [self.rough_groups(side_group)] if self.kind else []
+        every = np.concatenate([np.zeros(0, int), *found])
+        return np.unique(every[every >= 0])
 
     def powers(self, materials: Evaluation) -> np.ndarray:
         """Power of each under ``materials``, shape ``(N,)``."""
