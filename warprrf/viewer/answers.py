@@ -79,8 +79,8 @@ def as_asked(source: Source, asked: Asked) -> Source:
         return source
     if abs(asked.frequency_hz - source.frequency_hz) > 0.5 * CARRIER_STEP_HZ:
         source = source.at_frequency(asked.frequency_hz)
-    order = min(asked.mirror_order, source.terms.mirror_order)
-    return replace(source, terms=replace(source.terms, mirror_order=order))
+    order = min(asked.mirror_order, source.effects.mirrors)
+    return replace(source, effects=replace(source.effects, mirrors=order))
 
 
 def answer(source: Source, receiver: np.ndarray, transmitters: Sequence[np.ndarray], asked: Asked) -> Answer:

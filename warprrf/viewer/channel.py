@@ -43,7 +43,7 @@ class Channel:
             axes=({"label": "delay [ns]", "labelSize": 20, "size": 30}, {"label": "path gain [dB]", "labelSize": 20}),
         )  # fmt: skip
         self.table = gui.add_html("")
-        most = field.terms.mirror_order if isinstance(field, BistaticField) else 3
+        most = field.effects.mirrors if isinstance(field, BistaticField) else 3
         carrier, step = subject.carrier_hz / 1e9, answers.CARRIER_STEP_HZ / 1e9
         low, high = min(carrier, 1.0 if field is None else CARRIERS_GHZ[0]), max(carrier, CARRIERS_GHZ[1])
         with gui.add_folder("What is asked", expand_by_default=False):

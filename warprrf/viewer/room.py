@@ -10,7 +10,6 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians, quaternions_of
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import mirror_share
 from warprrf.viewer import pictures
 from warprrf.viewer.page import Page, Setting
 from warprrf.viewer.subject import Subject
@@ -54,7 +53,7 @@ def learned(field: BistaticField, kind: str, progress: Progress | None = None) -
     if kind == "roughness":
         height_m = field.wavelength_m / (4.0 * np.pi) * np.sqrt(np.maximum(-p.log_smooth, 0.0))
         return np.asarray(1e3 * height_m[surface.group])
-    share = mirror_share(p, groups, np.ones(len(groups))) if kind == "reflection" else p.scattered_share
+    share = p.mirrored_share if kind == "reflection" else p.scattered_share
     return np.asarray(10.0 * np.log10(np.maximum(share, 1e-12))[surface.group])
 
 

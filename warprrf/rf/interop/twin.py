@@ -38,7 +38,7 @@ from warprrf.rf.em.fresnel import LAMBERTIAN, fresnel_curves, lobe, slab_reflect
 from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, Band, Material, table_entry
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.fit import NEPER
+from warprrf.rf.fields.bistatic.observations import NEPER
 
 ABOUT = "Digital twin written by warprrf.write_twin."
 """First line of a twin's ``materials.json``: a folder that says so may be replaced."""
@@ -155,8 +155,7 @@ def write_twin(
     ``surface_<group>`` of a material ``fitted_<group>``, named by its largest group; it holds within 10 % of the
     field's carrier.
 
-    No material can hold a common gain (an uncalibrated receiver), residuals of elements or an indirect radiance, and
-    softened blocking belongs to the field's tracer: :attr:`Twin.left_out` says what this field has of the former, and
+    No material can hold a common gain (an uncalibrated receiver) or residuals of elements, and softened blocking belongs to the field's tracer: :attr:`Twin.left_out` says what this field has of the former, and
     which materials let nothing through because nobody said how thick they are.
     Sionna may find one mirror in several small triangles and count it as often; :func:`simulate` counts it once.
 
@@ -177,7 +176,7 @@ def write_twin(
     """
     if not isinstance(field, BistaticField):
         raise TypeError(f"field: got {type(field).__name__}, expected a field of model 'bistatic'")
-    if not field.terms.diffuse and field.terms.mirror_order == 0:
+    if field.effects.scatterings == 0 and field.effects.mirrors == 0:
         raise ValueError("field: it models line of sight alone, expected one with diffuse or mirror paths")
     folder = Path(folder)
     _check_replaceable(folder)
@@ -324,9 +323,9 @@ def _thicknesses(field: BistaticField, given: float | Mapping[str, float] | None
 
 def _project(field: BistaticField, g: int, name: str, area: float, thickness_m: float) -> TwinGroup:
     """What group ``g`` becomes as a slab; NaN stands for a half-space."""
-    p, terms, frequency = field.parameters, field.terms, field.frequency_hz
-    scattered = float(p.weight[g].sum()) if terms.diffuse else 0.0
-    mirrored = float(np.exp(p.log_mirror[g])) if terms.mirror_order > 0 else 0.0
+    p, effects, frequency = field.parameters, field.effects, field.frequency_hz
+    scattered = float(p.weight[g].sum()) if effects.scatterings else 0.0
+    mirrored = float(np.exp(p.log_mirror[g])) if effects.mirrors else 0.0
     known = np.isfinite(thickness_m)
     reflection = project_reflection(
         float(p.log_excess[g]), scattered, mirrored, thickness_m / field.wavelength_m if known else np.inf
@@ -334,7 +333,7 @@ def _project(field: BistaticField, g: int, name: str, area: float, thickness_m: 
     permittivity = reflection.relative_permittivity
     alpha_r, lobe_error = LAMBERTIAN, 0.0
     if scattered > 0:
-        alpha_r, lobe_error = project_lobes(terms.lobes, p.weight[g], reciprocal=terms.reciprocal)
+        alpha_r, lobe_error = project_lobes(p.lobes, p.weight[g], reciprocal=p.reciprocal)
     conductivity = LOSS_TANGENT * permittivity * 2.0 * np.pi * frequency * VACUUM_PERMITTIVITY
     low, high = (1.0 - BAND_SHARE) * frequency, (1.0 + BAND_SHARE) * frequency
     fitted = f"fitted at {frequency / 1e9:g} GHz"
@@ -375,12 +374,10 @@ def _left_out(field: BistaticField, half_spaces: Sequence[str]) -> tuple[str, ..
         )
     if p.log_gain != 0.0:
         found.append(f"common gain of {NEPER * p.log_gain:.2f} dB: multiply the twin's path gain by it")
-    if field.terms.residual:
+    if field.effects.residual:
         squares = np.average(field.residual[0] ** 2, weights=np.bincount(s.cell, s.mesh.areas))
         found.append(f"residuals within groups, {NEPER * np.sqrt(squares):.2f} dB rms over area")
-    if field.terms.indirect:
-        found.append("indirect radiance of each group: further bounces are the ray tracer's")
-    if field.terms.diffuse and field.terms.reciprocal:
+    if field.effects.scatterings and p.reciprocal:
         found.append("reciprocity: scattered power changes when transmitter and receiver are swapped")
     return tuple(found)
 

@@ -4,9 +4,8 @@ The full model (:mod:`warprrf.rf.relevance.model`) is evaluated at a handful of 
 What an effect is worth is the larger of two changes that leaving it out makes, both root mean squares over receivers:
 that of the dB image 10 log10(P + N0), over the sphere, and that of the total path gain. The smallest model is found by
 leaving out effects one after another, each time the one whose loss hurts least together with all that went before (the
-costliest of those that hurt alike, to a hundredth of a dB), while the model stays within the tolerance of the full one;
-what is left is then evaluated as a field of its own, to be sure. There the mean squares count with one standard error
-more, because few receivers stand for many.
+costliest of those that hurt alike, to a hundredth of a dB), while the model stays within the tolerance of the full one.
+There the mean squares count with one standard error more, because few receivers stand for many.
 The order does not depend on the tolerance, so a larger one never keeps more.
 """
 
@@ -26,38 +25,36 @@ from warprrf.geometry.mesh import as_mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Terms
+from warprrf.rf.fields.bistatic.materials import Effects
 from warprrf.rf.positions import check_positions, check_receivers, question_unit
-from warprrf.rf.relevance.model import FURTHER, FullModel, full_field, with_lobes
+from warprrf.rf.relevance.model import FullModel, effects_of, full_field, lobe_name, with_lobes
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape
 
 SAME_BAND = 0.05  # relative difference of carriers up to which a choice holds
 TITLES = {
     "line_of_sight": "line of sight",
-    "mirror_1": "mirrors, order 1",
-    "mirror_2": "mirrors, order 2",
-    "diffuse_1": "diffuse, order 1",
-    "diffuse_2": "diffuse, order 2 and more",
+    "mirrors_1": "mirrors, order 1",
+    "mirrors_2": "mirrors, order 2",
+    "scatterings_1": "scattering, order 1",
+    "scatterings_2": "scattering, order 2 and more",
     "mirror_scatter": "surfaces lit by mirrors",
     "scatter_mirror": "lit surfaces seen in mirrors",
-    "indirect": "indirect radiance of groups",
     "residual": "residual of elements",
     "lobes": "scattering lobes",
     "gas": "gas absorption (ITU-R P.676)",
     "diffraction": "diffraction (knife edge, ITU-R P.526)",
     "transmission": "transmission through walls (ITU-R P.2040)",
-    "unseen": "surface elements that no receiver sees",
 }
 OUTSIDE = ("diffraction", "transmission")
-"""Effects that a bistatic field has no term for."""
-ESTIMATED = ("gas", *OUTSIDE)
-"""Effects that are estimated beside the model."""
+"""Effects that a bistatic field does not model."""
 ALIKE_DB = 0.01  # losses that round to the same hundredth of a dB are alike: then cost decides
-NEEDS = {"mirror_1": ("mirror_2",), "diffuse_1": (*FURTHER, "residual")}
+NEEDS = {
+    "mirrors_1": ("mirrors_2",), "scatterings_1": ("mirror_scatter", "scatter_mirror", "scatterings_2", "residual"),
+}  # fmt: skip
 """What goes with an effect, because it rests on it."""
 COSTLY = (
-    "scatter_mirror", "diffuse_2", "mirror_scatter", "mirror_2", "diffuse_1", "mirror_1", "diffraction", "transmission",
-    "line_of_sight",
+    "scatter_mirror", "scatterings_2", "mirror_scatter", "mirrors_2", "scatterings_1", "mirrors_1", "diffraction",
+    "transmission", "line_of_sight",
 )  # fmt: skip
 """From the costliest down, as measured on the lobby: fixed, so that a choice does not hang on the clock."""
 MATERIALS = {
@@ -106,7 +103,8 @@ class Relevance:
         floor: N0 of the dB images.
         receivers, blocked: how many, and how many of them without line of sight.
         effects: rows of the table.
-        terms: the smallest bistatic model.
+        model: what the smallest bistatic model has.
+        lobes: exponents of its scattering lobes.
         image_db, total_db: its changes against the full model [dB], rms over receivers, all effects left out at once.
     """
 
@@ -119,7 +117,8 @@ class Relevance:
     receivers: int
     blocked: int
     effects: tuple[Effect, ...]
-    terms: Terms
+    model: Effects
+    lobes: tuple[int, ...]
     image_db: float
     total_db: float
 
@@ -137,11 +136,11 @@ class Relevance:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Effects that the scene needs and a bistatic field has no term for."""
+        """Effects that the scene needs and a bistatic field does not model."""
         return tuple(name for name in self.kept if name in OUTSIDE)
 
-    def options(self, frequency_hz: float) -> dict[str, Any]:
-        """Options of a bistatic fit to spectra at ``frequency_hz``: what is ruled out is off, the rest left to the fit.
+    def needs(self, frequency_hz: float) -> tuple[Effects, tuple[int, ...] | None]:
+        """What a fit to spectra at ``frequency_hz`` may need, and its lobes; None for those of a fit.
 
         Raises:
             ValueError: if the carrier is another than the one that this was made for.
@@ -151,25 +150,15 @@ class Relevance:
                 f"frequency_hz: got spectra of {frequency_hz / 1e9:g} GHz, but this relevance is for "
                 f"{self.frequency_hz / 1e9:g} GHz; expected the same band, call warprrf.relevance for it"
             )
-        t, out = self.terms, [e.name for e in self.effects if e.kept is False]
-        off: dict[str, Any] = {
-            name: False for name in ("mirror_scatter", "scatter_mirror", "indirect", "residual")
-        }
-        return {
-            "line_of_sight": t.line_of_sight,
-            "diffuse": t.diffuse,
-            "mirror_order": None if t.mirror_order == 2 else t.mirror_order,
-            "lobes": None if self.materials == "assumed" and t.diffuse else t.lobes,
-            "diffuse_order": None if t.diffuse_order > 1 else 1,
-            **{name: (value if name in out else None) for name, value in off.items()},
-        }
+        m, out = self.model, [e.name for e in self.effects if e.kept is False]
+        most = replace(
+            m, mirrors=3 if m.mirrors == 2 else m.mirrors, residual="residual" not in out and m.scatterings > 0
+        )
+        return most, None if self.materials == "assumed" and m.scatterings else self.lobes
 
     def reduce(self, full: BistaticField) -> BistaticField:
-        """``full``, a field with the terms that this was made of, cut down to the smallest model."""
-        lobes = self.terms.lobes
-        p = with_lobes(full.parameters, full.terms.lobes, lobes)
-        p = replace(p, log_weight=p.log_weight[:, [full.terms.lobes.index(n) for n in lobes]])
-        return replace(full, terms=self.terms, parameters=p, errors=None)
+        """``full``, a field with the effects that this was made of, cut down to the smallest model."""
+        return replace(full, effects=self.model, parameters=with_lobes(full.parameters, self.lobes), errors=None)
 
     def table(self) -> str:
         """The effects as a Markdown table, with what was chosen below it."""
@@ -187,7 +176,7 @@ class Relevance:
         for e in self.effects:
             chosen = "left to the fit" if e.kept is None else "yes" if e.kept else "no"
             if e.name in self.missing:
-                chosen = "needed, no term for it"
+                chosen = "needed, not modelled"
             numbers = [cell(v) for v in (e.image_db, e.total_db, e.image_blocked_db, e.total_blocked_db)]
             lines.append(f"| {title(e.name)} | {' | '.join(numbers)} | {chosen} | {e.reason} |")
         lines += [
@@ -196,14 +185,14 @@ class Relevance:
             "total.",
         ]
         if self.missing:
-            lines.append(f"Needed, but no term of the bistatic model: {', '.join(map(title, self.missing))}.")
+            lines.append(f"Needed, but not modelled: {', '.join(map(title, self.missing))}.")
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
         """All of it, in terms of JSON."""
         values = {name: getattr(self, name) for name in self.__dataclass_fields__}
         values["effects"] = [{**asdict(e), "worth_db": e.worth_db} for e in self.effects]
-        return {**values, "terms": asdict(self.terms), "missing": list(self.missing)}
+        return {**values, "model": asdict(self.model), "missing": list(self.missing)}
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write it as JSON, in one go."""
@@ -221,8 +210,8 @@ class Relevance:
         try:
             values.pop("missing")
             rows = [{k: v for k, v in row.items() if k != "worth_db"} for row in values.pop("effects")]
-            terms = Terms(**values.pop("terms"))
-            return cls(effects=tuple(Effect(**row) for row in rows), terms=terms, **values)
+            model, lobes = Effects(**values.pop("model")), tuple(values.pop("lobes"))
+            return cls(effects=tuple(Effect(**row) for row in rows), model=model, lobes=lobes, **values)
         except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise ValueError(f"{os.fspath(path)}: expected what Relevance.save wrote: {error!r}") from error
 
@@ -350,47 +339,20 @@ def relevances(
 
 
 def _choose(model: FullModel, source: str, tolerance_db: float) -> Relevance:
-    full, places = model.field, model.receivers
-    known = model.all if source != "assumed" else model.all - {f"lobe_{n}" for n in full.terms.lobes}
-    order = leave_out(model, known, tolerance_db)
-    # Measured on the reduced field itself, where fewer lobes light other surfaces too: step back if that errs more.
-    while True:
-        kept = model.all - frozenset(order)
-        chosen = Relevance(
-            source, full.frequency_hz, tolerance_db, model.floor, len(places), int(model.blocked.sum()), (),
-            _terms(full.terms, kept), 0.0, 0.0,
-        )  # fmt: skip
-        reduced = chosen.reduce(full if "unseen" in kept else model.seen_only)
-        image = np.stack([reduced.render(reduced.view(receiver)).image for receiver in places])
-        image += model.image(kept) - model.image(kept - set(ESTIMATED))
-        loss = model.difference(np.maximum(image, 0.0))
-        if decisive(loss) <= tolerance_db or not order:
-            break
-        order.pop()
+    full = model.field
+    known = model.all if source != "assumed" else model.all - set(map(lobe_name, full.parameters.lobes))
+    kept = model.all - frozenset(leave_out(model, known, tolerance_db))
     effects = [effect_row(model, name, kept) for name in model.effects if name in known]
     if source == "assumed":
         effects.append(open_row("lobes", "only known materials or a fit tell which lobes matter"))
-    for name in ("residual", "indirect"):
-        if name not in model.all:
-            effects.append(open_row(name, "only a fit tells"))
-    return replace(chosen, effects=tuple(effects), image_db=rms(loss[0]), total_db=rms(loss[1]))
-
-
-def _terms(full: Terms, kept: frozenset[str]) -> Terms:
-    diffuse = "diffuse_1" in kept
-    return Terms(
-        line_of_sight="line_of_sight" in kept,
-        diffuse=diffuse,
-        mirror_order=2 if "mirror_2" in kept else int("mirror_1" in kept),
-        lobes=tuple(n for n in full.lobes if f"lobe_{n}" in kept) if diffuse else full.lobes[:1],
-        reciprocal=full.reciprocal,
-        mirror_scatter="mirror_scatter" in kept,
-        scatter_mirror="scatter_mirror" in kept,
-        diffuse_order=full.diffuse_order if "diffuse_2" in kept else 1,
-        indirect="indirect" in kept,
-        residual="residual" in kept,
-        sub_pixels=full.sub_pixels,
-    )
+    if "residual" not in model.all:
+        effects.append(open_row("residual", "only a fit tells"))
+    loss, least = model.loss(kept), model.reduced(kept)
+    lobes = least.parameters.lobes if least.effects.scatterings else least.parameters.lobes[:1]
+    return Relevance(
+        source, full.frequency_hz, tolerance_db, model.floor, len(model.receivers), int(model.blocked.sum()),
+        tuple(effects), effects_of(kept), lobes, rms(loss[0]), rms(loss[1]),
+    )  # fmt: skip
 
 
 def rms(change: np.ndarray) -> float:
@@ -438,14 +400,12 @@ def effect_row(model: FullModel, name: str, kept: frozenset[str]) -> Effect:
     """The row of one effect in a model with the effects ``kept``."""
     lost = frozenset({name, *NEEDS.get(name, ())})
     lobe = name.startswith("lobe_")
-    if lobe and len(model.field.terms.lobes) == 1:
-        lost = frozenset(
-            {"diffuse_1", *NEEDS["diffuse_1"]}
-        )  # without its only lobe a surface scatters nothing
+    if lobe and len(model.field.parameters.lobes) == 1:  # without its only lobe a surface scatters nothing
+        lost = frozenset({"scatterings_1", *NEEDS["scatterings_1"]})
     loss = model.loss(model.all - lost)
     image, total = (rms(x) for x in loss)
     dark = [rms(x[model.blocked]) if model.blocked.any() else None for x in loss]
-    stays = name in kept and not (lobe and "diffuse_1" not in kept)
+    stays = name in kept and not (lobe and "scatterings_1" not in kept)
     return Effect(name, image, total, dark[0], dark[1], stays, _reason(model, name, lost))
 
 
@@ -457,8 +417,6 @@ def open_row(name: str, reason: str) -> Effect:
 def _reason(model: FullModel, name: str, lost: frozenset[str]) -> str:
     if name == "gas":
         return _gas(model)
-    if name == "unseen":
-        return _elements(model)
     if name in model.side:
         return _beside(model, name)
     if name.startswith("lobe_"):
@@ -474,11 +432,7 @@ def _percent(share: float) -> str:
 
 
 def _gas(model: FullModel) -> str:
-    longest = max(
-        [float(np.max(x, initial=0.0)) for x in model.bounce_length_m]
-        + [float(np.max(v.paths.length_m, initial=0.0)) for v in model.views]
-    )
-    rate = model.gas_db_per_m
+    rate, longest = model.gas_db_per_m, model.longest_m
     return f"{1e3 * rate:.2g} dB/km, longest path {longest:.1f} m: at most {rate * longest:.2g} dB"
 
 
@@ -506,16 +460,10 @@ def _beside(model: FullModel, name: str) -> str:
 
 
 def _lobe(model: FullModel, n: int) -> str:
-    others = [k for k in model.field.terms.lobes if k != n]
+    others = [k for k in model.field.parameters.lobes if k != n]
     if not others:
         return "the only lobe"
     surface, weight = model.field.surface, model.field.parameters.weight
     area = np.bincount(surface.element_group, surface.element_area, minlength=surface.groups)
-    share = area @ weight[:, model.field.terms.lobes.index(n)] / max(float(area @ weight.sum(axis=1)), 1e-300)
+    share = area @ weight[:, model.field.parameters.lobes.index(n)] / max(float(area @ weight.sum(axis=1)), 1e-300)
     return f"{_percent(float(share))} of the lobes' weight; its neighbours stand in for it"
-
-
-def _elements(model: FullModel) -> str:
-    unseen, area = model.unseen, model.field.surface.element_area
-    share = _percent(float(area[unseen].sum() / area.sum()))
-    return f"{int(unseen.sum())} of {len(unseen)}, {share} of the area; they matter to further bounces alone"

@@ -17,7 +17,7 @@ import numpy as np
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.materials import Model
 from warprrf.rf.fields.bistatic.records import Evaluation
-from warprrf.rf.fields.bistatic.render import PathGains, path_gains
+from warprrf.rf.fields.bistatic.render import path_gains
 from warprrf.rf.fields.bistatic.tracer import Tracer
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links
 from warprrf.rf.spectra.spectrum import check_shape
@@ -73,7 +73,8 @@ class LinkTracer:
         np.maximum.at(best, paths.receiver, sharp)
         image = np.zeros((count, *self._shape))
         if self._model.effects.scatterings:
-            power, delay = gains.by_ray().reshape(count, -1), _delays(gains)
+            power = gains.by_ray().reshape(count, -1)
+            delay = view.single_bounce_m().reshape(count, -1) / SPEED_OF_LIGHT
             total, moment, square = (
                 sums + np.einsum("rk,rk->r", power, delay**k)
                 for k, sums in enumerate((total, moment, square))
@@ -84,14 +85,6 @@ class LinkTracer:
             mean = moment / total
             spread = np.sqrt(np.maximum(square / total - mean**2, 0.0))
         return Links(total, best, spread, self._search(image, paths.receiver, paths.arrival, sharp))
-
-
-def _delays(gains: PathGains) -> np.ndarray:
-    """Delay of light scattered once along every ray [s], shape ``(R, K)``."""
-    view = gains.view
-    range_m = np.where(view.hits.face >= 0, view.hits.range_m, 0.0).reshape(len(view.receivers), -1)
-    way = view.receivers[:, None] - view.tracer.transmitter + range_m[..., None] * view.tracer.grid.directions
-    return (np.sqrt(np.einsum("rkx,rkx->rk", way, way)) + range_m) / SPEED_OF_LIGHT
 
 
 def _again(again: Callable[[], Tracer], *others: Any) -> LinkTracer:

@@ -130,6 +130,12 @@ class Parameters:
         return self.weight.sum(axis=1) * fresnel_curves().even(self.log_excess)[0]
 
     @property
+    def mirrored_share(self) -> np.ndarray:
+        """Share of power that each group mirrors head on, ``(G,)``."""
+        index = 1.0 + np.sqrt(1.0 + self.excess)
+        return np.exp(self.log_mirror) * (1.0 - 2.0 / index) ** 2
+
+    @property
     def log_smooth(self) -> np.ndarray:
         """ln of what each group mirrors of all that it mirrors and scatters, ``(G,)``: -(4 pi sigma_h / lambda)^2 of a
         surface of rms height sigma_h (Ament 1953)."""

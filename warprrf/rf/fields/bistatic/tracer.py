@@ -76,6 +76,13 @@ class View:
         """Surface cell that each ray meets, shape ``(R K,)``; any where it meets nothing."""
         return self.tracer.surface.cell.take(self.hits.face, mode="wrap")
 
+    def single_bounce_m(self) -> np.ndarray:
+        """Length from the transmitter over what each ray meets to the receiver [m], shape ``(R K,)``; 0 where that is nothing."""
+        ray = np.flatnonzero(self.hits.face >= 0)
+        found = np.zeros(len(self.hits.face))
+        found[ray] = np.linalg.norm(self.hits.points(ray) - self.tracer.transmitter, axis=1) + self.hits.range_m[ray]
+        return found
+
     def tables(self, effects: Effects) -> dict[str, Records]:
         """The tables that count under ``effects``; they are traced when they are first asked for."""
         wanted = (SHARP, *sequences(effects))
