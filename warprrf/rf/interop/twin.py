@@ -155,8 +155,9 @@ def write_twin(
     ``surface_<group>`` of a material ``fitted_<group>``, named by its largest group; it holds within 10 % of the
     field's carrier.
 
-    No material can hold a common gain (an uncalibrated receiver) or residuals of elements, and softened blocking belongs to the field's tracer: :attr:`Twin.left_out` says what this field has of the former, and
-    which materials let nothing through because nobody said how thick they are.
+    No material can hold a common gain (an uncalibrated receiver) or residuals of elements, and softened blocking belongs to
+    the field's tracer: :attr:`Twin.left_out` says what this field has of the former, and which materials let nothing
+    through because nobody said how thick they are.
     Sionna may find one mirror in several small triangles and count it as often; :func:`simulate` counts it once.
 
     Args:
