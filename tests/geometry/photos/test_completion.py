@@ -1,5 +1,7 @@
 """Splats with poses become a whole mesh: holes close, what is seen through stays open, what nothing shows is not made up."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from radio_scenes import box_mesh, joined
@@ -29,7 +31,7 @@ def without(mesh, *boxes):
     return wr.Mesh(vertices, faces[np.all(kept, axis=0)])
 
 
-def made(folder, shown, places, turn=None):
+def made(folder, shown, places, turn=None, config=CONFIG):
     """What becomes of splats on the mesh ``shown`` and a COLMAP model of 20 cameras at each place; all turned about z."""
     turn = np.eye(3) if turn is None else turn
     g = discs_on_mesh(wr.Mesh(shown.vertices @ turn, shown.faces), int(100 * shown.areas.sum()))
@@ -47,7 +49,7 @@ def made(folder, shown, places, turn=None):
     (folder / "model").mkdir()
     model.write_binary(str(folder / "model"))
     return wr.Reconstruction.from_files(
-        folder / "g.ply", colmap=folder / "model", device="cpu", config=CONFIG
+        folder / "g.ply", colmap=folder / "model", device="cpu", config=config
     )
 
 
@@ -70,14 +72,21 @@ def test_a_punched_room_is_closed_again_along_its_own_directions(angle, tmp_path
         assert patches.normal[k] @ rays[0] > patches.offset[k]
 
 
+def test_edges_are_sharp_before_anything_is_completed(tmp_path):
+    config = replace(CONFIG, completion=False)
+    mesh = made(tmp_path, wr.Mesh(*ROOM), [MIDDLE], config=config).mesh
+    assert (np.abs(mesh.vertices[:, [0, 2]]) < 5e-3).all(axis=1).sum() > 10  # of floor and wall
+
+
 def test_a_doorway_seen_through_stays_open(tmp_path):
     wall = [([1.9, 0, 0], [2.1, 1, 2.5]), ([1.9, 2, 0], [2.1, 3, 2.5]), ([1.9, 1, 2], [2.1, 2, 2.5])]
     truth, _ = joined(ROOM, *(box_mesh(*part) for part in wall))
-    mesh = made(tmp_path, truth, [MIDDLE - [1, 0, 0], MIDDLE + [1, 0, 0]]).mesh
+    rec = made(tmp_path, truth, [MIDDLE - [1, 0, 0], MIDDLE + [1, 0, 0]])
+    assert rec.patches.area.min() > 0.15
     y, z = (g.ravel() for g in np.meshgrid(np.linspace(0.05, 2.95, 40), np.linspace(0.05, 2.45, 40)))
     here = np.stack([np.full(y.size, 1.5), y, z], axis=1)
     rim = np.minimum(np.minimum(np.abs(y - 1), np.abs(y - 2)), np.abs(z - 2)) < 0.1
-    seen, expected = (m.visible(here, here + [1.0, 0, 0])[~rim] for m in (mesh, truth))
+    seen, expected = (m.visible(here, here + [1.0, 0, 0])[~rim] for m in (rec.mesh, truth))
     np.testing.assert_array_equal(seen, expected)
 
 
@@ -98,5 +107,6 @@ def test_a_slope_and_a_ball_are_kept(tmp_path):
 
 def test_a_place_seen_in_part_only_is_not_guessed(tmp_path):
     hall = wr.Mesh(*box_mesh([0, 0, 0], [9, 6, 5], inward=True))
-    mesh = made(tmp_path, without(hall, ([-1, -1, -1], [7, 7, 6])), [np.array([8.2, 3, 2])]).mesh
-    assert mesh.bounds[0][0] > 6.0
+    end = without(hall, ([1, -1, 0.05], [10, 7, 6]))  # its far end, and the floor
+    mesh = made(tmp_path, end, [np.array([8.0, 3, 2])]).mesh
+    assert np.isinf(mesh.cast([8, 3, 2], np.vstack([np.eye(3), -np.eye(3)])).t).all()

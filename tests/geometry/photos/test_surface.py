@@ -1,30 +1,20 @@
-"""Points and planes against shapes known in closed form."""
+"""Planes against shapes known in closed form."""
 
 import numpy as np
 import pytest
+from radio_scenes import box_mesh
+from trimesh.remesh import subdivide_to_size
 
+from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.cells import occupancy
 from warprrf.geometry.photos.planes import Plane, detect_planes, plane_axes
-from warprrf.geometry.photos.points import clean_points
+from warprrf.geometry.photos.snapping import find_patches
 
 
 def grid_on(plane_normal, offset, size=1.0, step=0.05):
     u, v = np.meshgrid(np.arange(-size, size, step), np.arange(-size, size, step))
     axes = plane_axes(np.asarray(plane_normal, float))
     return np.stack([u.ravel(), v.ravel()], axis=1) @ axes + offset * np.asarray(plane_normal, float)
-
-
-def test_planted_outliers_are_cleaned_and_little_else():
-    rng = np.random.default_rng(0)
-    good = np.concatenate([rng.uniform(-1, 1, (2000, 2)), 0.003 * rng.standard_normal((2000, 1))], axis=1)
-    bad = rng.uniform(-3, 3, (40, 3)) + [0, 0, 5]
-    keep = clean_points(np.concatenate([good, bad]))
-    assert not keep[2000:].any()
-    assert keep[:2000].mean() > 0.97
-    error, length = np.full(2000, 0.3), np.full(2000, 4)
-    error[:10], length[10:20] = 3.0, 2
-    keep = clean_points(good, reprojection_error=error, track_length=length)
-    assert not keep[:20].any()
 
 
 def test_planes_are_found_in_noisy_points_with_outliers():
@@ -114,3 +104,12 @@ def test_a_plane_is_empty_where_one_sees_through_it():
     (closed,) = occupancy([plane], frame, eyes, frame[window])
     assert closed.covers(np.array([[0.0, 0, 0]])).all()
     assert closed.area() > found.area() + 0.5
+
+
+def test_faces_go_to_the_planes_that_are_given():
+    vertices, faces = subdivide_to_size(*box_mesh([0, 0, 0], [4, 3, 2.5], inward=True), 0.2)
+    mesh = Mesh(vertices + 0.004 * np.random.default_rng(0).standard_normal(vertices.shape), faces)
+    planes = [Plane(np.eye(3)[a], 0.0, np.zeros(0, dtype=int)) for a in (2, 0)]
+    patches = find_patches(mesh, planes)
+    np.testing.assert_array_equal(patches.normal, [[0, 0, 1], [1, 0, 0]])
+    assert patches.area == pytest.approx([12, 7.5], rel=0.05)
