@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -155,13 +156,15 @@ def places(count: int) -> np.ndarray:
     return np.stack([x, y, np.linspace(1.0, 1.8, count)], axis=1)
 
 
+def links(count: int) -> dict[str, Any]:
+    """The transmitter, ``count`` receivers and the carrier."""
+    return {"transmitter": TRANSMITTER, "receivers": places(count), "frequency_hz": CARRIER_HZ}
+
+
 @cache
 def spectra() -> wr.SpectrumDataset:
     """Spectra of eight receivers by the exact engine."""
-    return wr.simulate(
-        room(), transmitter=TRANSMITTER, receivers=places(8), frequency_hz=CARRIER_HZ, shape=SHAPE,
-        beam_sigma_rad=BEAM_RAD,
-    )  # fmt: skip
+    return wr.simulate(room(), **links(8), shape=SHAPE, beam_sigma_rad=BEAM_RAD)
 
 
 @cache
@@ -208,14 +211,16 @@ def _each(paths: Iterable[wr.Paths], prefix: str) -> Values:
     return {f"{name}_{key}": value for name, of_one in found.items() for key, value in of_one.items()}
 
 
+def _image(out: Any) -> Values:
+    found: Values = {name: (getattr(out, name), PIXELS) for name in ("features", "alpha", "depth")}
+    return found | {"dominant": (out.dominant, Check(outliers=0.005))}
+
+
 @case
 def render_pinhole() -> Values:
     out = wr.render(gaussians(), pinhole(), background=np.array([0.1, 0.2, 0.3]))
     features = wr.render(gaussians(), pinhole(), features=np.linspace(-1, 1, 400 * 2).reshape(400, 2))
-    return {
-        "features": (out.features, PIXELS), "alpha": (out.alpha, PIXELS), "depth": (out.depth, PIXELS),
-        "dominant": (out.dominant, Check(outliers=0.005)), "given": (features.features, PIXELS),
-    }  # fmt: skip
+    return {**_image(out), "given": (features.features, PIXELS)}
 
 
 @case
@@ -224,10 +229,7 @@ def render_spherical() -> Values:
     exp = wr.render(
         gaussians(), wr.Camera.spherical(48, 24, position=(0, 0, 0)), blending=wr.Blending(rule="exp")
     )
-    return {
-        "features": (out.features, PIXELS), "alpha": (out.alpha, PIXELS), "depth": (out.depth, PIXELS),
-        "dominant": (out.dominant, Check(outliers=0.005)), "exp": (exp.features, PIXELS),
-    }  # fmt: skip
+    return {**_image(out), "exp": (exp.features, PIXELS)}
 
 
 @case
@@ -324,20 +326,13 @@ def materials() -> Values:
 
 @case
 def paths_of_a_mesh() -> Values:
-    link = {"transmitter": TRANSMITTER, "receivers": places(4)[1], "frequency_hz": CARRIER_HZ}
+    link = links(4) | {"receivers": places(4)[1]}
     return _each((wr.trace_paths(room_mesh()[0], **link, mirror_order=k) for k in (0, 1, 2)), "order")
 
 
 @case
 def paths_of_a_scene() -> Values:
-    paths = wr.trace_paths(
-        room(),
-        transmitter=TRANSMITTER,
-        receivers=places(4),
-        frequency_hz=CARRIER_HZ,
-        mirror_order=2,
-        gas=True,
-    )
+    paths = wr.trace_paths(room(), **links(4), mirror_order=2, gas=True)
     return _each(paths.each(), "receiver")
 
 
@@ -357,7 +352,7 @@ def paths_of_the_lobby() -> Values:
 
 @case
 def path_files_and_other_shapes() -> Values:
-    paths = wr.trace_paths(room(), transmitter=TRANSMITTER, receivers=places(3), frequency_hz=CARRIER_HZ)
+    paths = wr.trace_paths(room(), **links(3))
     with tempfile.TemporaryDirectory() as folder:
         paths.save(Path(folder) / "paths.nc")
         back = wr.Paths.load(Path(folder) / "paths.nc")
@@ -377,9 +372,7 @@ def path_files_and_other_shapes() -> Values:
 
 @case
 def channels() -> Values:
-    paths = wr.trace_paths(
-        room(), transmitter=TRANSMITTER, receivers=places(2), frequency_hz=CARRIER_HZ, mirror_order=2
-    )
+    paths = wr.trace_paths(room(), **links(2), mirror_order=2)
     tx = wr.PlanarArray(2, 2, orientation=(0.5, 0.0, 0.0), pattern="tr38901", polarisation="V")
     rx = wr.PlanarArray(1, 2, orientation=(-2.0, 0.0, 0.0), polarisation="cross")
     f = CARRIER_HZ + np.linspace(-1e9, 1e9, 16)
@@ -401,7 +394,7 @@ def arrays_and_beams() -> Values:
     r = np.random.default_rng(3)
     directions = r.normal(size=(12, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    paths = wr.trace_paths(room(), transmitter=TRANSMITTER, receivers=places(3), frequency_hz=CARRIER_HZ)
+    paths = wr.trace_paths(room(), **links(3))
     choice = wr.select_beams(paths, tx, rx, count=3)
     f = np.array([CARRIER_HZ])
     channel = paths.cfr(f, tx_array=tx, rx_array=wr.PlanarArray(1, 1))[:, 0, :, 0]
@@ -440,10 +433,7 @@ def band_plan() -> Values:
 @case
 def simulated() -> Values:
     ds = spectra()
-    air = wr.simulate(
-        room(), transmitter=TRANSMITTER, receivers=places(2), frequency_hz=CARRIER_HZ, shape=SHAPE,
-        beam_sigma_rad=BEAM_RAD, gas=True,
-    )  # fmt: skip
+    air = wr.simulate(room(), **links(2), shape=SHAPE, beam_sigma_rad=BEAM_RAD, gas=True)
     return {
         "path_gain": (ds.path_gain[:3], EXACT), "air": (air.path_gain[1], EXACT),
         "total": (ds.path_gain.sum(axis=(1, 2)), Check(atol=0.005, decibels=True)),
