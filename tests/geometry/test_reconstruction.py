@@ -51,6 +51,9 @@ def test_cells_that_no_photo_sees_get_no_discs():
     assert not visible_from(None, planes[0].cells(), planes[0].normal, behind).any()
     hidden = seen_cells(planes, behind)
     assert hidden[0].occupied.sum() == 0 and plane_mesh(hidden) is None
+    nearer = flat([1, 0, 0], [1, -2, 0], [1, 2, 4])[1]
+    front, back = seen_cells([nearer, *planes], [look([3.0, 0, 2.0], [0, 0, 2.0])] * 2)
+    assert front.occupied.any() and not back.occupied.any()
 
 
 def made(workspace, photos=VIEWS, **options):
