@@ -3,6 +3,7 @@
 import ast
 import inspect
 import json
+import pydoc
 import re
 import sys
 import textwrap
@@ -137,11 +138,9 @@ def test_python_in_the_readme_is_short():
 
 
 def test_names_of_the_reference_are_reached_as_it_prints_them():
-    listed = set(re.findall(r" as (\w+)$", (ROOT / "warprrf/__init__.pyi").read_text(), re.MULTILINE))
-    found = re.findall(r"^\.\. auto\w+:: \w+\.(\S+)", "\n".join(reference.pages().values()), re.MULTILINE)
+    found = re.findall(r"^\.\. auto\w+:: (\S+)", "\n".join(reference.pages().values()), re.MULTILINE)
     assert len(found) > 80
-    for first, *rest in (name.split(".") for name in found):
-        assert first in listed and reduce(getattr, rest, getattr(wr, first)), (first, *rest)
+    assert [name for name in found if pydoc.locate(name) is None] == []
 
 
 def test_commands_on_pages_are_taken_by_the_parser():

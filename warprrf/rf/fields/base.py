@@ -103,9 +103,11 @@ class RadioField(ABC):
             ds: training set: spectra, and for a ``bistatic`` field also :class:`Readings`, or a list of both.
             model: ``"bistatic"``, ``"rf3dgs+"`` or ``"rf3dgs"``.
             options: by name, ``device`` and ``progress`` among them. A ``bistatic`` field takes ``client``, and those of
-                :class:`warprrf.FitOptions`: ``quick=True``, ``relevance``, ``mirror_order``, ``diffuse_order``, ``lobes``,
-                ``reciprocal``, ``residual``, ``gain_offset``, ``iterations``, ``seed``, ... The others take those of
-                :class:`warprrf.FieldOptions`: ``iterations``, ``batch``, ``sh_degree``, ``checkpoint``, ``seed``, ...
+                :class:`~warprrf.rf.fields.bistatic.training.FitOptions`: ``quick=True``, ``relevance``,
+                ``mirror_order``, ``diffuse_order``, ``lobes``, ``reciprocal``, ``residual``, ``gain_offset``,
+                ``iterations``, ``seed``, ... The others take those of
+                :class:`~warprrf.rf.fields.harmonic.options.FieldOptions`: ``iterations``, ``batch``, ``sh_degree``,
+                ``checkpoint``, ``seed``, ...
 
         Raises:
             ValueError, TypeError: for an unknown model or bad arguments.

@@ -151,7 +151,7 @@ class HarmonicField(RadioField):
             transport: blending weights of ``ds.receivers``, if they were computed before.
             device: where to compute.
             progress: called with the stages ``"transport"`` and ``"fit"``.
-            settings: attributes of :class:`warprrf.FieldOptions`, in place of those of
+            settings: attributes of :class:`~warprrf.rf.fields.harmonic.options.FieldOptions`, in place of those of
                 ``options``: ``gain="linear"``, ``iterations=600``, ``seed=1``, ...
 
         Raises:
