@@ -143,6 +143,17 @@ def test_names_of_the_reference_are_reached_as_it_prints_them():
     assert [name for name in found if pydoc.locate(name) is None] == []
 
 
+def test_terms_of_the_glossary_are_those_of_the_library():
+    terms = re.findall(
+        r"^\| (?!term)([^|]+) \| [^|]+\. \|", (ROOT / "docs/glossary.md").read_text(), re.MULTILINE
+    )
+    assert len(terms) >= 50 and len(terms) == len(set(terms))
+    texts = [p.read_text() for p in (*(ROOT / "warprrf").rglob("*.py"), *PAGES) if p.stem != "glossary"]
+    used = re.sub(r"[\s_-]+", " ", " ".join(texts)).lower()
+    words = [word for term in terms for word in term.split(", ")]
+    assert [word for word in words if re.sub(r"[\s_-]+|\$.*", " ", word).strip().lower() not in used] == []
+
+
 def test_commands_on_pages_are_taken_by_the_parser():
     seen = set()
     for line in re.findall(r"^(?:\$ )?warprrf (\w.*)", "\n".join(CODE.values()), re.MULTILINE):
