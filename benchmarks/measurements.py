@@ -115,7 +115,7 @@ def table_of(kind: str, ds: wr.SpectrumDataset, places: np.ndarray, power: np.nd
 
 
 def spoilt(readings: wr.Readings, seed: int) -> Iterator[tuple[str, wr.Readings, np.ndarray]]:
-    """A horn's readings with errors of each sort, and which are wrong by ten decibels and more at the instrument."""
+    """A horn's readings with errors of each kind, and which are wrong by ten decibels and more at the instrument."""
     rng, none = np.random.default_rng(seed), np.zeros(0, int)
     floor = np.asarray(readings.floor)
     chosen, sign = rng.random(len(readings)) < 0.1, rng.choice([-1.0, 1.0], len(readings))

@@ -12,6 +12,7 @@ from functools import reduce
 from pathlib import Path
 
 import pytest
+from fuzz.calls import public
 from places import ROOT
 
 import warprrf as wr
@@ -152,6 +153,14 @@ def test_terms_of_the_glossary_are_those_of_the_library():
     used = re.sub(r"[\s_-]+", " ", " ".join(texts)).lower()
     words = [word for term in terms for word in term.split(", ")]
     assert [word for word in words if re.sub(r"[\s_-]+|\$.*", " ", word).strip().lower() not in used] == []
+
+
+def test_public_names_are_words_of_the_field():
+    own = "look skin crumb sort sent shown told recipe adopt tied lit".split()
+    calls = {name: inspect.signature(call).parameters for name, call in public().items()}
+    assert [
+        n for call, given in calls.items() for n in (call, *given) if {*re.split(r"[._]", n)} & {*own}
+    ] == []
 
 
 def test_commands_on_pages_are_taken_by_the_parser():

@@ -283,7 +283,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     },
     "RadioMap.load": lambda p: {"path": p.folder / "map.nc"},
     "RadioMap.picture": lambda p: {"path": "map.png"},
-    "RadioMap.shown": lambda p: {"quantity": "total_path_gain"},
+    "RadioMap.plot_values": lambda p: {"quantity": "total_path_gain"},
     "Relevance.load": lambda p: {"path": p.folder / "relevance.json"},
     "Relevance.reduce": lambda p: {"full": p.field},
     # channels

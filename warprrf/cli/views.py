@@ -237,7 +237,7 @@ def _map(args: argparse.Namespace, out: Output) -> None:
     if path.suffix == ".nc":
         found.save(path)
     found.picture(files[-1])
-    gain, snr = (found.shown(name)[found.free] for name in ("total_path_gain", "best_beam_snr_db"))
+    gain, snr = (found.plot_values(name)[found.free] for name in ("total_path_gain", "best_beam_snr_db"))
     figures = {"median_total_path_gain_db": np.median(gain), "median_best_beam_snr_db": np.median(snr)}
     out.result(
         f"{path}: {found.free.sum()} cells in the air of {found.free.size}; median total path gain "

@@ -417,7 +417,11 @@ class RadioField(ABC):
         ends = self.check_positions(receivers, transmitter)
         rows, found = np.zeros(0, int), []
         for source, own in ends.groups():
-            tell = None if progress is None else partial(_told, progress, len(rows), len(ends.receivers))
+            tell = (
+                None
+                if progress is None
+                else partial(_progress_after, progress, len(rows), len(ends.receivers))
+            )
             options = LinkOptions(beam_sigma_rad, shape, mirror_order, client, tell)
             found.append(self.trace_links(ends.receivers[own], source, options))
             rows = np.concatenate([rows, own])
@@ -575,7 +579,7 @@ def _cfr(
     return {"cfr": np.stack(found)}
 
 
-def _told(progress: Progress, before: int, total: int, stage: str, done: int, _: int) -> None:
+def _progress_after(progress: Progress, before: int, total: int, stage: str, done: int, _: int) -> None:
     """Progress of a part, after ``before`` of ``total``."""
     progress(stage, before + done, total)
 
