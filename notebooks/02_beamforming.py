@@ -180,14 +180,14 @@ def true_paths(index):
     )
     arrival = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
     away = (arrival @ specular.arrival.T).max(axis=-1, initial=-1) < np.cos(5 * test.beam_sigma_rad)
-    lit = away & (spectrum.path_gain > test.floor) & np.isfinite(spectrum.delay_s)
-    power, tau = spectrum.path_gain[lit], spectrum.delay_s[lit]
-    turns = np.exp(2j * np.pi * np.random.default_rng(index).random(lit.sum()))
+    above = away & (spectrum.path_gain > test.floor) & np.isfinite(spectrum.delay_s)
+    power, tau = spectrum.path_gain[above], spectrum.delay_s[above]
+    turns = np.exp(2j * np.pi * np.random.default_rng(index).random(above.sum()))
     scattered = replace(
-        specular, gain=np.sqrt(power) * turns, tau=tau, theta_r=theta[lit], phi_r=phi[lit],
-        theta_t=spectrum.aod[lit][:, 0], phi_t=spectrum.aod[lit][:, 1],
-        vertices=np.full((lit.sum(), *specular.vertices.shape[1:]), np.nan),
-        kind=np.full(lit.sum(), "diffuse"), valid=np.ones(lit.sum(), bool), jones=None,
+        specular, gain=np.sqrt(power) * turns, tau=tau, theta_r=theta[above], phi_r=phi[above],
+        theta_t=spectrum.aod[above][:, 0], phi_t=spectrum.aod[above][:, 1],
+        vertices=np.full((above.sum(), *specular.vertices.shape[1:]), np.nan),
+        kind=np.full(above.sum(), "diffuse"), valid=np.ones(above.sum(), bool), jones=None,
     )  # fmt: skip
     return specular, scattered
 
