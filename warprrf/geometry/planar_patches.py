@@ -44,7 +44,7 @@ class PlanarPatches:
             ``two_sided`` is False.
         offset: The plane is ``normal . x = offset`` [m], shape ``(P,)``.
         area: Area, repeated faces counted once [m^2], shape ``(P,)``.
-        group: What :func:`planar_patches` was given to keep apart, shape ``(P,)``, int32; -1 where nothing was.
+        group: What :func:`planar_patches` was told to keep apart, shape ``(P,)``, int32; -1 where nothing was.
         first: The first face at the place of each, shape ``(F,)``: itself unless it repeats one.
         tolerance_m: Corners of a patch lie this near to its plane [m]; rays that end on it ignore what is nearer.
         two_sided: Whether both sides are surfaces. False: only the side that ``normal`` points to.
