@@ -227,14 +227,14 @@ def render_pinhole() -> Values:
 def render_spherical() -> Values:
     out = wr.render(gaussians(), wr.Camera.spherical(48, 24, position=(0.1, 0.2, 0.3)))
     exp = wr.render(
-        gaussians(), wr.Camera.spherical(48, 24, position=(0, 0, 0)), blending=wr.Blending(rule="exp")
+        gaussians(), wr.Camera.spherical(48, 24, position=(0, 0, 0)), blending=wr.splats.Blending(rule="exp")
     )
     return {**_image(out), "exp": (exp.features, PIXELS)}
 
 
 @case
 def blending_weights() -> Values:
-    found = wr.blend_weights(gaussians(), wr.Camera.spherical(24, 12, position=(0, 0, 0)), top_k=4)
+    found = wr.splats.blend_weights(gaussians(), wr.Camera.spherical(24, 12, position=(0, 0, 0)), top_k=4)
     return {
         "index": (found.index, Check(outliers=0.005)), "weight": (found.weight, PIXELS),
         "range": (found.range, PIXELS), "alpha": (found.alpha, PIXELS),
@@ -244,7 +244,7 @@ def blending_weights() -> Values:
 @case
 def gaussian_rays() -> Values:
     r = np.random.default_rng(1)
-    rays = wr.GaussianRays(gaussians())
+    rays = wr.splats.GaussianRays(gaussians())
     origins, ends = r.normal(0, 3, (40, 3)), r.normal(0, 3, (40, 3))
     hits = rays.hits(origins, ends - origins, k=8)
     named = {k: np.asarray(v) for k, v in vars(hits).items() if isinstance(v, np.ndarray)}
@@ -306,7 +306,7 @@ def gas() -> Values:
     f = np.array([60e9, 140e9, 183.3e9, 300e9, 325e9])
     air = wr.Air(temperature_k=293.0, pressure_hpa=1000.0, water_vapour_g_m3=10.0)
     return {
-        "standard": (wr.gas_attenuation_db_per_m(f), FLOAT64),
+        "standard": (wr.em.gas_attenuation_db_per_m(f), FLOAT64),
         "air": (air.attenuation_db_per_m(f), FLOAT64),
         "transmittance": (air.transmittance(CARRIER_HZ, np.array([1.0, 10.0, 100.0])), FLOAT64),
     }
@@ -356,7 +356,7 @@ def path_files_and_other_shapes() -> Values:
     with tempfile.TemporaryDirectory() as folder:
         paths.save(Path(folder) / "paths.nc")
         back = wr.Paths.load(Path(folder) / "paths.nc")
-        written = wr.write_deepmimo(paths, Path(folder) / "deepmimo", scene=room())
+        written = wr.interop.write_deepmimo(paths, Path(folder) / "deepmimo", scene=room())
         names = sorted(p.name for p in Path(written).rglob("*") if p.is_file())
     sionna = paths.to_sionna()
     spread = paths.dispersion()
@@ -389,41 +389,41 @@ def channels() -> Values:
 
 @case
 def arrays_and_beams() -> Values:
-    tx = wr.PlanarArray(4, 4, orientation=wr.orientation_towards((1.0, 0.5, -0.2)), pattern="tr38901")
-    rx = wr.PlanarArray(2, 4, orientation=wr.orientation_towards((-1.0, -0.2, 0.1)))
+    tx = wr.PlanarArray(4, 4, orientation=wr.channel.orientation_towards((1.0, 0.5, -0.2)), pattern="tr38901")
+    rx = wr.PlanarArray(2, 4, orientation=wr.channel.orientation_towards((-1.0, -0.2, 0.1)))
     r = np.random.default_rng(3)
     directions = r.normal(size=(12, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     paths = wr.trace_paths(room(), **links(3))
-    choice = wr.select_beams(paths, tx, rx, count=3)
+    choice = wr.channel.select_beams(paths, tx, rx, count=3)
     f = np.array([CARRIER_HZ])
     channel = paths.cfr(f, tx_array=tx, rx_array=wr.PlanarArray(1, 1))[:, 0, :, 0]
-    many = wr.select_beams_multiuser(list(paths.each()), tx, noise=1e-9)
-    steered = wr.steering_codebook(tx, directions[:5])
-    error = wr.plane_wave_error(tx, 0.05, 1e-3)
+    many = wr.channel.select_beams_multiuser(list(paths.each()), tx, noise=1e-9)
+    steered = wr.channel.steering_codebook(tx, directions[:5])
+    error = wr.channel.plane_wave_error(tx, 0.05, 1e-3)
     named = {k: v for k, v in vars(error).items() if np.ndim(v) == 0}
     found: Values = {
         "gain": (tx.gain(directions), FLOAT64), "response": (rx.response(directions, 1e-3), FLOAT64),
-        "positions": (tx.positions(1e-3), FLOAT64), "dft": (wr.dft_codebook(rx).weights, FLOAT64),
+        "positions": (tx.positions(1e-3), FLOAT64), "dft": (wr.channel.dft_codebook(rx).weights, FLOAT64),
         "steering": (steered.weights, FLOAT64), "amplitude": (steered.amplitude(directions), FLOAT64),
-        "beam_gains": (wr.beam_gains(paths, tx, rx), Check(rtol=1e-5, atol=1e-16)),
+        "beam_gains": (wr.channel.beam_gains(paths, tx, rx), Check(rtol=1e-5, atol=1e-16)),
         "tx": (choice.tx, BITS), "rx": (choice.rx, BITS), "chosen": (choice.gain, Check(rtol=1e-6)),
         "many": (np.asarray(many.tx), BITS),
-        "covariance": (wr.transmit_covariance(list(paths.each()), tx), Check(rtol=1e-6, atol=1e-16)),
+        "covariance": (wr.channel.transmit_covariance(list(paths.each()), tx), Check(rtol=1e-6, atol=1e-16)),
     }  # fmt: skip
     for name, value in sorted(named.items()):
         found[f"plane_wave_{name}"] = (value, Check(rtol=1e-6))
     for method in ("mr", "zf", "slnr"):
-        weights = wr.precoders(channel, method, noise=1e-9)
-        sinr = wr.precoded_sinr(channel, weights, noise=1e-9)
+        weights = wr.channel.precoders(channel, method, noise=1e-9)
+        sinr = wr.channel.precoded_sinr(channel, weights, noise=1e-9)
         found[f"sinr_{method}"] = (sinr, Check(rtol=1e-5))
     return found
 
 
 @case
 def band_plan() -> Values:
-    numbers = sorted(wr.THZ_CHANNELS)
-    plan = [wr.thz_channel(n) for n in numbers]
+    numbers = sorted(wr.channel.THZ_CHANNELS)
+    plan = [wr.channel.thz_channel(n) for n in numbers]
     return {
         "numbers": (numbers, BITS),
         "values": ([[v for v in vars(c).values() if isinstance(v, float)] for c in plan], FLOAT64),
@@ -580,7 +580,7 @@ def coverage() -> Values:
 @case
 def twin() -> Values:
     with tempfile.TemporaryDirectory() as folder:
-        wr.write_twin(bistatic(), Path(folder) / "twin")
+        wr.interop.write_twin(bistatic(), Path(folder) / "twin")
         scene = wr.Scene.load(Path(folder) / "twin" / "scene.xml")
     area = np.bincount(scene.face_material, weights=scene.mesh.areas)
     return {
