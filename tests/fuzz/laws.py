@@ -209,7 +209,7 @@ def _kept(place: Place, pattern: Any) -> Any:
 
 PATTERNS: dict[str, Callable[[Place, Any], Any]] = {
     "gain": lambda place, pattern: _element(pattern).gain(TOWARDS),
-    "codebook": lambda place, pattern: wr.dft_codebook(_element(pattern)).power(TOWARDS, np.array([1e-9, 2e-9])),
+    "codebook": lambda place, pattern: wr.channel.dft_codebook(_element(pattern)).power(TOWARDS, np.array([1e-9, 2e-9])),
     "paths": lambda place, pattern: place.paths.cfr(np.array([300e9]), tx_array=_element(pattern)),
     "cfr": lambda place, pattern: place.field.cfr(POINTS, [300e9], rx_array=_element(pattern), diffuse="power", max_paths=9),
     "stored cfr": _kept,

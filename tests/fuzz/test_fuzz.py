@@ -83,7 +83,7 @@ CHECKED = {
     "simulate": "scene seed transmitter receivers frequency_hz", "sample_receivers": "scene n z clearance seed",
     "trace_paths": "mesh_or_scene mirror_order transmitter receivers frequency_hz", "RadioField.fit": "ds",
     "render": "g cam", "splats.blend_weights": "g cam top_k", "Mesh": "vertices faces", "Mesh.cast": "origins directions",
-    "Mesh.visible": "a b clearance", "Mesh.closest": "points", "Mesh.look_around": "points directions",
+    "Mesh.visible": "a b clearance", "Mesh.closest": "points", "Mesh.crossings": "points directions",
     "Mesh.cross_section": "height", "Paths.taps": "bandwidth_hz l_min l_max", "Paths.cfr": "frequencies_hz",
     "em.gas_attenuation_db_per_m": "frequency_hz", "Air": "temperature_k pressure_hpa water_vapour_g_m3",
     "lookups.nearest": "train", "lookups.mean": "train", "evaluate": "test", "em.lobe": "alpha_r",
@@ -99,7 +99,7 @@ def test_what_is_no_argument_is_refused_by_its_name(attempt, name):
 
 
 FOUND = """
-Mesh.look_around: directions=as bool, points=no rows; Paths.taps: center_hz=huge; Paths.select: chosen=2^63
+Mesh.crossings: directions=as bool, points=no rows; Paths.taps: center_hz=huge; Paths.select: chosen=2^63
 BistaticField.at_frequency: frequency_hz=tiny; RadioField.cfr: client=true; RadioField.fit: relevance=text
 RadioField.links: shape=with -inf; RadioField.load: path=no text; RadioField.suggest: candidates=with 1e+09
 Readings: chain=ragged; Readings.from_table: table=list; SpectrumDataset.empty: frequency_hz=tiny

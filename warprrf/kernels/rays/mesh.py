@@ -258,7 +258,7 @@ def closest_faces(
 
 
 @wp.kernel(enable_backward=False)
-def look_around(
+def find_crossings(
     offset: int,
     bvh: wp.uint64,
     corners: wp.array2d(dtype=wp.vec3d),

@@ -40,7 +40,7 @@ from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.observations import NEPER
 
-ABOUT = "Digital twin written by warprrf.write_twin."
+ABOUT = "Digital twin written by warprrf."
 """First line of a twin's ``materials.json``: a folder that says so may be replaced."""
 LOSS_TANGENT = 0.02  # least that single precision, which Sionna computes in, surely turns into a decay
 THICKNESS_WAVELENGTHS = (
@@ -466,7 +466,7 @@ def _check_replaceable(folder: Path) -> None:
         return
     try:
         table = read_json(folder / "materials.json")
-        twin = found <= _FILES and table["about"][0] == ABOUT
+        twin = found <= _FILES and str(table["about"][0]).startswith(ABOUT)
     except (OSError, ValueError, KeyError, TypeError, IndexError):
         twin = False
     if not twin:
