@@ -60,6 +60,9 @@ from warprrf.rf.spectra.readings import Readings as Readings
 # a model fitted to spectra, which answers for any receiver
 from warprrf.rf.fields.base import RadioField as RadioField
 
+# which paths a field or a simulation models
+from warprrf.rf.fields.bistatic.materials import Effects as Effects
+
 # propagation paths, and the channels, taps and spreads that follow
 from warprrf.rf.paths.path_set import Paths as Paths
 

@@ -93,7 +93,7 @@ class FitOptions:
     Attributes:
         effects: what is modelled: :class:`Effects`, the name of one of :data:`SETS` (``"single"``, ``"room"``,
             ``"everything"``), or ``"auto"``: the set that errs least on receivers held out (a quarter, 30 at most), and the
-            residual if it does not err more. With fewer than eight receivers it is ``"room"``, or ``"single"`` if that fits
+            residual if it does not err more; a larger set is tried where the one before it was better. With fewer than eight receivers it is ``"room"``, or ``"single"`` if that fits
             much better.
         lobes: exponents of the scattering lobes ((1 + cos psi) / 2)^n, 0 for Lambertian; None for 0, 2, 5, 12, 30.
         reciprocal: lobes that scatter alike when transmitter and receiver change places. By default they are those of
@@ -581,7 +581,7 @@ def choose(t: Training) -> Choice:
     if len(t.held) < (LEAST_HELD_OUT if len(trials) > 1 else 1):
         return _choose_of_few(t, trials)
     best, least = None, np.inf
-    for trial in trials:
+    for trial in trials:  # each holds the one before it: what is no better with some is not tried with more
         if best is None:
             trial = t.fitted(trial, t.few(1), 2 * SHORT_STEPS, rounds=2)
         else:
@@ -589,8 +589,9 @@ def choose(t: Training) -> Choice:
         loss = t.held_loss(trial)
         kept = loss < BETTER * least
         t.note(_name(trial.effects), kept, loss)
-        if kept or best is None:
-            best, least = trial, loss
+        if not kept:
+            break
+        best, least = trial, loss
     if best is None:
         raise ValueError("effects: got none to choose from")
     if np.isfinite(t.surface.look).all() and material.max() > 0 and not t.totals:
