@@ -8,7 +8,7 @@ from golden.make import joined as joined
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.exact import ExactEngine
-from warprrf.rf.fields.bistatic.mirror_light import MIRROR_SLACK_M
+from warprrf.rf.fields.bistatic.tracer import MIRROR_SLACK_M
 from warprrf.rf.paths.images import MirrorImages
 from warprrf.rf.paths.mirror_paths import zone_paths
 from warprrf.rf.spectra.dataset import SpectrumDataset
