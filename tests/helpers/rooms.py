@@ -323,7 +323,9 @@ def harmonic(room: Room) -> wr.RadioField:
 FIGURES: dict[str, Callable[[Room], np.ndarray]] = {
     "mirrors": mirrors,
     "exact": lambda room: images(room, simulated(room)),
-    "bistatic": lambda room: images(room, BistaticField.prior(room.scene, simulated(room), effects=EVERY_EFFECT)),
+    "bistatic": lambda room: images(
+        room, BistaticField.prior(room.scene, simulated(room), effects=EVERY_EFFECT)
+    ),
     "bistatic, fitted": lambda room: images(room, wr.RadioField.fit(room.scene, simulated(room))),
     "rf3dgs+": lambda room: images(room, harmonic(room)),
 }
