@@ -8,7 +8,8 @@ from golden.make import joined as joined
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.exact import ExactEngine
-from warprrf.rf.fields.bistatic.mirror_light import MIRROR_SLACK_M
+from warprrf.rf.fields.bistatic.observations import Observation, Place, Target
+from warprrf.rf.fields.bistatic.tracer import MIRROR_SLACK_M
 from warprrf.rf.paths.images import MirrorImages
 from warprrf.rf.paths.mirror_paths import zone_paths
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -98,3 +99,19 @@ def mirror_paths(surface, transmitter, receivers, wavelength_m, order):
     """Line of sight and mirror paths on a field's surface, softly blocked."""
     images = MirrorImages(surface.patches, transmitter, slack_m=MIRROR_SLACK_M)
     return zone_paths(images, receivers, order, wavelength_m, surface.skin_m)
+
+
+def observation(view, measured, floor, db=None, **how):
+    """What ``measured`` reads of ``view``: ``db`` above the floor, by default nothing."""
+    tracer = view.tracer
+    place = Place(
+        0,
+        np.zeros(1, int),
+        tracer.transmitter,
+        view.receivers[0],
+        tracer.frequency_hz,
+        tracer.grid.shape,
+        None,
+    )
+    count = len(measured.of_bins(np.zeros((measured.bins(view)[1], 1))))
+    return Observation(place, view, measured, Target(np.zeros(count) if db is None else db), floor, **how)

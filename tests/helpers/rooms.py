@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 import warprrf as wr
 from warprrf.geometry.splats.gaussians import discs_on_mesh
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Terms
+from warprrf.rf.fields.bistatic.materials import Effects
 
 SHAPE = (18, 36)
-ALL_TERMS = Terms(mirror_order=2, mirror_scatter=True, scatter_mirror=True, diffuse_order=3)
+EVERY_EFFECT = Effects(mirrors=2, residual=False)
 
 
 @dataclass(frozen=True)
@@ -323,7 +323,9 @@ def harmonic(room: Room) -> wr.RadioField:
 FIGURES: dict[str, Callable[[Room], np.ndarray]] = {
     "mirrors": mirrors,
     "exact": lambda room: images(room, simulated(room)),
-    "bistatic": lambda room: images(room, BistaticField.prior(room.scene, simulated(room), terms=ALL_TERMS)),
+    "bistatic": lambda room: images(
+        room, BistaticField.prior(room.scene, simulated(room), effects=EVERY_EFFECT)
+    ),
     "bistatic, fitted": lambda room: images(room, wr.RadioField.fit(room.scene, simulated(room))),
     "rf3dgs+": lambda room: images(room, harmonic(room)),
 }

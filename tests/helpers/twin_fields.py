@@ -1,11 +1,13 @@
 """A bistatic field of known parameters on a room with a block in it: nothing is fitted."""
 
+from dataclasses import replace
+
 import numpy as np
 from furnished import RECEIVERS, TX, furnished
 from radio_scenes import RadioScene, SlabMaterial
 
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Parameters, Terms
+from warprrf.rf.fields.bistatic.materials import SETS, Parameters
 from warprrf.rf.fields.bistatic.surface import Surface
 
 F, SHAPE, SIGMA = 300e9, (30, 60), np.radians(5.0)
@@ -37,10 +39,8 @@ def known_field(**changes) -> BistaticField:
         "floor": 1e-17,
         "range_db": (-170.0, -80.0),
         "beam_sigma_rad": SIGMA,
-        "terms": Terms(lobes=LOBES),
-        "parameters": Parameters(
-            weight, np.log([2.0, 5.0, 1.0]), np.log([0.75, 0.36, 0.99]), np.full(3, -np.inf)
-        ),
+        "effects": replace(SETS["single"], residual=False),
+        "parameters": Parameters(weight, np.log([2.0, 5.0, 1.0]), np.log([0.75, 0.36, 0.99]), LOBES),
         "material": surface.material,
         "residual": np.zeros((2, surface.cells)),
     }

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from furnished import RECEIVERS, SHAPE, TX
-from radio_scenes import RadioScene, SlabMaterial, joined
+from radio_scenes import RadioScene, SlabMaterial, joined, observation
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.absorption import Air
@@ -18,12 +18,12 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Parameters, Terms
+from warprrf.rf.fields.bistatic.fit import trace
+from warprrf.rf.fields.bistatic.materials import SETS, Effects, Parameters
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
-from warprrf.rf.fields.bistatic.render import mirror_shown, path_powers
-from warprrf.rf.fields.bistatic.response import respond
+from warprrf.rf.fields.bistatic.records import Evaluation
 from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.training import trace
+from warprrf.rf.fields.bistatic.tracer import View
 from warprrf.rf.relevance.model import full_field
 from warprrf.rf.simulate import simulate
 from warprrf.rf.spectra.beam import BeamOperator
@@ -37,6 +37,7 @@ AIR = Air()
 LOSS = AIR.attenuation_db_per_m(F)  # dB a metre
 RECEIVERS = RECEIVERS[:8]
 BLOCKED, SEEN = RECEIVERS[0], RECEIVERS[4]
+SINGLE = replace(SETS["single"], residual=False)
 
 
 def spectra(scene: RadioScene, **options: object) -> SpectrumDataset:
@@ -124,7 +125,7 @@ def test_sionnas_paths_lose_by_their_delay(tmp_path: Path) -> None:
 
 
 def test_a_field_of_line_of_sight_is_friis_times_gas(scene: RadioScene, humid: SpectrumDataset) -> None:
-    field = BistaticField.prior(scene, humid, terms=Terms(diffuse=False, mirror_order=0))
+    field = BistaticField.prior(scene, humid, effects=Effects(mirrors=0, scatterings=0))
     assert field.air == AIR
     distance = np.linalg.norm(SEEN - TX)
     expected = friis(SEEN) * passed(distance)
@@ -138,71 +139,51 @@ def test_a_field_of_line_of_sight_is_friis_times_gas(scene: RadioScene, humid: S
 
 
 def test_single_bounces_of_a_field_have_their_rays_lengths(scene: RadioScene, dry: SpectrumDataset) -> None:
-    field = BistaticField.prior(scene, dry, terms=Terms(mirror_order=2))
+    field = BistaticField.prior(scene, dry, effects=replace(SINGLE, mirrors=2))
     humid = field.with_gas()
     view = field.view(BLOCKED)
-    before, after = field.render(view).powers, humid.render(humid.view(BLOCKED)).powers
+    before, after = field.path_gains(view), humid.path_gains(humid.view(BLOCKED))
     lit = before.single > 0
     point = view.hits.points(np.flatnonzero(lit))
     length = np.linalg.norm(point - TX, axis=1) + np.linalg.norm(point - BLOCKED, axis=1)
     np.testing.assert_allclose(after.single[lit], before.single[lit] * passed(length), rtol=1e-5)
-    np.testing.assert_allclose(after.mirror, before.mirror * passed(view.paths.length_m), rtol=1e-12)
+    np.testing.assert_allclose(after.sharp, before.sharp * passed(view.paths.length_m), rtol=1e-12)
     # off again, nothing is left of it
     np.testing.assert_array_equal(
         humid.with_gas(False).spectrum(BLOCKED).path_gain, field.spectrum(BLOCKED).path_gain
     )
 
 
+def powers_by_ray(view: View, name: str, materials: Evaluation) -> np.ndarray:
+    """Power of a table's records by the ray that sees them."""
+    records = view.tables(Effects())[name]
+    return np.bincount(records.ray, records.powers(materials), minlength=len(view.hits.face))
+
+
 def test_scattered_light_seen_in_a_mirror_has_all_three_legs(scene: RadioScene, dry: SpectrumDataset) -> None:
-    field = BistaticField.prior(scene, dry, terms=Terms(scatter_mirror=True))
-    mesh, images = field.surface.mesh, []
-    views = [
-        one.transport().on_grid((12, 24), 1, 1).view(SEEN, one.terms) for one in (field, field.with_gas())
-    ]
-    for view in views:
-        ray, power = mirror_shown(view, field.materials, None)
-        images.append(np.bincount(ray, power, minlength=12 * 24))
-    d = view.transport.grid.directions
+    """And what elements send on evenly has the two from them; with one ray a pixel every ray goes on at mirrors."""
+    field = BistaticField.prior(scene, dry)
+    mesh, sides = field.surface.mesh, field.surface.side_group
+    views = [one.tracer().on_grid((12, 24), 1).view(SEEN, 0) for one in (field, field.with_gas())]
+    d = views[0].tracer.grid.directions
     first = mesh.cast(SEEN, d)
     normal = mesh.face_normals[first.face]
     turned = d - 2.0 * (d * normal).sum(axis=1, keepdims=True) * normal
     second = mesh.cast(first.point + 1e-4 * turned, turned)
-    length = first.t + second.t + np.linalg.norm(second.point - TX, axis=1)
-    lit = images[0] > 0
-    assert lit.sum() > 0.5 * len(lit)
-    # the second ray starts 2 cm off the mirror, which moves few of the points that it meets
-    ratio = images[1][lit] / (images[0][lit] * passed(length[lit]))
-    assert np.abs(10.0 * np.log10(ratio)).max() < 0.06 * LOSS
-    # elements that send on evenly: two legs from them
-    sent = np.ones(field.surface.element_sides)
-    dark = replace(field.parameters, log_weight=np.full_like(field.parameters.log_weight, -np.inf))
-    glow = []
-    for view in views:
-        ray, power = mirror_shown(view, replace(field.materials, parameters=dark), sent)
-        glow.append(np.bincount(ray, power, minlength=12 * 24))
-    lit = glow[0] > 0
-    ratio = glow[1][lit] / (glow[0][lit] * passed(first.t + second.t)[lit])
-    assert np.abs(10.0 * np.log10(ratio)).max() < 0.06 * LOSS
+    last = np.linalg.norm(second.point - TX, axis=1)
+    materials = Evaluation(field.parameters, None, sides, np.ones(len(sides)))
+    for name, length in (("SM", first.t + second.t + last), ("EM", first.t + second.t)):
+        before, after = (powers_by_ray(view, name, materials) for view in views)
+        lit = before > 0
+        assert lit.sum() > 0.5 * len(lit)
+        # the second ray starts 2 cm off the mirror, which moves few of the points that it meets
+        ratio = after[lit] / (before[lit] * passed(length[lit]))
+        assert np.abs(10.0 * np.log10(ratio)).max() < 0.06 * LOSS
 
 
-def test_light_that_mirrors_throw_has_its_images_length(scene: RadioScene, dry: SpectrumDataset) -> None:
-    field = BistaticField.prior(scene, dry, terms=Terms(mirror_scatter=True))
-    surface = field.surface
-    # one ray a pixel, each of which looks for mirrored light
-    views = [
-        one.transport().on_grid((16, 32), 1, 1).view(SEEN, one.terms) for one in (field, field.with_gas())
-    ]
-    before, after = (view.mirror_illumination for view in views)
-    point = views[0].hits.points(before.ray)
-    normal, offset = surface.plane_normal[before.patch], surface.plane_offset[before.patch]
-    image = TX - 2.0 * (normal @ TX - offset)[:, None] * normal
-    length = np.linalg.norm(point - image, axis=1) + np.linalg.norm(point - SEEN, axis=1)
-    strength = before.light.strength.numpy(), after.light.strength.numpy()
-    assert (strength[0] > 0).sum() > 500
-    np.testing.assert_allclose(strength[1], strength[0] * passed(length), rtol=1e-5)
+def test_light_that_mirrors_throw_has_its_images_length(dry: SpectrumDataset) -> None:
+    """Under a lid above a floor each is lit by the other's image: what a ray sees of that, and what elements get."""
 
-
-def test_irradiance_by_a_mirror_has_its_images_length(dry: SpectrumDataset) -> None:
     def sheet(z: float, up: bool) -> tuple[np.ndarray, np.ndarray]:
         corners = np.array([[-4.0, -4, z], [4, -4, z], [4, 4, z], [-4, 4, z]])
         faces = np.array([[0, 1, 2], [0, 2, 3]])
@@ -210,14 +191,25 @@ def test_irradiance_by_a_mirror_has_its_images_length(dry: SpectrumDataset) -> N
 
     mesh, part = joined(sheet(0.0, True), sheet(4.0, False))
     field = BistaticField.prior(RadioScene(mesh, part, [SlabMaterial("floor"), SlabMaterial("lid")]), dry)
-    before, after = (
-        one.transport().mirror_light.irradiance(field.parameters) for one in (field, field.with_gas())
-    )
+    views = [one.tracer().on_grid((16, 32), 1).view(SEEN, 0) for one in (field, field.with_gas())]
+    materials = Evaluation(field.parameters)
+
+    def by_image(point: np.ndarray) -> np.ndarray:
+        lid = point[:, 2:] > 2.0
+        return np.linalg.norm(point - np.where(lid, TX * [1, 1, -1], TX * [1, 1, -1] + [0, 0, 8.0]), axis=1)
+
+    before, after = (powers_by_ray(view, "MS", materials) for view in views)
+    lit = np.flatnonzero(before)
+    assert len(lit) > 300
+    point = views[0].hits.points(lit)
+    length = by_image(point) + np.linalg.norm(point - SEEN, axis=1)
+    np.testing.assert_allclose(after[lit], before[lit] * passed(length), rtol=1e-5)
+    onto = [view.tracer.mirrored.onto for view in views]
+    before, after = (np.bincount(r.ray, r.powers(materials), field.surface.element_sides) for r in onto)
+    lit = np.flatnonzero(before)
+    assert len(lit) > 40
     centre = np.tile(field.surface.element_centre, (2, 1))  # of both sides
-    lid = (centre[:, 2] > 3.9) & (before > 0)
-    assert lid.sum() > 20
-    length = np.linalg.norm(centre[lid] - TX * [1, 1, -1], axis=1)
-    np.testing.assert_allclose(after[lid] / before[lid], passed(length), rtol=0.02)
+    np.testing.assert_allclose(after[lit] / before[lit], passed(by_image(centre[lit])), rtol=0.02)
 
 
 def test_two_and_three_bounces_in_a_sphere_have_the_chords_lengths() -> None:
@@ -228,20 +220,19 @@ def test_two_and_three_bounces_in_a_sphere_have_the_chords_lengths() -> None:
     surface = Surface.of(Mesh(ball.vertices, ball.faces[:, ::-1]))
     groups = surface.groups
     parameters = Parameters(
-        np.full((groups, 1), np.log(0.9)), np.full(groups, np.log(50.0)), np.full(groups, -60.0),
-        np.full(groups, -np.inf),
-    )  # fmt: skip
+        np.full((groups, 1), np.log(0.9)), np.full(groups, np.log(50.0)), np.full(groups, -60.0), lobes=(0,)
+    )
     field = BistaticField(
         surface=surface, transmitter=np.array([0.02, 0.0, 0.0]), frequency_hz=F, shape=SHAPE, floor=1e-20,
         range_db=(-200.0, -80.0), beam_sigma_rad=np.radians(5.0), parameters=parameters, material=np.zeros(groups, int),
         residual=np.zeros((2, surface.cells)),
-        terms=Terms(line_of_sight=False, mirror_order=0, lobes=(0,), diffuse_order=2),
+        effects=Effects(False, 0, 2, mirror_scatter=False, scatter_mirror=False),
     )  # fmt: skip
-    thrice = replace(field, terms=replace(field.terms, diffuse_order=3))
+    thrice = replace(field, effects=replace(field.effects, scatterings=3))
     receiver = np.array([-0.02, 0.0, 0.0])
 
     def further(one: BistaticField) -> float:
-        return float(one.render(one.view(receiver)).further.sum())
+        return float(one.path_gains(one.view(receiver)).by_ray(["E"]).sum())
 
     two = further(field.with_gas()) / further(field)
     three = (further(thrice.with_gas()) - further(field.with_gas())) / (further(thrice) - further(field))
@@ -253,25 +244,23 @@ def test_two_and_three_bounces_in_a_sphere_have_the_chords_lengths() -> None:
 
 
 @pytest.mark.usefixtures("device")
-def test_an_indirect_radiance_has_the_receivers_leg(scene: RadioScene, dry: SpectrumDataset) -> None:
-    terms = Terms(line_of_sight=False, diffuse=False, mirror_order=0, indirect=True)
-    field = BistaticField.prior(scene, dry, terms=terms)
-    field = replace(field, parameters=replace(field.parameters, log_indirect=np.zeros(field.surface.groups)))
-    humid = field.with_gas()
-    view = field.view(SEEN)
-    rays = view.transport.grid.solid_angle * passed(view.hits.range_m.numpy())
-    expected = (WAVELENGTH / (4.0 * np.pi)) ** 2 * rays.sum()
-    view = humid.view(SEEN)
-    found = path_powers(view, humid.materials, humid.sent_radiance(view.transport))
-    assert found.further.sum() == pytest.approx(expected, rel=1e-9)
-    measured = SpectrumPixels(BeamOperator(SHAPE, humid.beam_sigma_rad), np.arange(SHAPE[0] * SHAPE[1]))
-    response = respond(view, measured, humid.terms, humid.floor)  # what a fit of it is made on
-    assert response.indirect.sum() * humid.floor == pytest.approx(expected, rel=1e-5)
+def test_an_even_radiance_has_the_receivers_leg(scene: RadioScene, dry: SpectrumDataset) -> None:
+    humid = BistaticField.prior(scene, dry).with_gas()
+    view, sides = humid.view(SEEN), humid.surface.side_group
+    expected = (WAVELENGTH / (4.0 * np.pi)) ** 2 * (
+        view.tracer.grid.solid_angle * passed(view.hits.range_m)
+    ).sum()
+    materials = Evaluation(humid.parameters, None, sides, np.ones(len(sides)), device=humid.device)
+    assert powers_by_ray(view, "E", materials).sum() == pytest.approx(
+        expected, rel=1e-5
+    )  # in single precision
+    o = observation(view, SpectrumPixels(BeamOperator(SHAPE, humid.beam_sigma_rad)), humid.floor)
+    columns = o.further(replace(SINGLE, scatterings=2), materials)[1]  # what a fit of it is made on
+    assert columns.sum() * humid.floor == pytest.approx(expected, rel=1e-5)
 
 
 def test_links_with_gas_are_the_spectrums_sums(scene: RadioScene, humid: SpectrumDataset) -> None:
-    terms = Terms(mirror_order=2, mirror_scatter=True, scatter_mirror=True, diffuse_order=2)
-    field = BistaticField.prior(scene, humid, terms=terms)
+    field = BistaticField.prior(scene, humid, effects=Effects(mirrors=2, scatterings=2, residual=False))
     total = field.links(RECEIVERS[[0, 4]]).total_path_gain
     for k, place in enumerate(RECEIVERS[[0, 4]]):
         expected = field.spectrum(place).total_path_gain
@@ -283,7 +272,7 @@ def test_a_fit_takes_the_air_out_of_what_it_learns(
     scene: RadioScene, dry: SpectrumDataset, humid: SpectrumDataset, tmp_path: Path
 ) -> None:
     train = humid.subset(np.arange(6))
-    field = RadioField.fit(scene, train, mirror_order=1, diffuse_order=1, indirect=False, residual=False)
+    field = RadioField.fit(scene, train, effects=SINGLE)
     test = np.arange(6, 8)
     assert field.air == AIR
     assert evaluate(humid.subset(test), field.spectrum)["psnr_db"] > 40
@@ -302,9 +291,9 @@ def test_a_fit_takes_the_air_out_of_what_it_learns(
 def test_what_was_traced_in_other_air_is_refused(
     scene: RadioScene, dry: SpectrumDataset, humid: SpectrumDataset
 ) -> None:
-    seen = trace(scene, dry.subset([0, 1]), mirror_order=1)
+    seen = trace(scene, dry.subset([0, 1]))
     with pytest.raises(ValueError, match="air and rays of this fit"):
-        RadioField.fit(scene, humid.subset([0, 1]), transport=seen)
+        RadioField.fit(scene, humid.subset([0, 1]), views=seen)
 
 
 def test_relevance_judges_the_air_by_itself(scene: RadioScene, humid: SpectrumDataset) -> None:

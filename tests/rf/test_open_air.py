@@ -56,7 +56,7 @@ def field():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         ds = wr.simulate(s, transmitter=SMALL * TX, receivers=SMALL * STREET, frequency_hz=F, shape=(16, 32))
-        return wr.RadioField.fit(s, ds, quick=True, mirror_order=1)
+        return wr.RadioField.fit(s, ds, quick=True, effects="single")
 
 
 @pytest.mark.parametrize("inward", [False, True])
@@ -137,7 +137,7 @@ def test_heights_above_the_ground_follow_a_slope(tmp_path):
     tx, rx = SMALL * TX + [0.0, 0.0, 7.0], places + np.outer(0.2 * x + 7.0, [0.0, 0.0, 1.0])
     with pytest.warns(UserWarning, match="not modelled"):
         ds = wr.simulate(s, transmitter=tx, receivers=rx, frequency_hz=F, shape=(16, 32))
-        sloping = wr.RadioField.fit(s, ds, quick=True, mirror_order=1)
+        sloping = wr.RadioField.fit(s, ds, quick=True, effects="single")
     found = sloping.radio_map(0.15, 1.0, above_ground=True, shape=(6, 12))
     np.testing.assert_allclose(found.positions[..., 2], 0.2 * found.positions[..., 0] + 7.15, atol=1e-6)
     assert 0.5 < found.free.mean() < 0.9
@@ -164,7 +164,7 @@ def test_every_verb_warns_once_where_it_was_called():
         lambda: wr.simulate(s, **where, shape=(16, 32)),
         lambda: wr.trace_paths(s, **where),
         lambda: wr.trace_paths(s.mesh, **where),
-        lambda: wr.RadioField.fit(s, ds, quick=True, mirror_order=1),
+        lambda: wr.RadioField.fit(s, ds, quick=True, effects="single"),
     ):
         (found,) = unmodelled(call)
         assert found[0].startswith("3.5 GHz: diffraction and transmission through walls are not modelled")
@@ -224,6 +224,6 @@ def test_a_receiver_that_sees_nothing_lit_says_nothing_of_materials(capfd):
     )
     assert ds.path_gain[:-1].reshape(4, -1).any(axis=1).all()
     assert not ds.path_gain[-1].any()
-    field = wr.RadioField.fit(s, ds, quick=True, mirror_order=1, indirect=False)
+    field = wr.RadioField.fit(s, ds, quick=True, effects="single")
     assert "illegal" not in "".join(capfd.readouterr())
     assert field.spectrum(dark[0]).path_gain.max() < field.floor

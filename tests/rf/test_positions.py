@@ -57,7 +57,7 @@ def field():
         shape=(16, 32),
         roles=["train"] * 3,
     )
-    return wr.RadioField.fit(s, ds, quick=True, mirror_order=1)
+    return wr.RadioField.fit(s, ds, quick=True, effects="single")
 
 
 @pytest.mark.parametrize(

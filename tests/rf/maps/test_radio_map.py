@@ -13,23 +13,23 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Terms
+from warprrf.rf.fields.bistatic.materials import Effects
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.maps.links import BeamSearch, directivity, links_of
 from warprrf.rf.maps.radio_map import QUANTITIES, RadioMap, is_free
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_solid_angles
 
 WAVELENGTH = SPEED_OF_LIGHT / F
-EVERYTHING = Terms(mirror_order=2, mirror_scatter=True, scatter_mirror=True, diffuse_order=2, indirect=True)
+EVERYTHING = Effects(mirrors=2, scatterings=2, residual=False)
 PLACES = RECEIVERS[[0, 1, 3, 5, 9]]
 
 
-def prior(scene: object, terms: Terms) -> BistaticField:
+def prior(scene: object, effects: Effects) -> BistaticField:
     known = SimpleNamespace(
         transmitter=TX, frequency_hz=F, path_gain=np.zeros((1, *SHAPE)), floor=1e-16, range_db=(-150.0, -90.0),
         beam_sigma_rad=SIGMA,
     )  # fmt: skip
-    return BistaticField.prior(scene, known, terms=terms)
+    return BistaticField.prior(scene, known, effects=effects)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def db(ratio: np.ndarray) -> np.ndarray:
 
 def test_an_empty_room_of_line_of_sight_alone_is_friis() -> None:
     room = Mesh(*box_mesh([0, 0, 0], [5, 4, 3], inward=True))
-    m = prior(room, Terms(diffuse=False, mirror_order=0)).radio_map(1.5, 0.4, transmit_power_dbm=10.0)
+    m = prior(room, Effects(mirrors=0, scatterings=0)).radio_map(1.5, 0.4, transmit_power_dbm=10.0)
     length = np.linalg.norm(m.positions - TX, axis=-1)
     friis = (WAVELENGTH / (4.0 * np.pi * length)) ** 2
     assert m.free.sum() == 12 * 10  # the thirteenth column's centre is at the wall
@@ -123,7 +123,7 @@ def test_more_rays_come_closer(whole: BistaticField) -> None:
 
 @pytest.mark.parametrize("order", [0, 1, 2])
 def test_fewer_mirrors_are_those_of_a_field_with_fewer(whole: BistaticField, order: int) -> None:
-    fewer = replace(whole, terms=replace(whole.terms, mirror_order=order))
+    fewer = replace(whole, effects=replace(whole.effects, mirrors=order))
     expected, found = fewer.links(PLACES), whole.links(PLACES, mirror_order=order)
     for name, value in vars(expected).items():
         np.testing.assert_array_equal(getattr(found, name), value, err_msg=name)

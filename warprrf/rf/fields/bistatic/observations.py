@@ -356,7 +356,7 @@ class Columns:
             p.weight[self.groups][:, :, None]
             * curves.at(curves.coordinates, p.log_excess[self.groups])[0][:, None]
         )
-        single = mixed.astype(np.float32).ravel() @ self.single.reshape(mixed.size, -1)
+        single = mixed.astype(np.float32).ravel() @ self.single.reshape(mixed.size, self.single.shape[-1])
         return np.asarray(
             np.maximum(single, 0.0) + p.scattered_share[self.senders].astype(np.float32) @ self.further, float
         )
@@ -378,7 +378,7 @@ class Columns:
             row[: layout.lobes] += (p.weight[g] * even[g])[:, None] * column
             row[layout.lobes] += p.weight[g].sum() * steeper[g] * column
         index = layout.stride * seen[:, None] + np.arange(layout.stride)
-        return found.reshape(index.size, -1), index.ravel()
+        return found.reshape(index.size, found.shape[-1]), index.ravel()
 
 
 def columns_of(o: Observation, effects: Effects, materials: Evaluation) -> Columns:

@@ -234,11 +234,7 @@ class Tracer:
     def _sharp(self, p: MirrorPaths) -> Records:
         """Line of sight and mirror paths as records, in double precision."""
         friis = (self.wavelength_m / (4.0 * np.pi * p.length_m)) ** 2 * p.share**2
-        group = (
-            np.where(p.patch >= 0, self.surface.patch_group.take(p.patch, mode="clip"), -1)
-            if p.patch.size
-            else p.patch
-        )
+        group = np.append(self.surface.patch_group, -1)[p.patch]  # no patch has no group
         angle = np.stack([p.cosine, np.where(p.patch >= 0, p.turn, 0.0), 0.0 * p.cosine], axis=2)
         power = friis * self.grid.transmittance(p.length_m)
         return Records(
