@@ -224,7 +224,7 @@ class Format:
             changes one value of the first part that is read (four numbers of a quaternion) at most, a cut nothing.
             "whole": a cut changes nothing. "numbers": what is read is numbers.
         held: attributes of what was read that its answers may be refused by.
-        unknown: ends of the names of numbers that may be NaN: a file may say so.
+        unknown: ends of the names of numbers that may be NaN, as a file may say that they were not measured.
     """
 
     make: Callable[[Place, Path], Path]
@@ -351,7 +351,7 @@ READINGS = {"frequency_hz": 300e9, "floor": 1e-14}
 FORMATS: dict[str, Format] = {
     **{
         f"{how}spectra": Format(
-            _copy(file), wr.SpectrumDataset.load, "netcdf", "sealed", unknown=(".path_gain",)  # NaN: not measured
+            _copy(file), wr.SpectrumDataset.load, "netcdf", "sealed", unknown=(".path_gain", ".delay_s", ".aod")
         )
         for how, file in (("", "spectra.nc"), ("compact ", "compact.nc"))
     },

@@ -129,13 +129,15 @@ def test_what_was_found_once_is_right_now(attempt, case):
 @pytest.mark.parametrize(
     ("target", "edits", "kind"),
     [
-        ("arrays, plain", [("double", 269, 44445), ("double", 1974, 16233)], "unfit"),
-        ("compact spectra", [("rename", 663, 1025619944), ("blank", 378031391, 141595)], "answered"),
+        ("file: arrays, plain", [("double", 269, 44445), ("double", 1974, 16233)], "unfit"),
+        ("file: compact spectra", [("rename", 663, 1025619944), ("blank", 378031391, 141595)], "answered"),
+        ("law: rooms", [("turned by a quarter", 12321, 380152463)], "answered"),
     ],
 )
-def test_what_a_file_says_is_empty_is_no_finding(attempt, target, edits, kind):
-    """Of arrays alone contents are not edited; a fill value of zero makes pixels of zero not measured."""
-    assert attempt(Case(FILE + target, tuple(edits))).kind == kind
+def test_what_was_wrongly_found_is_no_finding(attempt, target, edits, kind):
+    """Bytes alone have no contents; a fill value of zero makes pixels of zero not measured; a lattice of rays is none of
+    the room's."""
+    assert attempt(Case(target, tuple(edits))).kind == kind
 
 
 @pytest.mark.parametrize("law", LAWS)
