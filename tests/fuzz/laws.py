@@ -65,7 +65,9 @@ def _rooms(place: Place, edits: tuple[Edit, ...]) -> str:
     changed = rooms.ROOMS[room]().with_gaussians()
     for law in laws:
         changed = rooms.LAWS[law](changed)
-    now, before = rooms.FIGURES[figure](changed), _before(room, figure)
+    with rooms.rays_turned(changed.rotation) if figure == "exact" else contextlib.nullcontext():
+        now = rooms.FIGURES[figure](changed)
+    before = _before(room, figure)
     most = sum(rooms.most_db(figure, law) for law in laws)
     total = rooms.total_change_db(now, before)
     rms = 0.0 if changed.turned is None or figure == "mirrors" else rooms.rms_change_db(now, before)

@@ -126,6 +126,20 @@ def test_what_was_found_once_is_right_now(attempt, case):
     assert outcome.kind in ("refused", "answered"), outcome.text
 
 
+@pytest.mark.parametrize(
+    ("target", "edits", "kind"),
+    [
+        ("file: arrays, plain", [("double", 269, 44445), ("double", 1974, 16233)], "unfit"),
+        ("file: compact spectra", [("rename", 663, 1025619944), ("blank", 378031391, 141595)], "answered"),
+        ("law: rooms", [("turned by a quarter", 12321, 380152463)], "answered"),
+    ],
+)
+def test_what_was_wrongly_found_is_no_finding(attempt, target, edits, kind):
+    """Bytes alone have no contents; a fill value of zero makes pixels of zero not measured; a lattice of rays is none of
+    the room's."""
+    assert attempt(Case(target, tuple(edits))).kind == kind
+
+
 @pytest.mark.parametrize("law", LAWS)
 def test_a_law_holds(attempt, law):
     plain = [Case(LAW + law, ((name, 0, 0),)) for name in dict.fromkeys(LAWS[law].edits)]
@@ -172,6 +186,7 @@ def test_nan_is_a_finding_where_it_is_not_usual():
     usual = leaves({"a": np.array([1.0, np.nan]), "b": 1.0})
     assert not wrong(leaves({"a": np.array([np.nan]), "b": 2.0}), usual)
     assert "b" in wrong(leaves({"a": np.array([1.0]), "b": np.nan}), usual)
+    assert not wrong(leaves({"a": np.array([1.0]), "b": np.nan}), usual, (".b",))
     delay = np.array([[1e-9, np.nan]])  # of an empty pixel alone
     assert not wrong(leaves({"path_gain": np.array([[1.0, 0.0]]), "delay_s": delay}), {})
     assert "delay_s" in wrong(leaves({"path_gain": np.array([[1.0, 1.0]]), "delay_s": delay}), {})
