@@ -34,7 +34,7 @@ MIRROR_SLACK_M = 0.1
 """How far beside its faces a patch may still mirror [m]: outlines of a reconstructed mesh are torn."""
 LIFT_M = 0.02  # rays that start on a surface start so far off it
 THROUGH_MIRRORS = 3  # rays of a pixel that look for light by way of mirrors
-INTO_MIRRORS = 5  # that go on at mirrors: what these show is seen a second time already
+INTO_MIRRORS = 2  # square root of the rays of a pixel that go on at mirrors: what these show is seen a second time already
 SHARP = "sharp"
 """Name of the table of line of sight and mirrors."""
 SENT_ON = ("E", "EM")
@@ -249,13 +249,12 @@ class Tracer:
 
     def lit_by_mirrors(self, rays: _Rays) -> Records:
         """What some rays of each pixel see of surfaces that images of the transmitter light."""
-        places = places_of_rays(self.grid.per_pixel, INTO_MIRRORS)[::2]
+        chosen, times = np.flatnonzero(rays.hits.face >= 0), 1.0
         if rays.group is None:
-            places = places_of_rays(self.grid.per_pixel, THROUGH_MIRRORS)
-        chosen = np.flatnonzero(np.isin(rays.ray % self.grid.per_pixel, places) & (rays.hits.face >= 0))
-        times = (self.grid.per_pixel if rays.group is None else min(INTO_MIRRORS, self.grid.per_pixel)) / len(
-            places
-        )
+            places = ((np.arange(THROUGH_MIRRORS) + 0.5) * self.grid.per_pixel / THROUGH_MIRRORS).astype(int)
+            places = np.unique(places)
+            times = self.grid.per_pixel / len(places)
+            chosen = chosen[np.isin(chosen % self.grid.per_pixel, places)]
         row, image = self.mirrored.pairs(rays.hits.face[chosen])
         row, m = chosen[row], self.mirrored
         light = self.grid.light_through(rays.hits, m.image[image], row)
@@ -316,33 +315,31 @@ class Tracer:
         )  # fmt: skip
 
     def _turned(self, view: View) -> _Rays:
-        """Some rays of each pixel turned at the mirrors that they hit, and what they hit there."""
-        s, grid, hits = self.surface, self.grid, view.hits
-        places = places_of_rays(grid.per_pixel, INTO_MIRRORS)
-        times = grid.per_pixel / len(places)
-        ray = np.flatnonzero(np.isin(np.arange(len(hits.face)) % grid.per_pixel, places))
-        face = hits.face[ray]
-        own = (face >= 0) & (s.patch.take(face, mode="wrap") >= 0)
-        ray, face = ray[own], face[own]
-        each = ray % len(grid.directions)
+        """Rays of a coarser lattice turned at the mirrors that they hit, and what they hit there. Of the receiver's grid each
+        belongs to a ray of the same pixel that hits something, if one does."""
+        s, per_pixel = self.surface, self.grid.per_pixel
+        shape, sub_pixels = self.grid.shape, min(INTO_MIRRORS, self.grid.sub_pixels)
+        grid = self.kept.get((shape, sub_pixels), lambda: self.on_grid(shape, sub_pixels).grid)
+        hits = grid.hit(view.receivers)
+        ray = np.flatnonzero(hits.face >= 0)
+        ray = ray[s.patch[hits.face[ray]] >= 0]
+        face, each = hits.face[ray], ray % len(grid.directions)
         direction, normal = grid.directions[each], s.plane_normal[s.patch[face]]
         normal = np.where((direction * normal).sum(axis=1, keepdims=True) > 0, -normal, normal)
         cosine = -(direction * normal).sum(axis=1)
         turned = direction + 2.0 * cosine[:, None] * normal
-        solid_angle = grid.solid_angle[each] * times * grid.transmittance(hits.range_m[ray])
+        solid_angle = grid.solid_angle[each] * grid.transmittance(hits.range_m[ray])
         found = grid.hit_along(hits.points(ray) + LIFT_M * normal, turned, solid_angle)
-        return _Rays(found, ray, s.group[face], cosine)
+        pixel, place = np.divmod(ray, grid.per_pixel)
+        place = ((place + 0.5) * per_pixel / grid.per_pixel).astype(int)
+        met = view.hits.face.reshape(-1, per_pixel) >= 0
+        place = np.where(met[pixel, place], place, met.argmax(axis=1)[pixel])
+        return _Rays(found, pixel * per_pixel + place, s.group[face], cosine)
 
     def adopted(self, view: View) -> View:
         """What :func:`traced` found, as a view of this tracer."""
         own: dict[str, Any] = {"directions": self.grid.directions, "solid_angle": self.grid.solid_angle}
         return replace(view, tracer=self, hits=replace(view.hits, **own))
-
-
-def places_of_rays(per_pixel: int, count: int) -> np.ndarray:
-    """Which ``count`` of the rays of a pixel stand for all of them, shape ``(count,)``, or all if they are fewer."""
-    count = min(count, per_pixel)
-    return ((np.arange(count) + 0.5) * per_pixel / count).astype(int)
 
 
 def traced(again: Callable[[], Tracer], effects: Effects, part: tuple[np.ndarray, MirrorPaths]) -> View:
