@@ -10,7 +10,7 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_path
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Terms
+from warprrf.rf.fields.bistatic.materials import Effects
 from warprrf.rf.fields.bistatic.surface import SKIN_M, Surface
 from warprrf.rf.paths.polarisation import chain_reflection, turns
 from warprrf.rf.paths.trace import MirrorTracer
@@ -44,7 +44,7 @@ def test_mirrors_one_after_the_other_reflect_as_jones_matrices_say() -> None:
     ]
     scene = RadioScene(mesh, part, room)
     ds = spectra(scene, RX[None], shape=(12, 24), sigma=np.radians(10.0))
-    field = BistaticField.prior(scene, ds, terms=Terms(mirror_order=2))
+    field = BistaticField.prior(scene, ds, effects=Effects(mirrors=2, scatterings=0))
     permittivity = np.array([m.relative_permittivity for m in room])
     mirrored = 1.0 - np.array([m.scattering for m in room]) ** 2
     p = replace(field.parameters, log_excess=np.log(permittivity - 1.0), log_mirror=np.log(mirrored))
@@ -52,7 +52,7 @@ def test_mirrors_one_after_the_other_reflect_as_jones_matrices_say() -> None:
     view = field.view(RX)
     found = view.paths
     true = MirrorTracer(scene, transmitter=TX, frequency_hz=F).trace(RX, 2)
-    power = field.render(view).powers.mirror
+    power = field.path_gains(view).sharp
     compared = 0
     for path in np.flatnonzero(found.order == 2):
         same = (np.abs(true.length_m - found.length_m[path]) < 1e-6) & (

@@ -8,6 +8,7 @@ from furnished import RECEIVERS, ROOM, SHAPE, SIGMA, TX, spectra
 from radio_scenes import RadioScene, SlabMaterial
 from scipy import sparse
 from trimesh.remesh import subdivide_to_size
+from warprrf.rf.fields.bistatic.residuals import ResidualFit, Shares, fit_residual, gather_shares
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fields.bistatic.field import BistaticField
@@ -15,7 +16,6 @@ from warprrf.rf.fields.bistatic.fit import NEPER, Target
 from warprrf.rf.fields.bistatic.links import LinkTracer
 from warprrf.rf.fields.bistatic.materials import Terms
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
-from warprrf.rf.fields.bistatic.residuals import ResidualFit, Shares, fit_residual, gather_shares
 from warprrf.rf.fields.bistatic.surface import CELLS, ELEMENT_M, Surface
 from warprrf.rf.maps.links import LinkOptions
 from warprrf.rf.spectra.beam import BeamOperator
