@@ -81,7 +81,7 @@ class Truth:
         key: digest of the file's content.
         data: all receivers.
         counts: numbers of training receivers that it can give.
-        every: each how-manieth test receiver counts.
+        every: every n-th test receiver counts.
     """
 
     name: str
@@ -193,7 +193,7 @@ def checked(name: str, value: int, least: int) -> int:
 
 
 def files(data: Sequence[str], truths: Sequence[str]) -> list[Path]:
-    """The file of each truth: in a folder the full set before the sample, or as given, told apart by their engine.
+    """The file of each truth: in a folder the full set before the sample, or as given, distinguished by their engine.
 
     Raises:
         ValueError: if there is none for a truth, or two, or a truth is unknown.

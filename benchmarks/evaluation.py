@@ -30,7 +30,7 @@ from warprrf.steps import digest
 HELP = """\
 Fits methods to spectra of some receivers and scores them at the test receivers of the same data set: bistatic, RF-3DGS+ and
 RF-3DGS, NeRF2, a conditional GAN, Sionna RT with assumed and with calibrated materials, lookups. Takes any file of
-spectra and any room: a reconstruction, a mesh, or a scene, of which only the mesh is told. Runs that are in
+spectra and any room: a reconstruction, a mesh, or a scene, of which only the mesh is given. Runs that are in
 OUT/paper.json are not done again. Networks need the extra baselines, Sionna RT the extra sionna.
 
 examples:
@@ -86,7 +86,7 @@ class Options:
         methods: which of :data:`METHODS`.
         counts: numbers of training receivers; those that the data do not hold are left out.
         seeds: orders of the training receivers.
-        every: each how-manieth test receiver counts.
+        every: every n-th test receiver counts.
         region: hold out a quarter of the room, the farthest from the transmitter: no training receiver lies there, and no
             other test receiver is asked.
         steps: of NeRF2 and the GAN; 30 000 as published, which takes hours on a graphics card.

@@ -54,14 +54,14 @@ class Options:
 
     Attributes:
         frames: folder of the frames.
-        every: each how-manieth frame is a photo.
-        reference_every: each how-manieth frame's depth is fused.
+        every: every n-th frame is a photo.
+        reference_every: depth of every n-th frame is fused.
         iterations: of the photometric refinement; None: the library's.
     """
 
     frames: str | None = option(None, "folder of the frames (see above)")
-    every: int = option(8, "each how-manieth frame is a photo")
-    reference_every: int = option(2, "each how-manieth frame's depth is fused")
+    every: int = option(8, "every n-th frame is a photo")
+    reference_every: int = option(2, "depth of every n-th frame is fused")
     iterations: int | None = option(None, "of the photometric refinement", kind=int)
 
 

@@ -33,12 +33,12 @@ class FitOptions(DataOptions):
     Attributes:
         truths: ``"exact"``, ``"sionna"`` or both.
         counts: training receivers; those that a data set does not hold are left out.
-        every: each how-manieth test receiver counts.
+        every: every n-th test receiver counts.
     """
 
     truths: tuple[str, ...] = option(TRUTHS, "exact, sionna or both")
     counts: tuple[int, ...] = option((10, 50), "training receivers")
-    every: int = option(1, "each how-manieth test receiver counts")
+    every: int = option(1, "every n-th test receiver counts")
 
     def __post_init__(self) -> None:
         checked("every", self.every, 1)

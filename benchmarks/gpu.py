@@ -178,7 +178,7 @@ class Options:
 
 
 def run(options: Options, job: Job) -> None:
-    """Every part, one process each; a part that fails is told under ``failed`` and costs no other.
+    """Every part, one process each; a part that fails is listed under ``failed`` and costs no other.
 
     Raises:
         ValueError: if a part failed.

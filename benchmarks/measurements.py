@@ -53,7 +53,7 @@ OTHERS = {"B": (1.2, 1.4, 2.6), "C": (13.8, 1.2, 2.4), "D": (2.0, 9.0, 2.5)}
 """Transmitters beside that of the data set [m]; nothing is fitted under the last."""
 SHARE = 4  # spectra under each of three transmitters
 OTHER_HZ = 140e9
-FEWER = 5  # each how-manieth test receiver is simulated under another transmitter and at the other carrier
+FEWER = 5  # one test receiver in so many is simulated under another transmitter and at the other carrier
 COLUMNS = {
     "rows": (
         ("readings", "fitted to", "{}"), ("test", "receivers", "{}"), ("psnr_db", "PSNR [dB]", "{:.2f}"),
@@ -115,7 +115,7 @@ def table_of(kind: str, ds: wr.SpectrumDataset, places: np.ndarray, power: np.nd
 
 
 def spoilt(readings: wr.Readings, seed: int) -> Iterator[tuple[str, wr.Readings, np.ndarray]]:
-    """A horn's readings with errors of each sort, and which are wrong by ten decibels and more at the instrument."""
+    """A horn's readings with errors of each kind, and which are wrong by ten decibels and more at the instrument."""
     rng, none = np.random.default_rng(seed), np.zeros(0, int)
     floor = np.asarray(readings.floor)
     chosen, sign = rng.random(len(readings)) < 0.1, rng.choice([-1.0, 1.0], len(readings))
@@ -186,11 +186,11 @@ class Room:
         for k, place in enumerate(places):
             self.fits.job.progress("paths", k, len(places))
             paths = engine.solve(place)
-            sent = directions_from_angles(*paths["aod"].T)
+            departure = directions_from_angles(*paths["aod"].T)
             like = table_of(kind, ds, place[None], np.ones((1, count)))
-            for first in range(0, len(sent), AT_ONCE):
+            for first in range(0, len(departure), AT_ONCE):
                 part = slice(first, first + AT_ONCE)
-                arrive = paths["arrival"][part], sent[part], paths["tau"][part]
+                arrive = paths["arrival"][part], departure[part], paths["tau"][part]
                 found[k] += path_weights(like, np.arange(count), *arrive) @ paths["power"][part]
         return {"power": found}
 

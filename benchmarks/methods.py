@@ -67,7 +67,7 @@ class Task:
         test: receivers that will be asked for; their spectra are not looked at.
         geometry: what is known of the room.
         scratch: folder for files that a method needs meanwhile.
-        progress: told of ``"transport"``, ``"fit"`` and ``"evaluate"``.
+        progress: called with ``"transport"``, ``"fit"`` and ``"evaluate"``.
         slot: where the geometry keeps what the test receivers see.
         variant: which of the method's variants.
         seed: of every random choice.
@@ -118,7 +118,7 @@ class Method:
         fit: learns from a task.
         code: which of :data:`~benchmarks.data.VERSIONS` its figures depend on, with that of the metrics.
         variants: of which the better one counts.
-        network: whether it is a network, which trains for as many steps as it is told.
+        network: whether it is a network, which trains for as many steps as it is given.
         untaught: whether it sees no spectrum: one run for all numbers of training receivers.
     """
 
@@ -169,18 +169,18 @@ def _harmonic(task: Task, model: str, **options: Any) -> Fitted:
     Blending weights of the test receivers are computed beforehand for all variants; the time of a spectrum from nothing
     includes them. Where opacity was trained they are the field's own, computed as it is asked.
     """
-    place, told = task.geometry, task.progress
+    place, progress = task.geometry, task.progress
     if task.effort.harmonic_iterations is not None:
         options["iterations"] = task.effort.harmonic_iterations
-    weights, seconds = place.weights(task.train, progress=told)
+    weights, seconds = place.weights(task.train, progress=progress)
     learned: Any = wr.RadioField.fit(
         place.reconstruction, task.train, model=model, transport=weights, gain=task.variant, seed=task.seed,
-        device=place.device, progress=told, **options,
+        device=place.device, progress=progress, **options,
     )  # fmt: skip
     fitted = Fitted(learned.spectrum, transport_s=seconds, fit_s=learned.report["fit_time_s"], field=learned)
     if learned.report["train_opacity"]:
         return fitted
-    seen, seconds = place.weights(task.test, slot=task.slot, progress=told)
+    seen, seconds = place.weights(task.test, slot=task.slot, progress=progress)
     return replace(
         fitted,
         predict=lambda rx: learned.spectrum(rx, transport=seen.at(rx)),
@@ -212,11 +212,11 @@ def _transmitter(task: Task) -> Fitted:
             toward[None], np.array([friis]), ds.shape, ds.beam_sigma_rad, device=task.geometry.device
         )
         departure = np.stack(angles_from_directions(-toward)).astype(np.float32)
-        lit = gain > 0
+        has_power = gain > 0
         return Spectrum(
             path_gain=gain.astype(np.float32),
-            delay_s=np.where(lit, distance / SPEED_OF_LIGHT, np.nan),
-            aod=np.where(lit[..., None], departure, np.float32(np.nan)),
+            delay_s=np.where(has_power, distance / SPEED_OF_LIGHT, np.nan),
+            aod=np.where(has_power[..., None], departure, np.float32(np.nan)),
             floor=ds.floor,
             range_db=ds.range_db,
         )

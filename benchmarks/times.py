@@ -166,7 +166,7 @@ class Verb:
         name: as tables have it.
         call: what is measured.
         needs: attributes of :class:`Room` that stand ready before.
-        times: how often it is called; the first and the last call are told.
+        times: how often it is called; the first and the last call are reported.
     """
 
     name: str

@@ -14,7 +14,7 @@
 # %% [markdown]
 # # From photos of a lobby to a radio field
 #
-# A radio radiance field answers, for any receiver in a room: which paths arrive, from where, sent towards where, how
+# A radio radiance field answers, for any receiver in a room: which paths arrive, from where, how they left the transmitter, how
 # strong, how late. This notebook builds one from two things: **photos** of the room and **a few radio spectra**
 # measured in it. It runs on a CPU, on the photos of one part of the room and with few optimisation steps, so its
 # figures are worse than those of `make lobby`; every step is the same.

@@ -86,13 +86,15 @@ print(f"fitted to {len(train)} receivers in {time.perf_counter() - start:.1f} s"
 # Elements are isotropic here, so an upright array cannot tell front from back: a beam has a twin behind it.
 
 # %%
-array = wr.PlanarArray(16, 16, orientation=wr.orientation_towards([1.0, 0.0, 0.0]))
+array = wr.PlanarArray(16, 16, orientation=wr.channel.orientation_towards([1.0, 0.0, 0.0]))
 azimuth = np.radians(np.linspace(-90, 90, 721))
 around = np.stack([np.cos(azimuth), np.sin(azimuth), np.full_like(azimuth, 0.03)], axis=-1)
 around /= np.linalg.norm(around, axis=-1, keepdims=True)
 figure, axes = plt.subplots(1, 2, figsize=(13, 3.3), sharey=True)
 for ax, oversampling in zip(axes, (1, 2), strict=True):
-    pattern = 10 * np.log10(np.abs(wr.dft_codebook(array, oversampling).amplitude(around)) ** 2 + 1e-9)
+    pattern = 10 * np.log10(
+        np.abs(wr.channel.dft_codebook(array, oversampling).amplitude(around)) ** 2 + 1e-9
+    )
     level = pattern[pattern.max(axis=1) > 20]
     ax.plot(np.degrees(azimuth), level.T, linewidth=0.8)
     ax.plot(np.degrees(azimuth), pattern.max(axis=0), color="black", linewidth=2)
@@ -122,8 +124,8 @@ level = (dataset.transmitter - dataset.receivers.mean(axis=0)) * [1, 1, 0]
 
 def book(side, toward):
     """Codebook of a square array, oversampled twice; one beam for a single element."""
-    array = wr.PlanarArray(side, side, orientation=wr.orientation_towards(toward))
-    return wr.dft_codebook(array, 2 if side > 1 else 1)
+    array = wr.PlanarArray(side, side, orientation=wr.channel.orientation_towards(toward))
+    return wr.channel.dft_codebook(array, 2 if side > 1 else 1)
 
 
 arrays = {f"rx {n * n}": (book(1, -level), book(n, level)) for n in (4, 8, 16, 32)}
@@ -131,7 +133,7 @@ arrays |= {f"tx {n * n}": (book(n, -level), book(1, level)) for n in (4, 8, 16, 
 arrays["tx 64, rx 64"] = book(8, -level), book(8, level)
 rx_book = arrays["rx 256"][1]
 paths = field.paths(receiver)
-choice = wr.select_beams(paths, rx_array=rx_book, count=3)
+choice = wr.channel.select_beams(paths, rx_array=rx_book, count=3)
 print(
     f"blocked receiver: {len(paths.gain)} paths; best beams {choice.rx} with {10 * np.log10(choice.gain).round(1)} dB"
 )
@@ -144,7 +146,7 @@ zenith, turn = np.meshgrid(
     (np.arange(60) + 0.5) * np.pi / 60, -np.pi + (np.arange(120) + 0.5) * np.pi / 60, indexing="ij"
 )
 sphere = np.stack([np.sin(zenith) * np.cos(turn), np.sin(zenith) * np.sin(turn), np.cos(zenith)], axis=-1)
-one = wr.Codebook(rx_book.array, (rx_book.beam(choice.rx[0])[None],))
+one = wr.channel.Codebook(rx_book.array, (rx_book.beam(choice.rx[0])[None],))
 shown = 10 * np.log10(np.abs(one.amplitude(sphere.reshape(-1, 3))[0]) ** 2 + 1e-3).reshape(60, 120)
 image = axes[2].imshow(shown, extent=(-180, 180, 180, 0), aspect="auto", vmin=0, vmax=24)
 figure.colorbar(image, ax=axes[2], label="gain [dB]")
@@ -178,14 +180,14 @@ def true_paths(index):
     )
     arrival = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
     away = (arrival @ specular.arrival.T).max(axis=-1, initial=-1) < np.cos(5 * test.beam_sigma_rad)
-    lit = away & (spectrum.path_gain > test.floor) & np.isfinite(spectrum.delay_s)
-    power, tau = spectrum.path_gain[lit], spectrum.delay_s[lit]
-    turns = np.exp(2j * np.pi * np.random.default_rng(index).random(lit.sum()))
+    above = away & (spectrum.path_gain > test.floor) & np.isfinite(spectrum.delay_s)
+    power, tau = spectrum.path_gain[above], spectrum.delay_s[above]
+    turns = np.exp(2j * np.pi * np.random.default_rng(index).random(above.sum()))
     scattered = replace(
-        specular, gain=np.sqrt(power) * turns, tau=tau, theta_r=theta[lit], phi_r=phi[lit],
-        theta_t=spectrum.aod[lit][:, 0], phi_t=spectrum.aod[lit][:, 1],
-        vertices=np.full((lit.sum(), *specular.vertices.shape[1:]), np.nan),
-        kind=np.full(lit.sum(), "diffuse"), valid=np.ones(lit.sum(), bool), jones=None,
+        specular, gain=np.sqrt(power) * turns, tau=tau, theta_r=theta[above], phi_r=phi[above],
+        theta_t=spectrum.aod[above][:, 0], phi_t=spectrum.aod[above][:, 1],
+        vertices=np.full((above.sum(), *specular.vertices.shape[1:]), np.nan),
+        kind=np.full(above.sum(), "diffuse"), valid=np.ones(above.sum(), bool), jones=None,
     )  # fmt: skip
     return specular, scattered
 
@@ -207,7 +209,7 @@ def gains(index, tx, rx):
 true_cache = {}
 worth = gains(blocked, *arrays["rx 256"])[:, :, 0]
 mean = 10 * np.log10(worth.mean(axis=0))
-expected = 10 * np.log10(wr.beam_gains(paths, rx_array=rx_book)[:, 0])
+expected = 10 * np.log10(wr.channel.beam_gains(paths, rx_array=rx_book)[:, 0])
 print(
     f"exhaustive search {mean.max():.1f} dB, our beam {mean[choice.rx[0]]:.1f} dB, the median beam {np.median(mean):.1f} dB"
 )
@@ -256,7 +258,7 @@ for name, (tx, rx) in arrays.items():
         worth = gains(index, tx, rx)
         results.setdefault((name, "exhaustive"), []).append(worth.mean(axis=0).max())
         for method, found in asked.items():
-            pick = wr.select_beams(found[k], tx, rx)
+            pick = wr.channel.select_beams(found[k], tx, rx)
             results.setdefault((name, method), []).append(worth[:, pick.rx[0], pick.tx[0]].mean())
 results = {key: np.array(value) for key, value in results.items()}
 
@@ -304,8 +306,8 @@ for first in range(0, RECEIVERS - 3, 4):
     group = range(first, first + 4)
     seen = [asked["our field"][k] for k in group]
     true = [gains(chosen[k], tx, rx).mean(axis=0)[0] for k in group]
-    alone = [wr.select_beams(p, tx) for p in seen]
-    together = wr.select_beams_multiuser(seen, tx, noise=1 / ratio)
+    alone = [wr.channel.select_beams(p, tx) for p in seen]
+    together = wr.channel.select_beams_multiuser(seen, tx, noise=1 / ratio)
     for how, beams in (("each for itself", [c.tx[0] for c in alone]), ("minding the others", together.tx)):
         heard = np.array([gain[beams] for gain in true])  # of each user in each one's beam
         wanted = np.diag(heard)

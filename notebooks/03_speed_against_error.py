@@ -93,7 +93,7 @@ room = wr.Gaussians(
     means, np.tile([1.0, 0, 0, 0], (3_000, 1)), scales, rng.uniform(0.3, 0.95, 3_000), np.zeros((3_000, 1, 3))
 )
 gains = 10 ** ((-35 + 15 * np.sin(1.3 * means[:, 0]) * np.cos(1.7 * means[:, 1])) / 10)
-RADIO = wr.Blending(alpha_min=1e-4, alpha_max=1 - 1e-6, transmittance_min=1e-7)
+RADIO = wr.splats.Blending(alpha_min=1e-4, alpha_max=1 - 1e-6, transmittance_min=1e-7)
 
 
 def panorama(shape):
@@ -120,7 +120,7 @@ def rows_of(values, make, truth, shown=str):
 
 def of_strongest(k):
     """The image of the strongest `k` Gaussians of each pixel."""
-    found = wr.blend_weights(room, panorama((30, 60)), top_k=k, blending=RADIO)
+    found = wr.splats.blend_weights(room, panorama((30, 60)), top_k=k, blending=RADIO)
     return (found.weight * np.where(found.index >= 0, gains[found.index], 0)).sum(axis=-1)
 
 

@@ -2,34 +2,31 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
+import pytest
 import warp as wp
 
-from warprrf.device import MIN_SPLIT, launch
+from warprrf import device as module
 
-COUNT = 5 * MIN_SPLIT + 3  # cut unevenly wherever there are threads
+COUNT = 5 * module.MIN_SPLIT + 3  # cut unevenly wherever there are threads
 
 
 @wp.kernel(enable_backward=False)
-def add_scaled(offset: int, factor: float, x: wp.array(dtype=float), out: wp.array(dtype=float)):
+def count_visits(offset: int, visits: wp.array(dtype=int)):
     i = offset + wp.tid()
-    out[i] = out[i] + factor * x[i] + float(i)
+    visits[i] = visits[i] + i + 1
 
 
-def scaled(device, **how):
-    x = np.random.default_rng(0).random(COUNT, dtype=np.float32)
-    out = wp.zeros(COUNT, dtype=float, device=device)
-    launch(add_scaled, COUNT, [2.0, wp.array(x, dtype=float, device=device), out], device=device, **how)
-    return out.numpy(), 2.0 * x + np.arange(COUNT, dtype=np.float32)
-
-
-def test_every_index_is_run_once(device):
-    for how in ({}, {"grain": 1}, {"pieces": 7}):
-        found, expected = scaled(device, **how)
-        np.testing.assert_allclose(found, expected, rtol=1e-6)
-
-
-def test_given_cuts_hold():
-    found, expected = scaled("cpu", cuts=[3, 3, 40, 50])
+@pytest.mark.parametrize("how", [{}, {"grain": 1}, {"pieces": 7}, {"cuts": [200, 250, 250, 300]}])
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_launch_visits_every_index_of_its_range_once(how, count, device, monkeypatch):
+    first, last = (200, 300) if "cuts" in how and device == "cpu" else (0, COUNT)
+    with ThreadPoolExecutor(3) as pool:
+        monkeypatch.setattr(module, "threads", lambda: count)
+        monkeypatch.setattr(module, "_pool", lambda: pool)
+        visits = wp.zeros(COUNT, dtype=int, device=device)
+        module.launch(count_visits, COUNT, [visits], device=device, **how)
     index = np.arange(COUNT)
-    np.testing.assert_allclose(found, np.where((index >= 3) & (index < 50), expected, 0.0), rtol=1e-6)
+    assert np.array_equal(visits.numpy(), np.where((index >= first) & (index < last), index + 1, 0))

@@ -3,6 +3,7 @@
 import ast
 import inspect
 import json
+import pydoc
 import re
 import sys
 import textwrap
@@ -11,6 +12,7 @@ from functools import reduce
 from pathlib import Path
 
 import pytest
+from fuzz.calls import public
 from places import ROOT
 
 import warprrf as wr
@@ -137,11 +139,28 @@ def test_python_in_the_readme_is_short():
 
 
 def test_names_of_the_reference_are_reached_as_it_prints_them():
-    listed = set(re.findall(r" as (\w+)$", (ROOT / "warprrf/__init__.pyi").read_text(), re.MULTILINE))
-    found = re.findall(r"^\.\. auto\w+:: \w+\.(\S+)", "\n".join(reference.pages().values()), re.MULTILINE)
+    found = re.findall(r"^\.\. auto\w+:: (\S+)", "\n".join(reference.pages().values()), re.MULTILINE)
     assert len(found) > 80
-    for first, *rest in (name.split(".") for name in found):
-        assert first in listed and reduce(getattr, rest, getattr(wr, first)), (first, *rest)
+    assert [name for name in found if pydoc.locate(name) is None] == []
+
+
+def test_terms_of_the_glossary_are_those_of_the_library():
+    terms = re.findall(
+        r"^\| (?!term)([^|]+) \| [^|]+\. \|", (ROOT / "docs/glossary.md").read_text(), re.MULTILINE
+    )
+    assert len(terms) >= 50 and len(terms) == len(set(terms))
+    texts = [p.read_text() for p in (*(ROOT / "warprrf").rglob("*.py"), *PAGES) if p.stem != "glossary"]
+    used = re.sub(r"[\s_-]+", " ", " ".join(texts)).lower()
+    words = [word for term in terms for word in term.split(", ")]
+    assert [word for word in words if re.sub(r"[\s_-]+|\$.*", " ", word).strip().lower() not in used] == []
+
+
+def test_public_names_are_words_of_the_field():
+    own = "look skin crumb sort sent shown told recipe adopt tied lit".split()
+    calls = {name: inspect.signature(call).parameters for name, call in public().items()}
+    assert [
+        n for call, given in calls.items() for n in (call, *given) if {*re.split(r"[._]", n)} & {*own}
+    ] == []
 
 
 def test_commands_on_pages_are_taken_by_the_parser():

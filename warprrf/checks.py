@@ -200,8 +200,8 @@ def users_level() -> int:
 
 def some_of(rows: Sequence[int] | np.ndarray, most: int = 8) -> str:
     """Rows of a table, for a message: the first ones and how many more."""
-    told = ", ".join(str(int(row)) for row in rows[:most])
-    return told + f" and {len(rows) - most} more" * (len(rows) > most)
+    text = ", ".join(str(int(row)) for row in rows[:most])
+    return text + f" and {len(rows) - most} more" * (len(rows) > most)
 
 
 LARGEST_M = 1e8
@@ -248,8 +248,8 @@ def check_arrays(
             sizes = dict(zip(axes, array.shape, strict=True)) | sizes
         shape = tuple(int(axis) if axis.isdigit() else sizes.get(axis) for axis in axes)
         if array.shape != shape:
-            told = ", ".join(str(axis if n is None else n) for axis, n in zip(axes, shape, strict=True))
-            raise ValueError(f"{name}: got shape {array.shape}, expected ({told})")
+            text = ", ".join(str(axis if n is None else n) for axis, n in zip(axes, shape, strict=True))
+            raise ValueError(f"{name}: got shape {array.shape}, expected ({text})")
     for name, wanted in expected.items():
         array = np.asarray(arrays[name])
         most = sizes[wanted.index] - 1 if wanted.index else wanted.most
@@ -310,7 +310,7 @@ def _checked_call(function: Callable[..., Any], annotated: Any) -> Callable[...,
         if name in parameters and value is parameters[name].default:
             return value
         expected = function.__annotations__.get(name, "another type")
-        raise TypeError(f"{name}: got {_shown(value)}, expected {expected}")
+        raise TypeError(f"{name}: got {_described(value)}, expected {expected}")
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -330,7 +330,7 @@ def _checked_call(function: Callable[..., Any], annotated: Any) -> Callable[...,
 _OTHER = object()  # what does not fit its annotation
 
 
-def _shown(value: object) -> str:
+def _described(value: object) -> str:
     """A value by its type, and as it is written where that is short."""
     written = f" {value!r}" if isinstance(value, (str, bytes, numbers.Number)) else ""
     return type(value).__name__ + (written if len(written) < 60 else "")

@@ -1,8 +1,7 @@
 """Public names that are imported when first used, listed once: in the stub beside a package's ``__init__.py``.
 
 Type checkers read the stub as it stands. At run time its lines give the package's attributes and its table of contents:
-``# == heading ==`` begins a section, ``# text`` says what the name imported below is for. Names of the last section,
-``# == kept ==``, work but are not listed.
+``# == heading ==`` begins a section, ``# text`` says what the name imported below is for.
 """
 
 from __future__ import annotations
@@ -25,18 +24,16 @@ def attach(file: str, about: str) -> tuple[Callable[[str], Any], Callable[[], li
     """
     homes: dict[str, tuple[str, str]] = {}
     contents: list[tuple[str, str]] = []  # name and text; headings have no text
-    text, listed = "", True
+    text = ""
     for line in Path(file).with_suffix(".pyi").read_text(encoding="utf-8").splitlines():
         if line.startswith("# =="):
-            heading = line.strip("#= ")
-            listed = heading != "kept"
-            contents += [(heading, "")] if listed else []
+            contents.append((line.strip("#= "), ""))
         elif line.startswith("# "):
             text = line.removeprefix("# ")
         elif found := _IMPORT.match(line):
             home, origin, name = found.groups()
             homes[name] = home, origin
-            contents += [(name, text)] if listed else []
+            contents.append((name, text))
     width = max(len(name) for name, text in contents)
     table = [f"    {name:{width}}  {text}" if text else f"\n{name}:" for name, text in contents]
 
@@ -50,6 +47,6 @@ def attach(file: str, about: str) -> tuple[Callable[[str], Any], Callable[[], li
         return getattr(module, origin)
 
     def listing() -> list[str]:
-        return sorted(name for name, text in contents if text)
+        return sorted(homes)
 
     return lookup, listing, "\n".join([about.rstrip(), *table, ""])

@@ -258,8 +258,8 @@ class Store:
                     n: (place, room.shape, np.dtype(room.dtype).str)
                     for n, (place, room) in self._places.items()
                 }
-                told = {"key": self._attributes["key"], "places": held, "rest": self._sum_of_rest()}
-                line = json.dumps(told).encode()
+                entry = {"key": self._attributes["key"], "places": held, "rest": self._sum_of_rest()}
+                line = json.dumps(entry).encode()
                 self._stream.seek(end)
                 self._stream.write(bytes(4 * count) + _LINE + line + b" %08x\n" % zlib.crc32(line))
                 self._stream.flush()
@@ -290,16 +290,16 @@ class Store:
             raise ValueError(
                 f"store: {path} is damaged, or no store of ours; name another file, or remove it"
             )
-        told = json.loads(line)
-        if told["key"] != self._attributes["key"]:
+        entry = json.loads(line)
+        if entry["key"] != self._attributes["key"]:
             raise ValueError(
                 f"store: {path} holds answers of another field, other places or other options; name another file, or "
                 "remove it"
             )
         self._places = {
-            n: (at, Room(tuple(s), np.dtype(kind))) for n, (at, s, kind) in told["places"].items()
+            n: (at, Room(tuple(s), np.dtype(kind))) for n, (at, s, kind) in entry["places"].items()
         }
-        self._rest = told["rest"]
+        self._rest = entry["rest"]
 
     def _sound_rows(self) -> np.ndarray:
         """Which rows of the open file are there as they were written, shape ``(count,)`` bool.

@@ -235,7 +235,7 @@ class Steps:
         return float(sum(self._record(name)["seconds"] for name in names or self._records))
 
     def stages(self, name: str) -> dict[str, float]:
-        """Wall time [s] by what step ``name`` told its progress callback."""
+        """Wall time [s] by what step ``name`` reported to its progress callback."""
         return dict(self._record(name)["stages"])
 
     def attempts(self, name: str) -> int:

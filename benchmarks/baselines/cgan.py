@@ -39,7 +39,7 @@ class CGANOptions:
     octaves: int = 4
 
     @property
-    def told(self) -> int:
+    def inputs(self) -> int:
         """Numbers that tell a position."""
         return 3 + 6 * self.octaves
 
@@ -67,7 +67,7 @@ def fit_cgan(data: SpectrumDataset, options: CGANOptions, how: Training) -> Trai
     for_generator, for_critic = (
         torch.optim.Adam(net.parameters(), lr=ADAM_RATE, betas=ADAM_DECAYS) for net in (generator, critic)
     )
-    images, told = torch.from_numpy(pictures(data))[:, None].to(where), tell(data.receivers)
+    images, inputs = torch.from_numpy(pictures(data))[:, None].to(where), tell(data.receivers)
     judge = torch.nn.functional.binary_cross_entropy_with_logits
 
     def draw(position: Any, noise: Any) -> Any:
@@ -85,7 +85,7 @@ def fit_cgan(data: SpectrumDataset, options: CGANOptions, how: Training) -> Trai
         noise = torch.from_numpy(rng.standard_normal((options.batch, options.noise), dtype=np.float32)).to(
             where
         )
-        shown, position = images[pick], told[pick]
+        shown, position = images[pick], inputs[pick]
         drawn = draw(position, noise)
         for_critic.zero_grad(set_to_none=True)
         (0.5 * (verdict(shown, position, True) + verdict(drawn.detach(), position, False))).backward()
@@ -110,7 +110,7 @@ def _generator(nn: Any, options: CGANOptions, shape: tuple[int, int], seed: int)
     widths = [options.channels * 2**k for k in range(DOUBLINGS, -1, -1)]
     with seeded(seed):
         first = nn.Sequential(
-            nn.Linear(options.told + options.noise, 4 * options.channels),
+            nn.Linear(options.inputs + options.noise, 4 * options.channels),
             nn.LeakyReLU(0.2),
             nn.Linear(4 * options.channels, widths[0] * rows * columns),
             nn.LeakyReLU(0.2),
@@ -132,7 +132,7 @@ def _generator(nn: Any, options: CGANOptions, shape: tuple[int, int], seed: int)
 def _discriminator(nn: Any, options: CGANOptions) -> Any:
     c = options.channels
     return nn.Sequential(
-        nn.Conv2d(1 + options.told, c, 4, stride=2, padding=1),
+        nn.Conv2d(1 + options.inputs, c, 4, stride=2, padding=1),
         nn.LeakyReLU(0.2),
         nn.Conv2d(c, 2 * c, 4, stride=2, padding=1),
         nn.GroupNorm(8, 2 * c),

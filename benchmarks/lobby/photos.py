@@ -38,7 +38,7 @@ NOISE_SEED = 10_000  # of second renders
 
 
 @contextmanager
-def _mitsuba(variant: str) -> Iterator[Any]:
+def mitsuba(variant: str) -> Iterator[Any]:
     """Mitsuba in ``variant``; afterwards in what was set before, or in what Sionna RT has to be imported in."""
     select_llvm()
     mi = require("mitsuba", extra="sionna")
@@ -93,7 +93,7 @@ def tone_map(radiance: np.ndarray, exposure: float = 1.5) -> np.ndarray:
 
 def render_positions(xml: str | os.PathLike[str], camera: Camera, *, spp: int = 4) -> np.ndarray:
     """Mean surface point that each pixel sees in Mitsuba [m], shape ``(height, width, 3)``; proves a pose."""
-    with _mitsuba(VARIANT) as mi:
+    with mitsuba(VARIANT) as mi:
         return _layers(mi, mi.load_file(str(xml)), camera, "position:position", None, spp, 0)
 
 
@@ -181,7 +181,7 @@ def render_photos(
     out_dir.mkdir(parents=True, exist_ok=True)
     if all((out_dir / name).is_file() for name in cameras):
         return
-    with _mitsuba(VARIANT) as mi:
+    with mitsuba(VARIANT) as mi:
         scene = mi.load_file(str(xml))
         for k, (name, camera) in enumerate(cameras.items()):
             if not (out_dir / name).is_file():

@@ -15,7 +15,7 @@ def test_the_bumpy_sphere_is_closed_wound_outward_and_seen_from_its_middle():
     mesh = bumpy_sphere(5_000)
     assert mesh.is_closed
     assert len(mesh.faces) == pytest.approx(5_000, rel=0.1)
-    winding, _ = mesh.look_around([[0.0, 0, 0], [9, 0, 0]], [[0.1, 0.2, 0.3]])
+    winding, _ = mesh.crossings([[0.0, 0, 0], [9, 0, 0]], [[0.1, 0.2, 0.3]])
     np.testing.assert_array_equal(winding, [[1], [0]])
 
 

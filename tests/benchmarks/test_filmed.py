@@ -42,10 +42,8 @@ def film(cameras, tmp_path_factory):
         pose = np.linalg.inv(c.world_to_camera)
         pose[:3] = TILT.T @ pose[:3]
         np.savetxt(folder / f"frame-{k:06d}.pose.txt", pose, fmt="%.7e")
-        d = c.directions()
-        with np.errstate(divide="ignore"):
-            t = np.where(d > 0, (HIGH - c.position) / d, (LOW - c.position) / d).min(axis=-1)
-        z = np.round(1e3 * t * (d @ c.rotation[2])).astype(np.uint16)
+        depth = views.range_in_box(c, LOW, HIGH) * (c.directions() @ c.rotation[2])
+        z = np.round(1e3 * depth).astype(np.uint16)
         z[:2] = 65535
         Image.fromarray(z).save(folder / f"frame-{k:06d}.depth.png")
         Image.new("RGB", (c.width, c.height)).save(folder / f"frame-{k:06d}.color.jpg")

@@ -85,15 +85,15 @@ def origin(error: Exception) -> str:
     return f"{Path(own[-1].filename).name}: {own[-1].name}" if own else "not in the library"
 
 
-def wrong(answer: Leaves, usual: Leaves) -> str:
+def wrong(answer: Leaves, usual: Leaves, unknown: tuple[str, ...] = ()) -> str:
     """Where ``answer`` holds NaN that the ``usual`` answer does not have there.
 
-    Attributes of a data set are the caller's own.
+    NaN is right where names end in one of ``unknown``. Attributes of a data set are the caller's own.
     A pixel of a spectrum from which nothing comes has no delay and no direction: these are NaN there. So is a thickness that
     nobody knows, as in older files of fields.
     """
     for where, array in answer.items():
-        if not _holds_nan(array) or ".attributes." in where or where.endswith(".thickness_m"):
+        if not _holds_nan(array) or ".attributes." in where or where.endswith((".thickness_m", *unknown)):
             continue
         gain = answer.get(where.rpartition(".")[0] + ".path_gain")
         if (

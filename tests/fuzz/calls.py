@@ -18,6 +18,9 @@ import numpy as np
 
 import warprrf as wr
 from fuzz.place import ANGLES, POINTS, READINGS, TOWARDS, Place
+from warprrf.rf.fields import BistaticField, HarmonicField
+from warprrf.rf.fields.bistatic.fit import FitOptions
+from warprrf.rf.fields.harmonic.options import FieldOptions
 
 IGNORED = ("progress", "ax", "client")
 """Arguments that are not mutated unless an example names them: a caller's own functions, matplotlib's axes."""
@@ -25,9 +28,11 @@ UNCHECKED = ("trace_links", "render", "sent_radiance", "check_positions")
 """Methods that are given what others checked or made, or that every verb asks."""
 PARTS = {"transformed": ("means", "vertices", "world_to_camera")}
 """What else a refusal may name: parts of what a method makes."""
+FIELDS = (BistaticField, FitOptions, HarmonicField, FieldOptions)
+"""What a fit makes and takes, which is documented and not of the package's table of contents."""
 OPTIONS_OF = ("FitOptions", "FieldOptions")
 """Classes whose options are what is public of them."""
-SERVERS = ("view", "Viewer")
+SERVERS = ("view",)
 """What starts a server for each call: the law of messages, and tests/viewer, have its refusals."""
 SPREADS = ("channel.angular_spread", "channel.coherence_bandwidth", "channel.delay_spread")
 """What is NaN where there is no power, as their documentation says."""
@@ -48,7 +53,7 @@ def public() -> dict[str, Callable[..., Any]]:
     """Every public function, class and method, by its name: ``Mesh``, ``Mesh.cast``, ``channel.thz_channel``."""
     found: dict[str, Callable[..., Any]] = {}
     homes: set[Any] = set()
-    for name, value in _names(wr, ""):
+    for name, value in [*_names(wr, ""), *((kind.__name__, kind) for kind in FIELDS)]:
         if not callable(value) or value in homes or name in SERVERS:
             continue
         homes.add(value)
@@ -155,26 +160,26 @@ CLASSES: dict[str, Callable[[Place], Any]] = {
     "SpectrumDataset": lambda p: p.spectra.subset([0, 1, 2]),
     **{f"{kind}Field": lambda p: p.field for kind in ("Radio", "Bistatic")},
     "HarmonicField": lambda p: p.harmonic,
-    "FitOptions": lambda p: wr.FitOptions(),
-    "FieldOptions": lambda p: wr.FieldOptions(),
+    "FitOptions": lambda p: FitOptions(),
+    "FieldOptions": lambda p: FieldOptions(),
     "PlanarArray": lambda p: wr.PlanarArray(2, 3, polarisation="VH"),
     "RadioMap": lambda p: p.map,
     "channel.ArraySpectra": lambda p: wr.channel.ArraySpectra(
         p.transmitter, POINTS, np.full((3, 2), 0.5), 300e9, p.array, TOWARDS
     ),
-    "channel.BeamChoice": lambda p: wr.select_beams(p.paths, p.codebook, p.array),
+    "channel.BeamChoice": lambda p: wr.channel.select_beams(p.paths, p.codebook, p.array),
     "channel.Dispersion": lambda p: p.paths.dispersion(),
     "channel.MultiUserChoice": lambda p: wr.channel.select_beams_multiuser(
         p.sources, p.codebook, p.array, noise=1e-12
     ),
     "channel.PlaneWaveError": lambda p: wr.channel.plane_wave_error(p.array, 3.0, 1e-3),
-    "channel.ThzChannel": lambda p: wr.thz_channel(1),
+    "channel.ThzChannel": lambda p: wr.channel.thz_channel(1),
     "em.Band": lambda p: BAND,
     "interop.SionnaPaths": lambda p: p.paths.to_sionna(),
     "interop.Twin": lambda p: wr.interop.Twin(Path("scene.xml"), 300e9, (), ()),
-    "splats.Blending": lambda p: wr.Blending(),
-    "splats.BlendWeights": lambda p: wr.blend_weights(p.gaussians, p.camera, top_k=4),
-    "splats.GaussianRays": lambda p: wr.GaussianRays(p.gaussians, device="cpu"),
+    "splats.Blending": lambda p: wr.splats.Blending(),
+    "splats.BlendWeights": lambda p: wr.splats.blend_weights(p.gaussians, p.camera, top_k=4),
+    "splats.GaussianRays": lambda p: wr.splats.GaussianRays(p.gaussians, device="cpu"),
     "splats.Rasterizer": lambda p: p.raster,
     "lookups.Lookup": lambda p: wr.lookups.nearest(p.train),
 }
@@ -278,7 +283,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     },
     "RadioMap.load": lambda p: {"path": p.folder / "map.nc"},
     "RadioMap.picture": lambda p: {"path": "map.png"},
-    "RadioMap.shown": lambda p: {"quantity": "total_path_gain"},
+    "RadioMap.plot_values": lambda p: {"quantity": "total_path_gain"},
     "Relevance.load": lambda p: {"path": p.folder / "relevance.json"},
     "Relevance.reduce": lambda p: {"full": p.field},
     # channels

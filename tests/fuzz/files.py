@@ -86,7 +86,7 @@ def damage(path: Path, codec: str, edits: tuple[Edit, ...]) -> None:
     """Edit a file in place.
 
     Raises:
-        Unfit: if the codec cannot write what was made of the contents.
+        Unfit: if the codec cannot write what was made of the contents, or there is none.
     """
     for name, a, b in edits:
         if name in BYTES:
@@ -95,6 +95,8 @@ def damage(path: Path, codec: str, edits: tuple[Edit, ...]) -> None:
                 BYTES[name](data, a, b)
             path.write_bytes(data)
             continue
+        if not codec:
+            raise Unfit("bytes only")
         unpack, pack = CODECS[codec]
         try:
             tree = unpack(path)
@@ -222,6 +224,7 @@ class Format:
             changes one value of the first part that is read (four numbers of a quaternion) at most, a cut nothing.
             "whole": a cut changes nothing. "numbers": what is read is numbers.
         held: attributes of what was read that its answers may be refused by.
+        unknown: ends of the names of numbers that may be NaN, as a file may say that they were not measured.
     """
 
     make: Callable[[Place, Path], Path]
@@ -229,6 +232,7 @@ class Format:
     codec: str = ""
     law: str = ""
     held: tuple[str, ...] = ()
+    unknown: tuple[str, ...] = ()
 
 
 def _copy(*names: str) -> Callable[[Place, Path], Path]:
@@ -345,8 +349,12 @@ COLMAP = ("cameras", "images", "points3D")
 READINGS = {"frequency_hz": 300e9, "floor": 1e-14}
 
 FORMATS: dict[str, Format] = {
-    "spectra": Format(_copy("spectra.nc"), wr.SpectrumDataset.load, "netcdf", "sealed"),
-    "compact spectra": Format(_copy("compact.nc"), wr.SpectrumDataset.load, "netcdf", "sealed"),
+    **{
+        f"{how}spectra": Format(
+            _copy(file), wr.SpectrumDataset.load, "netcdf", "sealed", unknown=(".path_gain", ".delay_s", ".aod")
+        )
+        for how, file in (("", "spectra.nc"), ("compact ", "compact.nc"))
+    },
     **{
         f"{name} field": Format(_copy(f"{name}.safetensors"), _field, "tensors", "sealed", ("transmitter",))
         for name in ("bistatic", "harmonic", "rf3dgs")
@@ -359,7 +367,9 @@ FORMATS: dict[str, Format] = {
     ),
     "radio map": Format(_copy("map.nc"), wr.RadioMap.load, "netcdf", "sealed"),
     "relevance": Format(_copy("relevance.json"), wr.Relevance.load, "json"),
-    "step arrays": Format(_made("step.npz", lambda place, path: _cached(path)), _cached, "zip", "sealed"),
+    "step arrays": Format(
+        _made("step.npz", lambda place, path: _cached(path)), _cached, "zip", "sealed", unknown=("",)  # of any kind
+    ),
     "step record": Format(_made(".steps/step.json", lambda place, path: _recorded(path)), _recorded, "json"),
     **{
         f"arrays, {how}": Format(

@@ -65,7 +65,9 @@ def _rooms(place: Place, edits: tuple[Edit, ...]) -> str:
     changed = rooms.ROOMS[room]().with_gaussians()
     for law in laws:
         changed = rooms.LAWS[law](changed)
-    now, before = rooms.FIGURES[figure](changed), _before(room, figure)
+    with rooms.rays_turned(changed.rotation) if figure == "exact" else contextlib.nullcontext():
+        now = rooms.FIGURES[figure](changed)
+    before = _before(room, figure)
     most = sum(rooms.most_db(figure, law) for law in laws)
     total = rooms.total_change_db(now, before)
     rms = 0.0 if changed.turned is None or figure == "mirrors" else rooms.rms_change_db(now, before)
@@ -209,7 +211,7 @@ def _kept(place: Place, pattern: Any) -> Any:
 
 PATTERNS: dict[str, Callable[[Place, Any], Any]] = {
     "gain": lambda place, pattern: _element(pattern).gain(TOWARDS),
-    "codebook": lambda place, pattern: wr.dft_codebook(_element(pattern)).power(TOWARDS, np.array([1e-9, 2e-9])),
+    "codebook": lambda place, pattern: wr.channel.dft_codebook(_element(pattern)).power(TOWARDS, np.array([1e-9, 2e-9])),
     "paths": lambda place, pattern: place.paths.cfr(np.array([300e9]), tx_array=_element(pattern)),
     "cfr": lambda place, pattern: place.field.cfr(POINTS, [300e9], rx_array=_element(pattern), diffuse="power", max_paths=9),
     "stored cfr": _kept,

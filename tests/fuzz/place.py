@@ -165,6 +165,6 @@ MADE: dict[str, Callable[[Place], Any]] = {
     "path_gain": lambda p: np.asarray(p.spectra.path_gain[0], dtype=float),
     "prediction": _unit,
     "truth": lambda p: p.prediction[::-1].copy(),
-    "raster": lambda p: wr.Rasterizer(device="cpu"),
+    "raster": lambda p: wr.splats.Rasterizer(device="cpu"),
     "uploaded": _uploaded,
 }

@@ -83,7 +83,7 @@ CHECKED = {
     "simulate": "scene seed transmitter receivers frequency_hz", "sample_receivers": "scene n z clearance seed",
     "trace_paths": "mesh_or_scene mirror_order transmitter receivers frequency_hz", "RadioField.fit": "ds",
     "render": "g cam", "splats.blend_weights": "g cam top_k", "Mesh": "vertices faces", "Mesh.cast": "origins directions",
-    "Mesh.visible": "a b clearance", "Mesh.closest": "points", "Mesh.look_around": "points directions",
+    "Mesh.visible": "a b clearance", "Mesh.closest": "points", "Mesh.crossings": "points directions",
     "Mesh.cross_section": "height", "Paths.taps": "bandwidth_hz l_min l_max", "Paths.cfr": "frequencies_hz",
     "em.gas_attenuation_db_per_m": "frequency_hz", "Air": "temperature_k pressure_hpa water_vapour_g_m3",
     "lookups.nearest": "train", "lookups.mean": "train", "evaluate": "test", "em.lobe": "alpha_r",
@@ -99,7 +99,7 @@ def test_what_is_no_argument_is_refused_by_its_name(attempt, name):
 
 
 FOUND = """
-Mesh.look_around: directions=as bool, points=no rows; Paths.taps: center_hz=huge; Paths.select: chosen=2^63
+Mesh.crossings: directions=as bool, points=no rows; Paths.taps: center_hz=huge; Paths.select: chosen=2^63
 BistaticField.at_frequency: frequency_hz=tiny; RadioField.cfr: client=true; RadioField.fit: relevance=text
 RadioField.links: shape=with -inf; RadioField.load: path=no text; RadioField.suggest: candidates=with 1e+09
 Readings: chain=ragged; Readings.from_table: table=list; SpectrumDataset.empty: frequency_hz=tiny
@@ -124,6 +124,20 @@ def test_what_was_found_once_is_right_now(attempt, case):
     target, _, edits = case.partition(": ")
     outcome = attempt(Case(target, tuple(tuple(edit.split("=")) for edit in edits.split(", "))))
     assert outcome.kind in ("refused", "answered"), outcome.text
+
+
+@pytest.mark.parametrize(
+    ("target", "edits", "kind"),
+    [
+        ("file: arrays, plain", [("double", 269, 44445), ("double", 1974, 16233)], "unfit"),
+        ("file: compact spectra", [("rename", 663, 1025619944), ("blank", 378031391, 141595)], "answered"),
+        ("law: rooms", [("turned by a quarter", 12321, 380152463)], "answered"),
+    ],
+)
+def test_what_was_wrongly_found_is_no_finding(attempt, target, edits, kind):
+    """Bytes alone have no contents; a fill value of zero makes pixels of zero not measured; a lattice of rays is none of
+    the room's."""
+    assert attempt(Case(target, tuple(edits))).kind == kind
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -172,6 +186,7 @@ def test_nan_is_a_finding_where_it_is_not_usual():
     usual = leaves({"a": np.array([1.0, np.nan]), "b": 1.0})
     assert not wrong(leaves({"a": np.array([np.nan]), "b": 2.0}), usual)
     assert "b" in wrong(leaves({"a": np.array([1.0]), "b": np.nan}), usual)
+    assert not wrong(leaves({"a": np.array([1.0]), "b": np.nan}), usual, (".b",))
     delay = np.array([[1e-9, np.nan]])  # of an empty pixel alone
     assert not wrong(leaves({"path_gain": np.array([[1.0, 0.0]]), "delay_s": delay}), {})
     assert "delay_s" in wrong(leaves({"path_gain": np.array([[1.0, 1.0]]), "delay_s": delay}), {})

@@ -119,7 +119,7 @@ class Trial:
         answer = asked(lambda: form.read(path))
         if isinstance(answer, Exception):
             return refused(answer, [path.name, str(path.parent), *form.held])
-        bad = "" if form.codec == "zip" else wrong(answer, usual)  # arrays of any kind may hold NaN
+        bad = wrong(answer, usual, form.unknown)
         edit = case.edits[0][0].removesuffix(" early")
         if not bad and form.law and len(case.edits) == 1 and edit in BYTES:
             if form.law == "sealed" or (edit == "cut" and form.law != "numbers"):

@@ -291,7 +291,7 @@ def test_distance_to_a_box_from_outside_and_inside():
 def test_winding_number_counts_the_solids_around_a_point():
     mesh, _ = joined(box_mesh((-1, -1, -1), (1, 1, 1)), box_mesh((-2, -2, -2), (3, 2, 2)))
     towards = np.random.default_rng(0).normal(size=(20, 3))
-    number, _ = mesh.look_around([[0.1, 0.2, 0.3], [2.5, 0.1, 0.2], [9, 0, 0]], towards)
+    number, _ = mesh.crossings([[0.1, 0.2, 0.3], [2.5, 0.1, 0.2], [9, 0, 0]], towards)
     np.testing.assert_array_equal(number, np.tile([[2], [1], [0]], 20))
 
 

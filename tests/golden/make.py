@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -155,13 +156,15 @@ def places(count: int) -> np.ndarray:
     return np.stack([x, y, np.linspace(1.0, 1.8, count)], axis=1)
 
 
+def links(count: int) -> dict[str, Any]:
+    """The transmitter, ``count`` receivers and the carrier."""
+    return {"transmitter": TRANSMITTER, "receivers": places(count), "frequency_hz": CARRIER_HZ}
+
+
 @cache
 def spectra() -> wr.SpectrumDataset:
     """Spectra of eight receivers by the exact engine."""
-    return wr.simulate(
-        room(), transmitter=TRANSMITTER, receivers=places(8), frequency_hz=CARRIER_HZ, shape=SHAPE,
-        beam_sigma_rad=BEAM_RAD,
-    )  # fmt: skip
+    return wr.simulate(room(), **links(8), shape=SHAPE, beam_sigma_rad=BEAM_RAD)
 
 
 @cache
@@ -208,31 +211,30 @@ def _each(paths: Iterable[wr.Paths], prefix: str) -> Values:
     return {f"{name}_{key}": value for name, of_one in found.items() for key, value in of_one.items()}
 
 
+def _image(out: Any) -> Values:
+    found: Values = {name: (getattr(out, name), PIXELS) for name in ("features", "alpha", "depth")}
+    return found | {"dominant": (out.dominant, Check(outliers=0.005))}
+
+
 @case
 def render_pinhole() -> Values:
     out = wr.render(gaussians(), pinhole(), background=np.array([0.1, 0.2, 0.3]))
     features = wr.render(gaussians(), pinhole(), features=np.linspace(-1, 1, 400 * 2).reshape(400, 2))
-    return {
-        "features": (out.features, PIXELS), "alpha": (out.alpha, PIXELS), "depth": (out.depth, PIXELS),
-        "dominant": (out.dominant, Check(outliers=0.005)), "given": (features.features, PIXELS),
-    }  # fmt: skip
+    return {**_image(out), "given": (features.features, PIXELS)}
 
 
 @case
 def render_spherical() -> Values:
     out = wr.render(gaussians(), wr.Camera.spherical(48, 24, position=(0.1, 0.2, 0.3)))
     exp = wr.render(
-        gaussians(), wr.Camera.spherical(48, 24, position=(0, 0, 0)), blending=wr.Blending(rule="exp")
+        gaussians(), wr.Camera.spherical(48, 24, position=(0, 0, 0)), blending=wr.splats.Blending(rule="exp")
     )
-    return {
-        "features": (out.features, PIXELS), "alpha": (out.alpha, PIXELS), "depth": (out.depth, PIXELS),
-        "dominant": (out.dominant, Check(outliers=0.005)), "exp": (exp.features, PIXELS),
-    }  # fmt: skip
+    return {**_image(out), "exp": (exp.features, PIXELS)}
 
 
 @case
 def blending_weights() -> Values:
-    found = wr.blend_weights(gaussians(), wr.Camera.spherical(24, 12, position=(0, 0, 0)), top_k=4)
+    found = wr.splats.blend_weights(gaussians(), wr.Camera.spherical(24, 12, position=(0, 0, 0)), top_k=4)
     return {
         "index": (found.index, Check(outliers=0.005)), "weight": (found.weight, PIXELS),
         "range": (found.range, PIXELS), "alpha": (found.alpha, PIXELS),
@@ -242,7 +244,7 @@ def blending_weights() -> Values:
 @case
 def gaussian_rays() -> Values:
     r = np.random.default_rng(1)
-    rays = wr.GaussianRays(gaussians())
+    rays = wr.splats.GaussianRays(gaussians())
     origins, ends = r.normal(0, 3, (40, 3)), r.normal(0, 3, (40, 3))
     hits = rays.hits(origins, ends - origins, k=8)
     named = {k: np.asarray(v) for k, v in vars(hits).items() if isinstance(v, np.ndarray)}
@@ -304,7 +306,7 @@ def gas() -> Values:
     f = np.array([60e9, 140e9, 183.3e9, 300e9, 325e9])
     air = wr.Air(temperature_k=293.0, pressure_hpa=1000.0, water_vapour_g_m3=10.0)
     return {
-        "standard": (wr.gas_attenuation_db_per_m(f), FLOAT64),
+        "standard": (wr.em.gas_attenuation_db_per_m(f), FLOAT64),
         "air": (air.attenuation_db_per_m(f), FLOAT64),
         "transmittance": (air.transmittance(CARRIER_HZ, np.array([1.0, 10.0, 100.0])), FLOAT64),
     }
@@ -324,20 +326,13 @@ def materials() -> Values:
 
 @case
 def paths_of_a_mesh() -> Values:
-    link = {"transmitter": TRANSMITTER, "receivers": places(4)[1], "frequency_hz": CARRIER_HZ}
+    link = links(4) | {"receivers": places(4)[1]}
     return _each((wr.trace_paths(room_mesh()[0], **link, mirror_order=k) for k in (0, 1, 2)), "order")
 
 
 @case
 def paths_of_a_scene() -> Values:
-    paths = wr.trace_paths(
-        room(),
-        transmitter=TRANSMITTER,
-        receivers=places(4),
-        frequency_hz=CARRIER_HZ,
-        mirror_order=2,
-        gas=True,
-    )
+    paths = wr.trace_paths(room(), **links(4), mirror_order=2, gas=True)
     return _each(paths.each(), "receiver")
 
 
@@ -357,11 +352,11 @@ def paths_of_the_lobby() -> Values:
 
 @case
 def path_files_and_other_shapes() -> Values:
-    paths = wr.trace_paths(room(), transmitter=TRANSMITTER, receivers=places(3), frequency_hz=CARRIER_HZ)
+    paths = wr.trace_paths(room(), **links(3))
     with tempfile.TemporaryDirectory() as folder:
         paths.save(Path(folder) / "paths.nc")
         back = wr.Paths.load(Path(folder) / "paths.nc")
-        written = wr.write_deepmimo(paths, Path(folder) / "deepmimo", scene=room())
+        written = wr.interop.write_deepmimo(paths, Path(folder) / "deepmimo", scene=room())
         names = sorted(p.name for p in Path(written).rglob("*") if p.is_file())
     sionna = paths.to_sionna()
     spread = paths.dispersion()
@@ -377,9 +372,7 @@ def path_files_and_other_shapes() -> Values:
 
 @case
 def channels() -> Values:
-    paths = wr.trace_paths(
-        room(), transmitter=TRANSMITTER, receivers=places(2), frequency_hz=CARRIER_HZ, mirror_order=2
-    )
+    paths = wr.trace_paths(room(), **links(2), mirror_order=2)
     tx = wr.PlanarArray(2, 2, orientation=(0.5, 0.0, 0.0), pattern="tr38901", polarisation="V")
     rx = wr.PlanarArray(1, 2, orientation=(-2.0, 0.0, 0.0), polarisation="cross")
     f = CARRIER_HZ + np.linspace(-1e9, 1e9, 16)
@@ -396,41 +389,41 @@ def channels() -> Values:
 
 @case
 def arrays_and_beams() -> Values:
-    tx = wr.PlanarArray(4, 4, orientation=wr.orientation_towards((1.0, 0.5, -0.2)), pattern="tr38901")
-    rx = wr.PlanarArray(2, 4, orientation=wr.orientation_towards((-1.0, -0.2, 0.1)))
+    tx = wr.PlanarArray(4, 4, orientation=wr.channel.orientation_towards((1.0, 0.5, -0.2)), pattern="tr38901")
+    rx = wr.PlanarArray(2, 4, orientation=wr.channel.orientation_towards((-1.0, -0.2, 0.1)))
     r = np.random.default_rng(3)
     directions = r.normal(size=(12, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    paths = wr.trace_paths(room(), transmitter=TRANSMITTER, receivers=places(3), frequency_hz=CARRIER_HZ)
-    choice = wr.select_beams(paths, tx, rx, count=3)
+    paths = wr.trace_paths(room(), **links(3))
+    choice = wr.channel.select_beams(paths, tx, rx, count=3)
     f = np.array([CARRIER_HZ])
     channel = paths.cfr(f, tx_array=tx, rx_array=wr.PlanarArray(1, 1))[:, 0, :, 0]
-    many = wr.select_beams_multiuser(list(paths.each()), tx, noise=1e-9)
-    steered = wr.steering_codebook(tx, directions[:5])
-    error = wr.plane_wave_error(tx, 0.05, 1e-3)
+    many = wr.channel.select_beams_multiuser(list(paths.each()), tx, noise=1e-9)
+    steered = wr.channel.steering_codebook(tx, directions[:5])
+    error = wr.channel.plane_wave_error(tx, 0.05, 1e-3)
     named = {k: v for k, v in vars(error).items() if np.ndim(v) == 0}
     found: Values = {
         "gain": (tx.gain(directions), FLOAT64), "response": (rx.response(directions, 1e-3), FLOAT64),
-        "positions": (tx.positions(1e-3), FLOAT64), "dft": (wr.dft_codebook(rx).weights, FLOAT64),
+        "positions": (tx.positions(1e-3), FLOAT64), "dft": (wr.channel.dft_codebook(rx).weights, FLOAT64),
         "steering": (steered.weights, FLOAT64), "amplitude": (steered.amplitude(directions), FLOAT64),
-        "beam_gains": (wr.beam_gains(paths, tx, rx), Check(rtol=1e-5, atol=1e-16)),
+        "beam_gains": (wr.channel.beam_gains(paths, tx, rx), Check(rtol=1e-5, atol=1e-16)),
         "tx": (choice.tx, BITS), "rx": (choice.rx, BITS), "chosen": (choice.gain, Check(rtol=1e-6)),
         "many": (np.asarray(many.tx), BITS),
-        "covariance": (wr.transmit_covariance(list(paths.each()), tx), Check(rtol=1e-6, atol=1e-16)),
+        "covariance": (wr.channel.transmit_covariance(list(paths.each()), tx), Check(rtol=1e-6, atol=1e-16)),
     }  # fmt: skip
     for name, value in sorted(named.items()):
         found[f"plane_wave_{name}"] = (value, Check(rtol=1e-6))
     for method in ("mr", "zf", "slnr"):
-        weights = wr.precoders(channel, method, noise=1e-9)
-        sinr = wr.precoded_sinr(channel, weights, noise=1e-9)
+        weights = wr.channel.precoders(channel, method, noise=1e-9)
+        sinr = wr.channel.precoded_sinr(channel, weights, noise=1e-9)
         found[f"sinr_{method}"] = (sinr, Check(rtol=1e-5))
     return found
 
 
 @case
 def band_plan() -> Values:
-    numbers = sorted(wr.THZ_CHANNELS)
-    plan = [wr.thz_channel(n) for n in numbers]
+    numbers = sorted(wr.channel.THZ_CHANNELS)
+    plan = [wr.channel.thz_channel(n) for n in numbers]
     return {
         "numbers": (numbers, BITS),
         "values": ([[v for v in vars(c).values() if isinstance(v, float)] for c in plan], FLOAT64),
@@ -440,10 +433,7 @@ def band_plan() -> Values:
 @case
 def simulated() -> Values:
     ds = spectra()
-    air = wr.simulate(
-        room(), transmitter=TRANSMITTER, receivers=places(2), frequency_hz=CARRIER_HZ, shape=SHAPE,
-        beam_sigma_rad=BEAM_RAD, gas=True,
-    )  # fmt: skip
+    air = wr.simulate(room(), **links(2), shape=SHAPE, beam_sigma_rad=BEAM_RAD, gas=True)
     return {
         "path_gain": (ds.path_gain[:3], EXACT), "air": (air.path_gain[1], EXACT),
         "total": (ds.path_gain.sum(axis=(1, 2)), Check(atol=0.005, decibels=True)),
@@ -590,7 +580,7 @@ def coverage() -> Values:
 @case
 def twin() -> Values:
     with tempfile.TemporaryDirectory() as folder:
-        wr.write_twin(bistatic(), Path(folder) / "twin")
+        wr.interop.write_twin(bistatic(), Path(folder) / "twin")
         scene = wr.Scene.load(Path(folder) / "twin" / "scene.xml")
     area = np.bincount(scene.face_material, weights=scene.mesh.areas)
     return {

@@ -11,7 +11,7 @@ from trimesh.remesh import subdivide_to_size
 import warprrf as wr
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.materials import Material
-from warprrf.rf.positions import NEAR_FIELD, check_positions, in_the_air, parted
+from warprrf.rf.positions import NEAR_FIELD, check_positions, is_free, parted
 from warprrf.rf.scene import Scene
 
 F = 300e9
@@ -152,15 +152,15 @@ def test_only_what_a_closed_surface_holds_is_no_air_however_surfaces_are_wound(s
     mesh = joined(*parts)[0]
     off = mesh.distance(places) > 0.01
     for known in (places[~solid & off][0], None):
-        np.testing.assert_array_equal(in_the_air(mesh, places, known)[off], ~solid[off])
+        np.testing.assert_array_equal(is_free(mesh, places, known)[off], ~solid[off])
 
 
-def test_a_room_is_one_though_crumbs_lie_beside_it():
+def test_a_room_is_one_though_fragments_lie_beside_it():
     """As in a reconstruction, whose walls have pieces before and behind them."""
-    crumb = sheet([6.1, 2, 1], [6.1, 3, 1], [6.1, 3, 2], [6.1, 2, 2])
-    mesh = joined(box_mesh(LOW, HIGH, inward=True), crumb)[0]
+    fragment = sheet([6.1, 2, 1], [6.1, 3, 1], [6.1, 3, 2], [6.1, 2, 2])
+    mesh = joined(box_mesh(LOW, HIGH, inward=True), fragment)[0]
     check_positions(mesh, TX, np.zeros((0, 3)), WAVELENGTH)
-    assert in_the_air(mesh, np.array([AIR, TX])).all()
+    assert is_free(mesh, np.array([AIR, TX])).all()
 
 
 def test_a_room_of_solid_walls_has_its_air_between_them():
@@ -174,7 +174,7 @@ def test_a_room_of_solid_walls_has_its_air_between_them():
     held = ((places > CUPBOARD[0]) & (places < CUPBOARD[1])).all(axis=1)
     clear = mesh.distance(places) > 0.01
     for known in (TX, None):
-        np.testing.assert_array_equal(in_the_air(mesh, places, known)[clear], ~held[clear])
+        np.testing.assert_array_equal(is_free(mesh, places, known)[clear], ~held[clear])
 
 
 def test_places_round_open_walls_and_lone_boxes_pass_and_in_a_box_do_not():
@@ -201,7 +201,7 @@ def test_sionnas_boxes_of_sheets_are_rooms(name):
     scene = wr.Scene.load(getattr(rt.scene, name))
     places = np.random.default_rng(0).uniform([-4.9, -4.9, 0.1], [4.9, 4.9, 4.9], (400, 3))
     assert scene.is_free(places).all()
-    assert in_the_air(scene.mesh, places, np.array([-4.0, -4.0, 4.0])).all()
+    assert is_free(scene.mesh, places, np.array([-4.0, -4.0, 4.0])).all()
     assert len(wr.sample_receivers(scene, 50, seed=0)) == 50
 
 

@@ -199,7 +199,6 @@ HOSTILE = {
     ),
     "itself": ('<include filename="scene.xml"/>', "deep"),
     "a file above": ('<include filename="../scene.xml"/>', "outside"),
-    "a file of the system": ('<include filename="/etc/passwd"/>', "outside"),
     "a name twice": (2 * CUBE.replace("cube", 'cube" id="a').format(""), "alike"),
     "a perspective": (
         CUBE.format(

@@ -87,5 +87,5 @@ def test_receivers_are_drawn_from_the_air():
 def test_places_too_near_a_surface_are_ruled_out_before_solids(monkeypatch):
     room = scene()
     places = sample_receivers(room, 3, seed=0)
-    monkeypatch.delattr(Mesh, "look_around")  # the last of the tests
+    monkeypatch.delattr(Mesh, "crossings")  # the last of the tests
     assert not room.is_free(places, clearance_m=1e3).any()

@@ -11,6 +11,7 @@ from types import ModuleType
 from typing import Any
 
 import warprrf
+from warprrf.viewer import Viewer
 
 GROUPS = {
     "geometry": ("Geometry", "Photos, cameras, Gaussians, meshes and rays: stage 1."),
@@ -43,10 +44,12 @@ def pages() -> dict[str, str]:
         elif inspect.isclass(found) or inspect.isfunction(found):
             groups[_group(found.__module__)].append(_entry("warprrf", name, found))
     for model in _models():
-        groups["rf.fields"].append(_entry("warprrf", model.__name__, model))
         options = _options(model)
-        groups["rf.fields"].append(_entry("warprrf", options.__name__, options) + "\n   :no-members:")
-    groups["viewer"].append(_entry("warprrf", "Viewer", warprrf.Viewer))
+        groups["rf.fields"].append(_entry(model.__module__, model.__name__, model))
+        groups["rf.fields"].append(
+            _entry(options.__module__, options.__name__, options) + "\n   :no-members:"
+        )
+    groups["viewer"].append(_entry("warprrf.viewer", "Viewer", Viewer))
     written = {
         f"reference/{key.replace('.', '-')}.rst": "\n\n".join([_title(title), words, *groups[key]]) + "\n"
         for key, (title, words) in GROUPS.items()
@@ -56,8 +59,9 @@ def pages() -> dict[str, str]:
     written["reference/command-line.rst"] = _command_line()
     index = [
         _title("API reference"),
-        "Names are reached as ``warprrf.NAME`` (``import warprrf as wr``), those of a module as ``wr.MODULE.NAME``. "
-        "``help(wr)`` and ``help(wr.MODULE)`` print the same lists.",
+        "Names are reached as ``warprrf.NAME`` (``import warprrf as wr``), those of a module as ``wr.MODULE.NAME``; the "
+        "models that a fit makes, and their options, are imported from where they are. ``help(wr)`` and "
+        "``help(wr.MODULE)`` print the same lists.",
         ".. toctree::\n   :maxdepth: 2\n",
     ]
     listed = "\n".join(f"   {path.removeprefix('reference/').removesuffix('.rst')}" for path in written)

@@ -24,7 +24,7 @@ _PATIENCE_S = 1.0  # after which Ctrl-C ends native code too
 class Output:
     """Progress, result and errors of one command; a progress callback `(stage, done, total)`.
 
-    With ``lines`` everything is JSON on standard output, an object a line, told apart by ``event``: ``progress`` (when a
+    With ``lines`` everything is JSON on standard output, an object a line, distinguished by ``event``: ``progress`` (when a
     stage begins and ends, and each second), ``result`` and ``error``. Otherwise results go there as text, and bars and
     errors to standard error.
 
@@ -42,7 +42,9 @@ class Output:
         self._interval = 1.0 if lines else 0.2 if self._terminal else 30.0
         self._left = TimeLeft()
         self._stage: str | None = None
-        self._unshown: tuple[int, int, float | None] | None = None  # what was last told, if it was not shown
+        self._unshown: tuple[int, int, float | None] | None = (
+            None  # what was last reported, if it was not shown
+        )
         self._began = self._shown = 0.0
         self._resumes: Path | None = None
         self._once = threading.Lock()

@@ -331,15 +331,15 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
         lines.append(f"gain of {name}: {chain['gain_db']:.2f} +- {chain['std_db']:.2f} dB")
     for name, rows in wrong.items():
         lines.append(f"{name}: left out as wrong, counted from 0: {', '.join(map(str, rows))}")
-    told = {name: field.report.get(name) for name in ("noise_db", "azimuth_zero_deg", "position_offset_m")}
-    for name, zero in (told["azimuth_zero_deg"] or {}).items():
+    fitted = {name: field.report.get(name) for name in ("noise_db", "azimuth_zero_deg", "position_offset_m")}
+    for name, zero in (fitted["azimuth_zero_deg"] or {}).items():
         lines.append(f"{name}: add {zero:.2f} degrees to its azimuths")
-    for name, moved in (told["position_offset_m"] or {}).items():
+    for name, moved in (fitted["position_offset_m"] or {}).items():
         for place, offset in np.round(moved, 4):
             lines.append(f"{name}: the receiver at {_rows([place])} stood off by {_rows([offset])} m")
-    for name, noise in (told["noise_db"] or {}).items():
+    for name, noise in (fitted["noise_db"] or {}).items():
         lines.append(f"{name}: readings are {noise:.2f} dB from the field (standard deviation)")
-    found = {"model": args.model, "receivers": places, "chains": chains, "unexplained": wrong, **told}
+    found = {"model": args.model, "receivers": places, "chains": chains, "unexplained": wrong, **fitted}
     out.result("\n".join(lines), files=[args.out], **found)
 
 

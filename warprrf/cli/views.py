@@ -237,7 +237,7 @@ def _map(args: argparse.Namespace, out: Output) -> None:
     if path.suffix == ".nc":
         found.save(path)
     found.picture(files[-1])
-    gain, snr = (found.shown(name)[found.free] for name in ("total_path_gain", "best_beam_snr_db"))
+    gain, snr = (found.plot_values(name)[found.free] for name in ("total_path_gain", "best_beam_snr_db"))
     figures = {"median_total_path_gain_db": np.median(gain), "median_best_beam_snr_db": np.median(snr)}
     out.result(
         f"{path}: {found.free.sum()} cells in the air of {found.free.size}; median total path gain "
@@ -262,7 +262,7 @@ def _twin(args: argparse.Namespace, out: Output) -> None:
     """A field's digital twin: a scene for Sionna RT.
 
     Writes the reconstructed mesh with the fitted materials as scene.xml, materials.json and meshes/. `sionna.rt.load_scene`
-    opens the scene as it is, all lobes Lambertian; `warprrf.load_sionna_scene` sets the scattering patterns too, and
+    opens the scene as it is, all lobes Lambertian; `warprrf.interop.load_sionna_scene` sets the scattering patterns too, and
     `warprrf simulate` takes it as any scene. A material has one curve and one lobe: what the projection misses is printed.
 
     examples:
@@ -270,7 +270,9 @@ def _twin(args: argparse.Namespace, out: Output) -> None:
       warprrf twin field.safetensors -o twin --thickness glass=0.01 walls=0.1
       warprrf simulate twin/scene.xml -o spectra.nc --transmitter 2 3 3.2 --receivers receivers.csv --engine sionna
     """
-    twin = wr.write_twin(load_field(args.field, args), args.out, thickness_m=_thickness(args.thickness))
+    twin = wr.interop.write_twin(
+        load_field(args.field, args), args.out, thickness_m=_thickness(args.thickness)
+    )
     rows = [["surface", "area m2", "thickness m", "permittivity", "S", "lobe", "lobe error dB"]]
     for group in twin.groups:
         rows.append(

@@ -53,9 +53,9 @@ def read_gltf(folder: Folder) -> MeshContent:
     except (ImportError, OSError, MemoryError):
         raise
     except Exception as error:  # a header may hold anything in place of anything
-        told = error if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-        told = str(told).removeprefix(f"path: {folder.path} ")
-        raise ValueError(f"path: {folder.path} is not a readable mesh: {told}") from error
+        reason = error if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+        reason = str(reason).removeprefix(f"path: {folder.path} ")
+        raise ValueError(f"path: {folder.path} is not a readable mesh: {reason}") from error
 
 
 @dataclass(frozen=True)

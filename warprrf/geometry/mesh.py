@@ -35,7 +35,7 @@ from warprrf.checks import (
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh_files import MeshOptions, load_mesh
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
-from warprrf.kernels.rays.mesh import closest_faces, look_around
+from warprrf.kernels.rays.mesh import closest_faces, find_crossings
 
 ENDPOINT_CLEARANCE = 1e-4
 """Length at both ends of a segment in which :meth:`Mesh.visible` ignores surfaces [m]."""
@@ -406,7 +406,7 @@ class Mesh:
         """Distance from each of ``points`` (N, 3) [m] to the surface [m], shape ``(N,)``."""
         return self.closest(points, device=device).distance
 
-    def look_around(
+    def crossings(
         self, points: ArrayLike, directions: ArrayLike, *, device: DeviceLike = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """What rays in the same ``directions`` (D, 3) cross from each of ``points`` (N, 3) [m].
@@ -423,7 +423,7 @@ class Mesh:
         winding, side = (wp.zeros(len(p) * len(d), dtype=wp.int32, device=where) for _ in range(2))
         start, toward = (wp.array(x, dtype=wp.vec3d, device=where) for x in (p - self.center, d))
         inputs = [bvh.id, corners, start, toward, winding, side]
-        _device.launch(look_around, len(p) * len(d), inputs, device=where)
+        _device.launch(find_crossings, len(p) * len(d), inputs, device=where)
         return winding.numpy().reshape(len(p), len(d)), side.numpy().reshape(len(p), len(d))
 
     @cached_property

@@ -2,21 +2,26 @@
 
 A patch is a connected set of faces of one group (a material, say) that lie in one plane. The plane is fitted: least
 squares over the faces, weighted by area. What must not matter does not: which way faces are wound, a face that is there
-twice, an order or a finer subdivision of faces, coordinates rounded to float32, and small errors of vertices. A curved
-surface is not flat at any such error: its facets stay patches of their own. Lengths in metres.
+twice, a surface that lies on another of its group, an order or a finer subdivision of faces, coordinates rounded to
+float32, and small errors of vertices. A curved surface is not flat at any such error: its facets stay patches of their
+own. Lengths in metres.
 """
 
 from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike
 
+from warprrf import device as _device
 from warprrf.cache import cached_property
 from warprrf.checks import check_similarity
 from warprrf.geometry.mesh import Mesh, components, edge_pairs, vectors_across
+from warprrf.kernels.rays.mesh import OverlapFaces, find_overlaps
 
 FLAT_M = 1e-5
 """Corners may lie this far from their patch's plane [m], and six standard deviations of vertices' errors more."""
@@ -43,7 +48,7 @@ class PlanarPatches:
         normal: Unit normal, shape ``(P, 3)``; its sign is that of the patch's largest face and means a side only where
             ``two_sided`` is False.
         offset: The plane is ``normal . x = offset`` [m], shape ``(P,)``.
-        area: Area, repeated faces counted once [m^2], shape ``(P,)``.
+        area: Area, repeated faces counted once, others that lie on each other each [m^2], shape ``(P,)``.
         group: What :func:`planar_patches` was told to keep apart, shape ``(P,)``, int32; -1 where nothing was.
         first: The first face at the place of each, shape ``(F,)``: itself unless it repeats one.
         tolerance_m: Corners of a patch lie this near to its plane [m]; rays that end on it ignore what is nearer.
@@ -211,7 +216,7 @@ def vertex_noise(mesh: Mesh, pairs: np.ndarray, rounding_m: float) -> float:
     """Standard deviation of vertices' errors [m], from neighbours that may be coplanar; at least ``rounding_m``.
 
     On a flat piece errors bend a face towards one neighbour and away from another; on a smooth curved one all bend the
-    same way. Only if most faces with three neighbours are bent both ways is that noise, and only up to
+    same way. Only if most of the area with three neighbours is bent both ways is that noise, and only up to
     :data:`MOST_NOISE_M`: hills are not.
 
     Args:
@@ -224,13 +229,18 @@ def vertex_noise(mesh: Mesh, pairs: np.ndarray, rounding_m: float) -> float:
     rise = np.einsum("nki,ni->nk", x[b] - x[a][:, :1], n[a])
     rise = rise[np.arange(len(a)), np.abs(rise).argmax(axis=1)] if len(a) else np.zeros(0)
     count = len(mesh.faces)
+    inner = np.bincount(a, minlength=count) >= 3
+    # A face that was cut up says what it did whole: its pieces rise less, by the root of areas.
+    cut = np.abs(rise) <= 2.0 * rounding_m
+    facet = components(count, np.column_stack([a, b])[cut])
+    rise *= np.sqrt(np.bincount(facet, mesh.areas)[facet[b]] / np.maximum(mesh.areas[b], 1e-300))
+    a, rise = facet[a][~cut], rise[~cut]
     low, high = np.zeros(count), np.zeros(count)
     np.minimum.at(low, a, rise)
     np.maximum.at(high, a, rise)
-    whole = np.bincount(a, minlength=count) >= 3
     # Bent as much, within a factor of ten, one way as the other: facets of a pipe with errors are not.
-    both = whole & (np.minimum(high, -low) > np.maximum(rounding_m, 0.1 * np.maximum(high, -low)))
-    if both.sum() <= 0.55 * whole.sum():
+    both = np.minimum(high, -low) > np.maximum(rounding_m, 0.1 * np.maximum(high, -low))
+    if mesh.areas[inner & both[facet]].sum() <= 0.55 * mesh.areas[inner].sum():
         return rounding_m
     # The corner across an edge lies off the neighbour's plane by twice a vertex's error (of a parallelogram).
     noise = float(np.median(np.abs(rise)) / 0.6745 / 2.0)
@@ -296,9 +306,33 @@ def _pieces(faces: _Faces, once: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     bad = np.unique(piece[own][faces.gap(own, normal[piece[own]], offset[piece[own]]) > faces.distance_m])
     if len(bad):
         piece = _numbered(_grown(faces, piece, np.isin(piece, bad), pairs))
+    # Surfaces that lie on each other share no edge; they are one mirror all the same.
+    pairs = np.concatenate([pairs, _overlaps(faces, piece)])
     while (joined := _joined(faces, piece, pairs)) is not None:
         piece = joined
     return piece
+
+
+def _overlaps(faces: _Faces, piece: np.ndarray) -> np.ndarray:
+    """Pairs of faces that lie on each other within the tolerance, in pieces of one group, shape ``(N, 2)``: each face with
+    one of the largest such piece."""
+    own = np.flatnonzero(piece >= 0)
+    where = _device.resolve("cpu")
+    put = partial(wp.array, device=where)
+    corners = faces.mesh.triangles[own] - faces.mesh.center
+    margin = 2.0 * faces.distance_m  # float32's rounding is less
+    low, high = corners.min(axis=1) - margin, corners.max(axis=1) + margin
+    bvh = wp.Bvh(*(put(x.astype(np.float32), dtype=wp.vec3) for x in (low, high)))
+    held = OverlapFaces()
+    held.corners = put(corners, dtype=wp.vec3d)
+    held.normal = put(faces.mesh.face_normals[own], dtype=wp.vec3d)
+    held.area = put(faces.mesh.areas[own], dtype=wp.float64)
+    held.part, held.group = (put(x[own], dtype=wp.int32) for x in (piece, faces.group))
+    held.part_area = put(np.bincount(piece[own], faces.mesh.areas[own]), dtype=wp.float64)
+    other = wp.full(len(own), -1, dtype=wp.int32, device=where)
+    _device.launch(find_overlaps, len(own), [bvh.id, held, faces.distance_m, other], device=where)
+    found = other.numpy()
+    return np.column_stack([own, own[found]])[found >= 0]
 
 
 def _grown(faces: _Faces, piece: np.ndarray, again: np.ndarray, pairs: np.ndarray) -> np.ndarray:

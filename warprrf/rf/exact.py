@@ -49,11 +49,13 @@ SUB_PIXELS = 8
 """Default square root of the directions per pixel.
 
 Error of the total diffuse power at 60 x 120 over 17 places in a furnished room, rms (largest): 4: 0.3 % (0.8 %),
-8: 0.05 % (0.13 %), 16: 0.02 % (0.04 %).
+8: 0.05 % (0.13 %), 16: 0.02 % (0.04 %). Coarse grids have fewer directions: at
+18 x 36, out of sight in the lobby, one of them or none meets a desk top seen at one degree, and the total moves by up to
+0.07 dB when the room is turned; 16: 0.04 dB, 32: 0.01 dB, 64: 0.002 dB.
 """
 FACTORS = 1025
 """Entries of a reciprocal lobe's factor over the cosine: interpolation errs by 1e-5 at most up to an exponent of 100."""
-REVISION = 3
+REVISION = 4
 """Raised whenever the engine's numbers change: finished receivers of another revision are not used."""
 
 

@@ -51,7 +51,7 @@ _SKY = 1.0 / 3.0  # share of rays upward that meet nothing where there is sky
 _PLACES = 5  # along each side of a scene, at which the sky is looked for
 _ROOM = 0.1  # least share of the box around a scene that its room takes
 _WALL = 0.5  # least share of what a room's walls hold that their inner surface does
-_CRUMBS = 0.1  # of a surface's area: what is left beside it is nothing to speak of
+_FRAGMENTS = 0.1  # of a surface's area: what is left beside it is nothing to speak of
 _SAMPLES = 1000  # faces whose places tell what a surface holds
 _LEAK = 0.02  # share of rays that may leave a closed room: its walls need not meet exactly
 _FLOOR = 0.1  # least share of a plan with something below, for a scene with a floor
@@ -218,7 +218,7 @@ def parted(
     return found
 
 
-def in_the_air(
+def is_free(
     mesh: Mesh,
     points: np.ndarray,
     known: np.ndarray | None = None,
@@ -251,7 +251,7 @@ def holds(part: Mesh, points: np.ndarray, *, device: DeviceLike = None) -> np.nd
     within = np.flatnonzero(found)
     for first in range(0, len(within), _AT_ONCE):
         some = within[first : first + _AT_ONCE]
-        winding, _ = part.look_around(points[some], lattice(_DIRECTIONS), device=device)
+        winding, _ = part.crossings(points[some], lattice(_DIRECTIONS), device=device)
         found[some] = (winding % 2).mean(axis=1) > 0.5
     return found
 
@@ -284,7 +284,7 @@ def under_a_roof(mesh: Mesh, points: np.ndarray, *, device: DeviceLike = None) -
     found = np.zeros(len(points), dtype=bool)
     for first in range(0, len(points), _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
-        winding, _ = mesh.look_around(points[some], np.concatenate([_upward(), _overhead()]), device=device)
+        winding, _ = mesh.crossings(points[some], np.concatenate([_upward(), _overhead()]), device=device)
         middle = np.median(winding, axis=1, keepdims=True)
         for votes in (winding % 2 == 1, (winding == middle) & (middle != 0)):
             share = votes.reshape(len(votes), _BANDS + 1, -1).mean(axis=2)
@@ -397,10 +397,10 @@ def _rooms(mesh: Mesh) -> list[int]:
         ]
         places, area = mesh.triangles[rest].mean(axis=1), mesh.areas[rest]
         held, left = area[holds(mesh.closed_parts[k], places)].sum(), area.sum()
-        crumbs = left <= _CRUMBS * mesh.closed_parts[k].areas.sum() and not _is_amid(
+        fragments = left <= _FRAGMENTS * mesh.closed_parts[k].areas.sum() and not _is_amid(
             mesh.closed_parts[k], places
         )
-        if held > 0.5 * left or crumbs:
+        if held > 0.5 * left or fragments:
             rooms.append(k)
             least = _WALL * volume[k]
     return rooms
@@ -409,7 +409,7 @@ def _rooms(mesh: Mesh) -> list[int]:
 def _is_amid(part: Mesh, points: np.ndarray) -> bool:
     """Whether most of ``points`` (N, 3) are in the hollow of a closed surface, as furniture amid walls of solids: all around
     they see it."""
-    side = part.look_around(points, lattice(_DIRECTIONS))[1]
+    side = part.crossings(points, lattice(_DIRECTIONS))[1]
     return bool(len(points) and np.mean((side != 0).mean(axis=1) > 1.0 - _LEAK) > 0.5)
 
 
@@ -438,7 +438,7 @@ def _is_sealed(mesh: Mesh, known: np.ndarray, device: DeviceLike) -> bool:
         return True
     places = _spread(mesh)
     places = np.concatenate([known[None], places[mesh.visible(places, known, device=device)]])
-    side = mesh.look_around(places, lattice(4 * _DIRECTIONS), device=device)[1]
+    side = mesh.crossings(places, lattice(4 * _DIRECTIONS), device=device)[1]
     return bool(((side == 0).mean(axis=1) < _LEAK).all())
 
 
@@ -456,7 +456,7 @@ def _spread(mesh: Mesh) -> np.ndarray:
 
 def _sky_over(mesh: Mesh, points: np.ndarray, device: DeviceLike) -> np.ndarray:
     """Whether a third of the rays upward from ``points`` (N, 3) meets nothing, shape ``(N,)``, bool."""
-    side = mesh.look_around(points, _upward(), device=device)[1]
+    side = mesh.crossings(points, _upward(), device=device)[1]
     return np.asarray((side == 0).mean(axis=1) >= _SKY)
 
 

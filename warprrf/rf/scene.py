@@ -19,7 +19,7 @@ from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import MeshOptions, is_mesh_file
 from warprrf.rf.em.materials import Material
-from warprrf.rf.positions import in_the_air
+from warprrf.rf.positions import is_free
 from warprrf.rf.scene_parts import MaterialChoice, Materials, ScenePart, read_mesh_scene
 from warprrf.rf.scene_sionna import SIONNA_FREQUENCY_HZ, parts_of, to_sionna_scene
 from warprrf.rf.scene_xml import read_scene_xml
@@ -252,7 +252,7 @@ class Scene:
         """
         points = check_array("points", points, (None, 3))
         check_number("clearance_m", clearance_m, 0.0)
-        return in_the_air(self.mesh, points, clearance_m=clearance_m, device=device)
+        return is_free(self.mesh, points, clearance_m=clearance_m, device=device)
 
 
 def _positions(name: str, values: Mapping[str, ArrayLike] | None) -> dict[str, np.ndarray]:

@@ -94,8 +94,8 @@ def answer(source: Source, receiver: np.ndarray, transmitters: Sequence[np.ndarr
     for transmitter in transmitters:
         if isinstance(source, BistaticField):
             view = source.view(receiver, transmitter)
-            told = asked.uncertainty and source.errors is not None and len(transmitters) == 1
-            spectra.append(source.spectrum(receiver, transmitter, view=view, uncertainty=told))
+            wanted = asked.uncertainty and source.errors is not None and len(transmitters) == 1
+            spectra.append(source.spectrum(receiver, transmitter, view=view, uncertainty=wanted))
             paths.append(source.paths(receiver, transmitter, MOST_PATHS, view=view))
         elif isinstance(source, RadioField):
             spectra.append(source.spectrum(receiver, transmitter))

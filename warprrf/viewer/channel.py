@@ -53,16 +53,16 @@ class Channel:
             )
             slid = gui.add_slider("carrier [GHz]", min=low, max=high, step=step, initial_value=carrier)
             slid.disabled = isinstance(field, RadioField) and not isinstance(field, BistaticField)
-            told = gui.add_checkbox("expected error", False, visible=hasattr(field, "gain_std_db"))
-            told.disabled = getattr(field, "errors", None) is None
-        self.range_db, self._mirrors, self.carrier, self._told = (
-            Setting(handle, changed) for handle in (range_db, mirrors, slid, told)
+            uncertainty = gui.add_checkbox("expected error", False, visible=hasattr(field, "gain_std_db"))
+            uncertainty.disabled = getattr(field, "errors", None) is None
+        self.range_db, self._mirrors, self.carrier, self._uncertainty = (
+            Setting(handle, changed) for handle in (range_db, mirrors, slid, uncertainty)
         )
 
     @property
     def asked(self) -> Asked:
         """What the settings ask for."""
-        return Asked(float(self.carrier.value) * 1e9, int(self._mirrors.value), bool(self._told.value))
+        return Asked(float(self.carrier.value) * 1e9, int(self._mirrors.value), bool(self._uncertainty.value))
 
     def show(self, found: Answer) -> None:
         """Show an answer."""
@@ -72,7 +72,7 @@ class Channel:
         for (paths, k), row in zip(listed, rows, strict=True):
             zenith, azimuth = float(paths.theta_r[k]), float(paths.phi_r[k])
             if all(np.hypot(zenith - z, azimuth - a) > APART_RAD for z, a, _ in marks):
-                marks.append((zenith, azimuth, "{}: {}, {}, from {}, sent to {}".format(*row)))
+                marks.append((zenith, azimuth, "{}: {}, {}, from {}, departs towards {}".format(*row)))
         self.images, note = self._panoramas(found)
         scales = [image[2:] for image in self.images]
         drawn = [
@@ -114,7 +114,9 @@ class Channel:
 
 def _table(rows: Sequence[tuple[str, ...]]) -> str:
     """HTML of paths."""
-    head = "".join(f"<th>{name}</th>" for name in ("kind", "gain", "delay", "arrives from", "sent to"))
+    head = "".join(
+        f"<th>{name}</th>" for name in ("kind", "gain", "delay", "arrives from", "departs towards")
+    )
     body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
     note = "Directions: zenith, azimuth. Point at a ring in the spectrum, or click on a path in the room."
     return f"<table><tr>{head}</tr>{body}</table>{note}"

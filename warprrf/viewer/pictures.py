@@ -13,7 +13,7 @@ from warprrf import device as _device
 from warprrf.geometry.splats.gaussians import Gaussians
 
 Image = tuple[str, np.ndarray, float, float, str]
-"""Title, values (H, W) [dB], lowest and highest that are told apart, colour map."""
+"""Title, values (H, W) [dB], lowest and highest of the colours, colour map."""
 GREY = (200, 200, 205)
 STYLE = """<style>
 .wr{font:12px/1.4 sans-serif;padding:0 10px 8px;color:#333} .wr .title{font-weight:600;margin-top:4px}
@@ -75,7 +75,7 @@ def panorama(image: Image, marks: Sequence[tuple[float, float, str]] = (), *, sc
     Args:
         image: its title, values (H, W) [dB], their range, and a colour map.
         marks: zenith and azimuth [rad] of small rings, each with the text that appears while the mouse is over it.
-        scale: whether azimuths and colours are told below it.
+        scale: whether azimuths and colours are labelled below it.
     """
     title, values, low, high, name = image
     data = base64.b64encode(png(coloured(values, low, high, name))).decode()
@@ -92,7 +92,7 @@ def panorama(image: Image, marks: Sequence[tuple[float, float, str]] = (), *, sc
     )
 
 
-def sheet(caption: str, images: Sequence[Image], view: np.ndarray | None = None) -> bytes:
+def combined(caption: str, images: Sequence[Image], view: np.ndarray | None = None) -> bytes:
     """A PNG file of images as :func:`panorama` takes them, below what the browser shows (H, W, 3)."""
     figures = _device.require("matplotlib.figure", extra="view")
     drawing = figures.Figure(

@@ -47,7 +47,7 @@ def learned(field: BistaticField, kind: str, progress: Progress | None = None) -
             standard deviation of the gain of what a surface scatters, by what the measurements saw of it [dB].
         progress: of the last, which takes seconds.
     """
-    surface, p, groups = field.surface, field.parameters, np.arange(field.surface.groups)
+    surface, p = field.surface, field.parameters
     if kind == "uncertainty":
         return field.gain_std_db(progress)[surface.element]
     if kind == "roughness":

@@ -11,7 +11,7 @@ from warprrf.device import Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.maps.radio_map import QUANTITIES
-from warprrf.rf.positions import in_the_air
+from warprrf.rf.positions import is_free
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.readings import Readings
@@ -124,7 +124,7 @@ class Survey:
             float(self.height.value), float(self._cell.value), self._transmitters()[0], progress=progress
         )
         quantity = next(name for name, text in QUANTITIES.items() if text == self._quantity.value)
-        value = found.shown(quantity)
+        value = found.plot_values(quantity)
         low, high = (float(np.nanpercentile(value, q)) for q in (2, 98))
         picture = pictures.coloured(value, low, high)[::-1]
         seen = np.where(np.isnan(value), 0, 255).astype(np.uint8)[::-1]
@@ -150,7 +150,7 @@ class Survey:
             raise ValueError("field: got one without a mesh, expected one that knows walls from air")
         axes = [np.arange(a + 0.5 * CANDIDATE_M, b, CANDIDATE_M) for a, b in mesh.bounds[:, :2].T]
         places = np.stack(np.meshgrid(*axes, [float(self.height.value)]), axis=-1).reshape(-1, 3)
-        places = places[in_the_air(mesh, places, field.transmitter, device=field.device)]
+        places = places[is_free(mesh, places, field.transmitter, device=field.device)]
         return np.asarray(places[np.linalg.norm(places - field.transmitter, axis=1) > CLEAR_M])
 
     def _suggest(self, field: RadioField, progress: Progress) -> None:

@@ -255,7 +255,7 @@ class Viewer:
             event.client.send_file_download("warprrf.png", self._png(view), save_immediately=True)
 
     def _png(self, view: np.ndarray | None = None) -> bytes:
-        return pictures.sheet(self.message.replace("**", ""), self._channel.images, view)
+        return pictures.combined(self.message.replace("**", ""), self._channel.images, view)
 
     def _html(self) -> bytes:
         """The scene as it stands, with spectrum and figures in a corner."""

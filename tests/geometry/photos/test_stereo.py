@@ -20,10 +20,8 @@ def silent(stage, done, total):
 
 def truth(camera):
     """Range along every pixel's ray to the inside of the box, and the photo of its pattern."""
-    d = camera.directions()
-    with np.errstate(divide="ignore"):
-        t = np.where(d > 0, (HIGH - camera.position) / d, (LOW - camera.position) / d).min(axis=-1)
-    x = camera.position + t[..., None] * d
+    t = views.range_in_box(camera, LOW, HIGH)
+    x = camera.position + t[..., None] * camera.directions()
     rng = np.random.default_rng(5)
     waves = rng.normal(size=(12, 3)) * 2 * np.pi / 0.5
     pattern = np.sin(x @ waves.T + rng.uniform(0, 6, 12)).sum(axis=-1) / 12

@@ -1,68 +1,20 @@
-"""Points, planes, fused depth and planar patches against shapes known in closed form."""
-
-from functools import partial
+"""Planes against shapes known in closed form."""
 
 import numpy as np
 import pytest
-import views
+from radio_scenes import box_mesh
+from trimesh.remesh import subdivide_to_size
 
+from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.cells import occupancy
-from warprrf.geometry.photos.fusion import fuse_depth
 from warprrf.geometry.photos.planes import Plane, detect_planes, plane_axes
-from warprrf.geometry.photos.points import clean_points
-from warprrf.geometry.photos.snapping import find_patches, flattened, largest_first, simplified
-
-pytest.importorskip("open3d")
-look = partial(views.look, width=160, height=120, f=100.0, off=(1.5, -2.0))
-
-LOW, HIGH = np.array([-2.0, -1.5, 0.0]), np.array([2.013, 1.517, 2.511])  # not whole voxels
-
-
-def room_range(camera):
-    """Distance to the inside of the box LOW..HIGH along every pixel's ray."""
-    d = camera.directions()
-    with np.errstate(divide="ignore"):
-        return np.where(d > 0, (HIGH - camera.position) / d, (LOW - camera.position) / d).min(axis=-1)
-
-
-def room_cameras():
-    angles = np.arange(12) * np.pi / 6
-    return [
-        look([0.5 * np.cos(a), 0.4 * np.sin(a), 1.2], [np.cos(a), np.sin(a), 1.2 + tilt])
-        for a in angles
-        for tilt in (-2.5, -0.7, 0.0, 0.7, 2.5)
-    ]
-
-
-def room_distance(points):
-    return np.minimum(np.abs(points - LOW), np.abs(points - HIGH)).min(axis=1)
-
-
-@pytest.fixture(scope="module")
-def fused():
-    rng = np.random.default_rng(0)
-    cameras = room_cameras()
-    depths = [room_range(c) + 0.004 * rng.standard_normal((c.height, c.width)) for c in cameras]
-    return fuse_depth(depths, cameras)
+from warprrf.geometry.photos.snapping import find_patches
 
 
 def grid_on(plane_normal, offset, size=1.0, step=0.05):
     u, v = np.meshgrid(np.arange(-size, size, step), np.arange(-size, size, step))
     axes = plane_axes(np.asarray(plane_normal, float))
     return np.stack([u.ravel(), v.ravel()], axis=1) @ axes + offset * np.asarray(plane_normal, float)
-
-
-def test_planted_outliers_are_cleaned_and_little_else():
-    rng = np.random.default_rng(0)
-    good = np.concatenate([rng.uniform(-1, 1, (2000, 2)), 0.003 * rng.standard_normal((2000, 1))], axis=1)
-    bad = rng.uniform(-3, 3, (40, 3)) + [0, 0, 5]
-    keep = clean_points(np.concatenate([good, bad]))
-    assert not keep[2000:].any()
-    assert keep[:2000].mean() > 0.97
-    error, length = np.full(2000, 0.3), np.full(2000, 4)
-    error[:10], length[10:20] = 3.0, 2
-    keep = clean_points(good, reprojection_error=error, track_length=length)
-    assert not keep[:20].any()
 
 
 def test_planes_are_found_in_noisy_points_with_outliers():
@@ -148,77 +100,16 @@ def test_a_plane_is_empty_where_one_sees_through_it():
     assert not found.covers(np.array([[0.0, 0, 0], [0.2, 0, -0.2]])).any()
     assert found.covers(np.array([[0.8, 0, 0.8], [-0.7, 0, 0.0], [0.0, 0, 0.9]])).all()
     assert not found.covers(np.array([[1.8, 0, 0]])).any()
-    # Nobody looks through: the hole is filled, as a bare patch of wall would be.
-    (closed,) = occupancy([plane], frame, eyes[:0], targets[:0])
+    # Nobody looks further than the plane: the hole is filled, as a bare patch of wall would be.
+    (closed,) = occupancy([plane], frame, eyes, frame[window])
     assert closed.covers(np.array([[0.0, 0, 0]])).all()
     assert closed.area() > found.area() + 0.5
 
 
-def test_fused_room_has_no_bias_on_any_side(fused):
-    # A pixel off by half would move floor and ceiling alike by 1 cm here.
-    vertices = fused.vertices
-    for axis in range(3):
-        others = [a for a in range(3) if a != axis]
-        middle = (
-            np.abs(vertices[:, others] - ((LOW + HIGH) / 2)[others]) < 0.6 * ((HIGH - LOW) / 2)[others]
-        ).all(axis=1)
-        for wall in (LOW[axis], HIGH[axis]):
-            near = vertices[middle & (np.abs(vertices[:, axis] - wall) < 0.1), axis] - wall
-            assert len(near) > 100
-            assert abs(np.median(near)) < 2.5e-3
-    assert np.percentile(room_distance(vertices), 90) < 0.01
-
-
-def test_fused_surface_faces_the_cameras(fused):
-    centres = fused.triangles.mean(axis=1)
-    inward = ((np.array([0, 0, 1.2]) - centres) * fused.face_normals).sum(axis=1) > 0
-    assert inward.mean() > 0.999
-
-
-def walls():
-    return [
-        Plane(s * np.eye(3)[a], float(s * wall[a]), np.zeros(0, dtype=int))
-        for a in range(3)
-        for s, wall in ((1, LOW), (-1, HIGH))
-    ]
-
-
-@pytest.mark.parametrize("known", [True, False])
-def test_patches_of_a_room_are_its_six_sides(fused, known):
-    patches = largest_first(find_patches(fused, walls() if known else ()), 0.15)
-    assert len(patches) == 6
-    size = HIGH - LOW
-    for normal, offset, area in zip(patches.normal, patches.offset, patches.area, strict=True):
-        axis = np.abs(normal).argmax()
-        wall = LOW[axis] if normal[axis] > 0 else HIGH[axis]
-        assert np.degrees(np.arccos(np.abs(normal[axis]))) < 0.2
-        assert abs(offset - normal[axis] * wall) < 4e-3
-        assert area == pytest.approx(np.prod(size) / size[axis], rel=0.08)
-    assert (patches.face_patch >= 0).mean() > 0.98
-
-
-def test_flattened_patches_are_flat_with_sharp_edges(fused):
-    patches = flattened(find_patches(fused, walls()))
-    flat = patches.mesh
-    for k in range(6):
-        corners = flat.triangles[patches.faces(k)]
-        assert np.median(np.abs(corners @ patches.normal[k] - patches.offset[k])) < 1e-12
-    assert np.percentile(room_distance(flat.vertices), 99) < 1e-9
-    # The edge of wall and floor was rounded by the voxels, and is no more.
-    at = [LOW[0], 0.3, LOW[2]]
-    assert np.linalg.norm(flat.vertices - at, axis=1).min() < 0.04
-    assert np.abs(np.linalg.norm(fused.vertices - at, axis=1)).min() < 0.08
-
-
-def test_simplified_room_is_the_same_surface_with_few_faces(fused):
-    flat = flattened(find_patches(fused, walls()))
-    coarse = simplified(flat)
-    assert len(coarse.mesh.faces) < 0.15 * len(flat.mesh.faces)
-    d = np.random.default_rng(0).standard_normal((20_000, 3))
-    origin = np.tile([0.1, 0.2, 1.1], (len(d), 1))
-    before, after = flat.mesh.cast(origin, d), coarse.mesh.cast(origin, d)
-    assert after.valid.mean() > before.valid.mean() - 2e-3
-    both = before.valid & after.valid
-    assert np.percentile(np.abs(after.t[both] - before.t[both]), 99) < 1e-3
-    for k in range(6):
-        assert (coarse.mesh.face_normals[coarse.faces(k)] @ coarse.normal[k] > 0).all()
+def test_faces_go_to_the_planes_that_are_given():
+    vertices, faces = subdivide_to_size(*box_mesh([0, 0, 0], [4, 3, 2.5], inward=True), 0.2)
+    mesh = Mesh(vertices + 0.004 * np.random.default_rng(0).standard_normal(vertices.shape), faces)
+    planes = [Plane(np.eye(3)[a], 0.0, np.zeros(0, dtype=int)) for a in (2, 0)]
+    patches = find_patches(mesh, planes)
+    np.testing.assert_array_equal(patches.normal, [[0, 0, 1], [1, 0, 0]])
+    assert patches.area == pytest.approx([12, 7.5], rel=0.05)

@@ -86,32 +86,6 @@ def test_the_exponential_of_float32_errs_by_less_than_1e_6():
     assert np.abs(found - np.exp(-q / 2)).max() < 1e-6
 
 
-@wp.kernel(enable_backward=False)
-def count_visits(offset: int, visits: wp.array(dtype=int)):
-    i = offset + wp.tid()
-    visits[i] = visits[i] + i + 1
-
-
-@pytest.mark.parametrize(
-    ("how", "first", "last"),
-    [
-        ({}, 0, 1000),
-        ({"grain": 1}, 0, 1000),
-        ({"pieces": 7}, 0, 1000),
-        ({"cuts": [200, 250, 250, 300]}, 200, 300),
-    ],
-)
-@pytest.mark.parametrize("count", [1, 3])
-def test_a_launch_visits_every_index_once(how, first, last, count, monkeypatch):
-    with ThreadPoolExecutor(3) as pool:
-        monkeypatch.setattr(device, "threads", lambda: count)
-        monkeypatch.setattr(device, "_pool", lambda: pool)
-        visits = wp.zeros(1000, dtype=int, device="cpu")
-        device.launch(count_visits, 1000, [visits], device="cpu", **how)
-    index = np.arange(1000)
-    assert np.array_equal(visits.numpy(), np.where((index >= first) & (index < last), index + 1, 0))
-
-
 OTHERS = [{"per_pixel": True}, pytest.param({"device": "cuda:0"}, marks=pytest.mark.cuda)]
 
 

@@ -37,18 +37,18 @@ def rank_one(h: np.ndarray) -> np.ndarray:
 def test_weights_have_unit_norm_and_one_user_gets_maximum_ratio(method: str) -> None:
     h = rayleigh()
     for channels in (h, rank_one(h)):
-        w = wr.precoders(channels, method, noise=1e-9)
+        w = wr.channel.precoders(channels, method, noise=1e-9)
         np.testing.assert_allclose(np.linalg.norm(w, axis=1), 1.0, rtol=1e-12)
-        alone = wr.precoders(channels[:1], method, noise=1e-9)
+        alone = wr.channel.precoders(channels[:1], method, noise=1e-9)
         gain = np.abs(h[0] @ alone[0]) ** 2
         assert gain == pytest.approx(np.linalg.norm(h[0]) ** 2, rel=1e-10)
-        assert wr.precoded_sinr(h[:1], alone, noise=1e-9)[0] == pytest.approx(gain / 1e-9, rel=1e-10)
+        assert wr.channel.precoded_sinr(h[:1], alone, noise=1e-9)[0] == pytest.approx(gain / 1e-9, rel=1e-10)
 
 
 def test_zero_forcing_nulls_interference_and_gives_what_the_inverse_gram_says() -> None:
     h = rayleigh()
     for channels in (h, rank_one(h)):
-        heard = np.abs(h @ wr.precoders(channels, "zf", noise=1e-9).T)
+        heard = np.abs(h @ wr.channel.precoders(channels, "zf", noise=1e-9).T)
         own = np.diag(heard)
         assert (heard - np.diag(own)).max() < 1e-10 * own.min()
         # |h_u^T w_u|^2 = 1 / [(H H^H)^-1]_uu
@@ -57,9 +57,9 @@ def test_zero_forcing_nulls_interference_and_gives_what_the_inverse_gram_says() 
 
 def test_slnr_is_the_generalised_eigenvector_and_for_channels_the_mmse_precoder() -> None:
     h, noise = rayleigh(), 3e-10
-    scattered = wr.transmit_covariance([diffuse(seed) for seed in range(3)], wr.PlanarArray(3, 4))
+    scattered = wr.channel.transmit_covariance([diffuse(seed) for seed in range(3)], wr.PlanarArray(3, 4))
     for covariances, quiet in ((rank_one(h), noise), (scattered, 0.1)):
-        w = wr.precoders(covariances, "slnr", noise=quiet)
+        w = wr.channel.precoders(covariances, "slnr", noise=quiet)
         for own, found in zip(covariances, w, strict=True):
             leaked = covariances.sum(axis=0) - own + len(covariances) * quiet * np.eye(ELEMENTS)
             values, vectors = eigh(own, leaked)
@@ -67,7 +67,7 @@ def test_slnr_is_the_generalised_eigenvector_and_for_channels_the_mmse_precoder(
             assert alike(found[None], best)[0] == pytest.approx(1.0, abs=1e-9)
             ratio = (found.conj() @ own @ found) / (found.conj() @ leaked @ found)
             assert ratio.real == pytest.approx(values[-1], rel=1e-9)
-    w = wr.precoders(h, "slnr", noise=noise)
+    w = wr.channel.precoders(h, "slnr", noise=noise)
     mmse = h.conj().T @ np.linalg.inv(h @ h.conj().T + USERS * noise * np.eye(USERS))
     np.testing.assert_allclose(alike(w, mmse.T / np.linalg.norm(mmse.T, axis=1)[:, None]), 1.0, rtol=1e-12)
 
@@ -75,33 +75,33 @@ def test_slnr_is_the_generalised_eigenvector_and_for_channels_the_mmse_precoder(
 def test_slnr_lies_between_maximum_ratio_and_zero_forcing() -> None:
     h = rayleigh()
     for channels in (h, rank_one(h)):
-        loud, quiet = (wr.precoders(channels, "slnr", noise=n) for n in (1.0, 1e-18))
-        np.testing.assert_allclose(alike(loud, wr.precoders(h, "mr", noise=1.0)), 1.0, rtol=1e-9)
-        np.testing.assert_allclose(alike(quiet, wr.precoders(h, "zf", noise=1.0)), 1.0, rtol=1e-6)
+        loud, quiet = (wr.channel.precoders(channels, "slnr", noise=n) for n in (1.0, 1e-18))
+        np.testing.assert_allclose(alike(loud, wr.channel.precoders(h, "mr", noise=1.0)), 1.0, rtol=1e-9)
+        np.testing.assert_allclose(alike(quiet, wr.channel.precoders(h, "zf", noise=1.0)), 1.0, rtol=1e-6)
     for noise in (1e-11, 1e-9, 1e-7):
         rate = {}
         for method in ("mr", "zf", "slnr"):
             rates = []
             for seed in range(40):
                 h = rayleigh(users=8, seed=seed)
-                w = wr.precoders(h, method, noise=noise)
-                rates.append(np.log2(1.0 + wr.precoded_sinr(h, w, noise=noise)).sum())
+                w = wr.channel.precoders(h, method, noise=noise)
+                rates.append(np.log2(1.0 + wr.channel.precoded_sinr(h, w, noise=noise)).sum())
             rate[method] = np.mean(rates)
         assert rate["slnr"] > max(rate["mr"], rate["zf"]) - 1e-9
 
 
 def test_covariance_gives_every_pair_of_beams_its_mean_gain() -> None:
-    tx = wr.dft_codebook(wr.PlanarArray(4, 4, pattern="tr38901"))
-    rx = wr.dft_codebook(wr.PlanarArray(2, 2, orientation=(0.4, 0.1, 0.0)))
+    tx = wr.channel.dft_codebook(wr.PlanarArray(4, 4, pattern="tr38901"))
+    rx = wr.channel.dft_codebook(wr.PlanarArray(2, 2, orientation=(0.4, 0.1, 0.0)))
     users = [diffuse(seed) for seed in range(3)]
     chosen = np.array([3, 0, 2])
-    found = wr.transmit_covariance(users, tx, rx, rx=chosen)
-    gains = np.stack([wr.beam_gains(p, tx, rx)[beam] for p, beam in zip(users, chosen, strict=True)])
+    found = wr.channel.transmit_covariance(users, tx, rx, rx=chosen)
+    gains = np.stack([wr.channel.beam_gains(p, tx, rx)[beam] for p, beam in zip(users, chosen, strict=True)])
     power = np.einsum("bn,unm,bm->ub", tx.weights.conj(), found, tx.weights).real
     np.testing.assert_allclose(power, gains, rtol=1e-10)
-    stacked = wr.transmit_covariance(wr.Paths.stack(users), tx, rx, rx=chosen)
+    stacked = wr.channel.transmit_covariance(wr.Paths.stack(users), tx, rx, rx=chosen)
     np.testing.assert_allclose(stacked, found, rtol=1e-12)
-    one = wr.transmit_covariance(users[0], wr.PlanarArray(1, 1))
+    one = wr.channel.transmit_covariance(users[0], wr.PlanarArray(1, 1))
     assert one.shape == (1, 1, 1)
     assert one[0, 0, 0].real == pytest.approx(users[0].power.sum(), rel=1e-12)
 
@@ -113,18 +113,18 @@ def test_covariance_is_the_mean_over_phases() -> None:
         [user.cfr([CARRIER], tx_array=array, diffuse="random_phase", seed=s)[0, :, 0] for s in range(3000)]
     )
     mean = np.einsum("si,sj->ij", drawn.conj(), drawn) / len(drawn)
-    found = wr.transmit_covariance(user, array)[0]
+    found = wr.channel.transmit_covariance(user, array)[0]
     assert np.linalg.norm(mean - found) < 0.05 * np.linalg.norm(found)
 
 
 def test_sinr_of_beams_is_that_of_the_multi_user_choice() -> None:
-    book = wr.dft_codebook(wr.PlanarArray(3, 4))
+    book = wr.channel.dft_codebook(wr.PlanarArray(3, 4))
     h = rayleigh()
     gains = [np.abs(book.received(row))[None] ** 2 for row in h]
     sent = np.array([1, 5, 7, 2])
     expected = signal_over_interference(gains, sent, np.zeros(USERS, int), 1e-9)
     for channels in (h, rank_one(h)):
-        sinr = wr.precoded_sinr(channels, 3.0 * book.weights[sent], noise=1e-9)
+        sinr = wr.channel.precoded_sinr(channels, 3.0 * book.weights[sent], noise=1e-9)
         np.testing.assert_allclose(sinr, expected, rtol=1e-9)
 
 
@@ -137,18 +137,18 @@ def test_bad_input_is_named() -> None:
         ({"channels": rayleigh(5, 4), "method": "zf"}, "cannot part 5 users by 4 elements"),
     ):
         with pytest.raises(ValueError, match=message):
-            wr.precoders(**({"channels": h, "method": "slnr", "noise": 1e-9} | change))
+            wr.channel.precoders(**({"channels": h, "method": "slnr", "noise": 1e-9} | change))
     with pytest.raises(ValueError, match="rx: got None, expected the index of a beam for each of 1 users"):
-        wr.transmit_covariance(diffuse(0), array, array)
+        wr.channel.transmit_covariance(diffuse(0), array, array)
     with pytest.raises(ValueError, match="without a departure angle"):
-        wr.transmit_covariance(replace(diffuse(0), theta_t=np.full(5, np.nan)), array)
+        wr.channel.transmit_covariance(replace(diffuse(0), theta_t=np.full(5, np.nan)), array)
 
 
 def test_a_user_without_power_counts_as_dark_where_rates_are_reckoned() -> None:
     h = rayleigh()
-    w = wr.precoders(h, "zf", noise=1e-9)
+    w = wr.channel.precoders(h, "zf", noise=1e-9)
     dark = h.copy()
     dark[1] = 0.0
-    sinr = wr.precoded_sinr(dark, w, noise=1e-9)
+    sinr = wr.channel.precoded_sinr(dark, w, noise=1e-9)
     assert sinr[1] == 0.0
     assert (np.delete(sinr, 1) > 0).all()

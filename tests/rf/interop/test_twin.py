@@ -25,7 +25,7 @@ def field():
 
 @pytest.fixture(scope="module")
 def twin(field, tmp_path_factory):
-    return wr.write_twin(field, tmp_path_factory.mktemp("twin") / "twin")
+    return wr.interop.write_twin(field, tmp_path_factory.mktemp("twin") / "twin")
 
 
 def spectra(twin, receivers, **options):
@@ -75,7 +75,7 @@ def test_sionna_opens_the_scene_as_it_is_and_our_loader_sets_the_scattering_patt
     import sionna.rt as rt
 
     bare = rt.load_scene(str(twin.xml), merge_shapes=False)
-    loaded = wr.load_sionna_scene(twin.xml, frequency_hz=F)
+    loaded = wr.interop.load_sionna_scene(twin.xml, frequency_hz=F)
     assert loaded.frequency.numpy()[0] == pytest.approx(F)
     assert set(bare.objects) == set(loaded.objects) == {"surface_walls", "surface_block_top__1_"}
     for group, alpha_r in zip(twin.groups, (4, None), strict=True):
@@ -88,7 +88,7 @@ def test_sionna_opens_the_scene_as_it_is_and_our_loader_sets_the_scattering_patt
         assert isinstance(pattern, rt.DirectivePattern if alpha_r else rt.LambertianPattern)
         assert getattr(pattern, "alpha_r", None) == alpha_r
     with pytest.raises(ValueError, match="140 GHz"):
-        wr.load_sionna_scene(twin.xml, frequency_hz=140e9)
+        wr.interop.load_sionna_scene(twin.xml, frequency_hz=140e9)
 
 
 def test_sionna_scatters_and_mirrors_as_the_field(twin, field):
@@ -182,7 +182,7 @@ def test_a_slabs_curve_is_the_mean_over_its_fringes(thickness):
 def test_slabs_are_as_thick_as_the_scene_or_the_caller_says_and_else_let_nothing_through(field, tmp_path):
     assert np.isinf(field.surface.thickness_m).all()  # the room's
     unknown = replace(field, surface=replace(field.surface, thickness_m=np.array([0.02, np.nan, np.nan])))
-    found = wr.write_twin(unknown, tmp_path / "scene")
+    found = wr.interop.write_twin(unknown, tmp_path / "scene")
     assert [group.thickness_m for group in found.groups] == [0.02, np.inf]
     assert "block/top <1>" in found.left_out[0] and "walls" not in found.left_out[0]
     assert wr.Scene.load(found.xml).materials[0].thickness_m == pytest.approx(0.02)
@@ -190,8 +190,8 @@ def test_slabs_are_as_thick_as_the_scene_or_the_caller_says_and_else_let_nothing
     alike = replace(
         nowhere, material=np.array([0, 0, 1])
     )  # one material is one slab, however little is known
-    assert [group.name for group in wr.write_twin(alike, tmp_path / "alike").groups] == ["walls"]
-    given = wr.write_twin(unknown, tmp_path / "given", thickness_m={"block/top <1>": 0.3})
+    assert [group.name for group in wr.interop.write_twin(alike, tmp_path / "alike").groups] == ["walls"]
+    given = wr.interop.write_twin(unknown, tmp_path / "given", thickness_m={"block/top <1>": 0.3})
     assert [group.thickness_m for group in given.groups] == [0.02, 0.3] and given.left_out == ()
     unknown.save(tmp_path / "field.safetensors")
     words = ["twin", str(tmp_path / "field.safetensors"), "-o", str(tmp_path / "cli"), "--thickness", "0.3"]
@@ -199,11 +199,11 @@ def test_slabs_are_as_thick_as_the_scene_or_the_caller_says_and_else_let_nothing
     assert [m.thickness_m for m in wr.Scene.load(tmp_path / "cli" / "scene.xml").materials] == [0.3, 0.3]
     for wrong in ({"door": 0.1}, -1.0, {"walls": 0.0}):
         with pytest.raises(ValueError, match="thickness_m"):
-            wr.write_twin(unknown, tmp_path / "x", thickness_m=wrong)
+            wr.interop.write_twin(unknown, tmp_path / "x", thickness_m=wrong)
 
 
 def test_what_no_material_can_hold_is_said(field, tmp_path):
-    assert wr.write_twin(field, tmp_path / "plain").left_out == ()
+    assert wr.interop.write_twin(field, tmp_path / "plain").left_out == ()
     parameters = replace(
         field.parameters, log_gain=np.log(10**0.35), log_indirect=np.array([-9.0, -9.0, -9.0])
     )
@@ -214,7 +214,7 @@ def test_what_no_material_can_hold_is_said(field, tmp_path):
         residual=residual,
         terms=Terms(lobes=LOBES, residual=True, indirect=True),
     )
-    found = wr.write_twin(rich, tmp_path / "rich")
+    found = wr.interop.write_twin(rich, tmp_path / "rich")
     gain, elements, indirect = found.left_out
     assert "3.50 dB" in gain
     assert "1.00 dB" in elements
@@ -222,7 +222,7 @@ def test_what_no_material_can_hold_is_said(field, tmp_path):
     about = json.loads((tmp_path / "rich" / "materials.json").read_text())["about"]
     assert gain in about
     alike = replace(field, terms=Terms(lobes=LOBES, reciprocal=True))
-    assert "reciprocity" in wr.write_twin(alike, tmp_path / "alike").left_out[0]
+    assert "reciprocity" in wr.interop.write_twin(alike, tmp_path / "alike").left_out[0]
 
 
 def test_a_reciprocal_lobe_becomes_the_nearest_of_the_other_kind():
@@ -235,27 +235,27 @@ def test_a_reciprocal_lobe_becomes_the_nearest_of_the_other_kind():
 def test_an_earlier_twin_is_replaced_and_nothing_else(field, tmp_path):
     folder = tmp_path / "twin"
     folder.mkdir()
-    wr.write_twin(field, folder)
+    wr.interop.write_twin(field, folder)
     darker = replace(field.parameters, log_excess=field.parameters.log_excess - 1.0)
-    wr.write_twin(replace(field, parameters=darker), folder)
+    wr.interop.write_twin(replace(field, parameters=darker), folder)
     again = wr.Scene.load(folder / "scene.xml")
     assert again.materials[0].permittivity(F).real == pytest.approx(1 + 2 / np.e, rel=2e-3)
     assert [path.name for path in tmp_path.iterdir()] == ["twin"]
     (folder / "notes.txt").write_text("mine")
     with pytest.raises(ValueError, match=r"folder.*notes\.txt"):
-        wr.write_twin(field, folder)
+        wr.interop.write_twin(field, folder)
     (folder / "notes.txt").unlink()
     (folder / "materials.json").write_text("{")
     with pytest.raises(ValueError, match="no earlier twin"):
-        wr.write_twin(field, folder)
+        wr.interop.write_twin(field, folder)
     with pytest.raises(ValueError, match=r"file .*materials\.json"):
-        wr.write_twin(field, folder / "materials.json")
+        wr.interop.write_twin(field, folder / "materials.json")
 
 
 @pytest.mark.parametrize("what", ["disk full", "stale handle"])
 def test_a_failed_write_leaves_the_earlier_twin(what, field, tmp_path, monkeypatch):
     folder, rename = tmp_path / "twin", Path.rename
-    wr.write_twin(field, folder)
+    wr.interop.write_twin(field, folder)
     before = (folder / "scene.xml").read_bytes()
 
     def failing(self, target, *_):
@@ -265,14 +265,16 @@ def test_a_failed_write_leaves_the_earlier_twin(what, field, tmp_path, monkeypat
 
     monkeypatch.setattr(*((twins, "write_mesh") if what == "disk full" else (Path, "rename")), failing)
     with pytest.raises(OSError, match=what):
-        wr.write_twin(field, folder)
+        wr.interop.write_twin(field, folder)
     assert (folder / "scene.xml").read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["twin"]
 
 
 def test_fields_without_materials_are_refused(field, tmp_path):
     with pytest.raises(TypeError, match="field.*RadioField"):
-        wr.write_twin(object(), tmp_path / "twin")
+        wr.interop.write_twin(object(), tmp_path / "twin")
     with pytest.raises(ValueError, match="line of sight alone"):
-        wr.write_twin(replace(field, terms=Terms(lobes=LOBES, diffuse=False, mirror_order=0)), tmp_path / "x")
+        wr.interop.write_twin(
+            replace(field, terms=Terms(lobes=LOBES, diffuse=False, mirror_order=0)), tmp_path / "x"
+        )
     assert list(tmp_path.iterdir()) == []

@@ -16,7 +16,7 @@ from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.materials import Effects
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.maps.links import BeamSearch, directivity, links_of
-from warprrf.rf.maps.radio_map import QUANTITIES, RadioMap, in_the_air
+from warprrf.rf.maps.radio_map import QUANTITIES, RadioMap, is_free
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_solid_angles
 
 WAVELENGTH = SPEED_OF_LIGHT / F
@@ -167,7 +167,7 @@ def test_solids_are_no_cells_even_of_a_torn_mesh(scene: RadioScene) -> None:
     box = ((points > [2.2, 1.6, 0]) & (points < [3.0, 2.4, 2.4])).all(axis=1)
     clear = scene.mesh.distance(points) > 0.1  # nearer to a wall one missing face fills half the view
     for mesh in (scene.mesh, torn, Mesh(torn.vertices, torn.faces[:, ::-1])):
-        np.testing.assert_array_equal(in_the_air(mesh, points, TX)[clear], (room & ~box)[clear])
+        np.testing.assert_array_equal(is_free(mesh, points, TX)[clear], (room & ~box)[clear])
 
 
 def test_map_of_a_furnished_room_has_a_hole(found: RadioMap) -> None:
@@ -214,7 +214,7 @@ def test_pictures_show_every_quantity(found: RadioMap, tmp_path: Path) -> None:
     for quantity in QUANTITIES:
         ax = found.plot(quantity)
         shown = np.asarray(ax.images[0].get_array().filled(np.nan))
-        np.testing.assert_allclose(shown, found.shown(quantity), equal_nan=True)
+        np.testing.assert_allclose(shown, found.plot_values(quantity), equal_nan=True)
 
 
 @pytest.mark.parametrize(

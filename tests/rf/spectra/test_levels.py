@@ -41,7 +41,7 @@ def spectra(total_db: np.ndarray) -> SpectrumDataset:
 
 @pytest.mark.parametrize(("spoil", "unit"), UNITS)
 def test_powers_of_another_unit_are_questioned_and_the_unit_guessed(spoil, unit: str, tmp_path: Path) -> None:
-    """As much as was sent is an error, far above line of sight a warning: in tables, in spectra and their files, in a fit."""
+    """As much as was transmitted is an error, far above line of sight a warning: in tables, spectra, their files and fits."""
     power_db, good = np.asarray(spoil(TRUE_DB)), spectra(TRUE_DB)
     ends = zip(("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z"), [*np.zeros((3, 3)), *RX.T], strict=True)
     table = dict(ends) | {"power_db": power_db}

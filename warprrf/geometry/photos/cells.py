@@ -150,7 +150,7 @@ def seen_cells(planes: Sequence[Plane], cameras: Sequence[Camera]) -> list[Plane
 
 
 def surface_shares(mesh: Mesh, planes: Sequence[Plane], cameras: Sequence[Camera]) -> tuple[float, float]:
-    """Shares of the area of ``mesh`` that no camera sees, and that some see but only edges told of (plain planes)."""
+    """Shares of the area of ``mesh`` that no camera sees, and that some see but only edges show (plain planes)."""
     centres, normals, areas = mesh.triangles.mean(axis=1), mesh.face_normals, mesh.areas
     seen = np.zeros(len(centres), dtype=bool)
     for camera in cameras:

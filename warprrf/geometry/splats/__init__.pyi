@@ -1,4 +1,4 @@
-# == nouns ==
+# == classes ==
 # pinhole and spherical cameras
 from warprrf.geometry.splats.camera import Camera as Camera
 
@@ -17,6 +17,6 @@ from warprrf.geometry.splats.render import BlendWeights as BlendWeights
 # rays from any points through Gaussians
 from warprrf.geometry.splats.gaussian_rays import GaussianRays as GaussianRays
 
-# == verbs ==
+# == functions ==
 # weights of a view, for fits that keep the geometry
 from warprrf.geometry.splats.render import blend_weights as blend_weights

@@ -313,9 +313,9 @@ class Rasterizer:
             n in (None, own) for n, own in zip(shape, array.shape, strict=True)
         )
         if not fits or not wp.types.types_equal(array.dtype, kind) or array.device != self.device:
-            told = tuple("any" if n is None else n for n in shape)
+            wanted = tuple("any" if n is None else n for n in shape)
             raise ValueError(
-                f"{name}: got {array.shape} of {array.dtype.__name__} on {array.device}, expected {told} of "
+                f"{name}: got {array.shape} of {array.dtype.__name__} on {array.device}, expected {wanted} of "
                 f"{kind.__name__} on {self.device}"
             )
 

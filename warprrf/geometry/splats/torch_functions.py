@@ -92,7 +92,7 @@ def ray_transmittance(
     blending: Blending | None = None,
 ) -> torch.Tensor:
     """Share of light that passes from ``a`` to ``b`` (N, 3) or (3,) [m], shape ``(N,)``: see
-    :meth:`warprrf.GaussianRays.transmittance`; differentiable in the four tensors, not in the points.
+    :meth:`warprrf.splats.GaussianRays.transmittance`; differentiable in the four tensors, not in the points.
 
     Raises:
         TypeError, ValueError: naming the argument that does not fit.
@@ -115,7 +115,7 @@ def ray_hits(
     blending: Blending | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """The first ``k`` Gaussians along each ray: index, t, alpha, weight (N, K) and left (N,), see
-    :meth:`warprrf.GaussianRays.hits`; all but the index differentiable in the four tensors, not in the rays.
+    :meth:`warprrf.splats.GaussianRays.hits`; all but the index differentiable in the four tensors, not in the rays.
 
     Raises:
         TypeError, ValueError: naming the argument that does not fit.

@@ -77,7 +77,9 @@ def build(real: type) -> Any:
         return vec2(te, tm)
 
     @wp.func
-    def mirrors(t: Table, m: Materials, excess: wp.array(dtype=real), i: int, begin: int, end: int, raised: int):
+    def mirrors(
+        t: Table, m: Materials, excess: wp.array(dtype=real), i: int, begin: int, end: int, raised: int
+    ):
         """Jones matrix of the mirrors in columns ``begin`` to ``end``; of ``raised`` the derivative to ln x."""
         whole = mat2(real(1.0), real(0.0), real(0.0), real(1.0))
         for k in range(wp.static(MOST)):
@@ -213,7 +215,9 @@ def build(real: type) -> Any:
                     angle = t.angle[i, t.rough]
                     sum = mixed(t, m, m.weight, i, row)
                     for j in range(lobes):
-                        slope[b, place[row] + j] += p * m.weight[row, j] * lobe(m, j, angle, t.half_width) / sum
+                        slope[b, place[row] + j] += (
+                            p * m.weight[row, j] * lobe(m, j, angle, t.half_width) / sum
+                        )
                     r = half_space(m.excess[row], angle[0])
                     rise = wp.dot(r, half_space_slope(m.excess[row], angle[0]))
                     if m.reciprocal == 1:

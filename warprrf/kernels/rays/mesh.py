@@ -258,7 +258,7 @@ def closest_faces(
 
 
 @wp.kernel(enable_backward=False)
-def look_around(
+def find_crossings(
     offset: int,
     bvh: wp.uint64,
     corners: wp.array2d(dtype=wp.vec3d),
@@ -307,3 +307,70 @@ def look_around(
                     first = enters
     winding[i] = crossed
     side[i] = first
+
+
+@wp.struct
+class OverlapFaces:
+    """Faces: corners [m], unit normals, areas [m^2], the part and the group that each is of; and the areas of parts."""
+
+    corners: wp.array2d(dtype=wp.vec3d)
+    normal: wp.array(dtype=wp.vec3d)
+    area: wp.array(dtype=wp.float64)
+    part: wp.array(dtype=wp.int32)
+    group: wp.array(dtype=wp.int32)
+    part_area: wp.array(dtype=wp.float64)
+
+
+@wp.func
+def shared_width(corners: wp.array2d(dtype=wp.vec3d), i: int, j: int, normal: wp.vec3d):
+    """How far two triangles reach into each other, seen along ``normal`` [m]: least over the sides of the first."""
+    least = wp.float64(wp.inf)
+    for k in range(3):
+        across = wp.normalize(wp.cross(normal, corners[i, (k + 1) % 3] - corners[i, k]))
+        low = wp.vec2d(wp.float64(wp.inf), wp.float64(wp.inf))
+        high = -low
+        for c in range(3):
+            at = wp.vec2d(wp.dot(across, corners[i, c]), wp.dot(across, corners[j, c]))
+            low = wp.min(low, at)
+            high = wp.max(high, at)
+        least = wp.min(least, wp.min(high[0], high[1]) - wp.max(low[0], low[1]))
+    return least
+
+
+@wp.kernel(enable_backward=False)
+def find_overlaps(
+    offset: int, bvh: wp.uint64, faces: OverlapFaces, distance: wp.float64, other: wp.array(dtype=wp.int32)
+):
+    """For each face, one of another part of its group that it lies on, of the largest if several; unchanged if none.
+
+    The smaller one's corners lie within ``distance`` [m] of the larger one's plane, and what both share is as wide or
+    wider. ``bvh`` holds the faces' boxes, wider by ``distance`` or more.
+    """
+    i = offset + wp.tid()
+    a = faces.corners[i, 0]
+    b = faces.corners[i, 1]
+    c = faces.corners[i, 2]
+    query = wp.bvh_query_aabb(bvh, narrow(wp.min(wp.min(a, b), c)), narrow(wp.max(wp.max(a, b), c)))
+    most = wp.float64(0.0)
+    j = int(0)
+    while wp.bvh_query_next(query, j):
+        part = faces.part[j]
+        if part != faces.part[i] and faces.group[j] == faces.group[i]:
+            if faces.part_area[part] > most:
+                large = i
+                small = j
+                if faces.area[j] > faces.area[i]:
+                    large = j
+                    small = i
+                normal = faces.normal[large]
+                apart = wp.float64(0.0)
+                for k in range(3):
+                    height = wp.dot(normal, faces.corners[small, k] - faces.corners[large, 0])
+                    apart = wp.max(apart, wp.abs(height))
+                if apart <= distance:
+                    width = wp.min(
+                        shared_width(faces.corners, i, j, normal), shared_width(faces.corners, j, i, normal)
+                    )
+                    if width >= distance:
+                        most = faces.part_area[part]
+                        other[i] = j

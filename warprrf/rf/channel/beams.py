@@ -308,8 +308,10 @@ def select_beams_multiuser(
     if not gains:
         raise ValueError("sources: got none, expected a spectrum or paths for every user")
     served = _search(gains, noise * len(gains))
-    received, sent = (np.array([served[u][k] for u in range(len(gains))]) for k in (0, 1))
-    return MultiUserChoice(sent, received, signal_over_interference(gains, sent, received, noise))
+    received, transmitted = (np.array([served[u][k] for u in range(len(gains))]) for k in (0, 1))
+    return MultiUserChoice(
+        transmitted, received, signal_over_interference(gains, transmitted, received, noise)
+    )
 
 
 @checked
@@ -324,16 +326,16 @@ def signal_over_interference(
         noise: Noise power over the total transmitted power.
     """
     users = len(gains)
-    sent, received = (
+    transmitted, received = (
         check_array(name, value, (users,), np.int64) for name, value in (("tx", tx), ("rx", rx))
     )
     tables = [check_array("gains", g, (None, None)) for g in gains]
-    for name, index, axis in (("rx", received, 0), ("tx", sent, 1)):
+    for name, index, axis in (("rx", received, 0), ("tx", transmitted, 1)):
         fewest = min((table.shape[axis] for table in tables), default=0)
         if users and not -fewest <= index.min() <= index.max() < fewest:
             raise ValueError(f"{name}: got beams {index.min()} to {index.max()}, expected 0 to {fewest - 1}")
     check_positive("noise", noise, "noise power")
-    heard = np.array([table[r, sent] for table, r in zip(tables, received, strict=True)]).reshape(
+    heard = np.array([table[r, transmitted] for table, r in zip(tables, received, strict=True)]).reshape(
         users, users
     )
     signal = np.diag(heard)
@@ -368,8 +370,8 @@ def _sum_rates(
 ) -> np.ndarray:
     """Sum of rates if ``user`` takes each pair of beams while ``others`` keep theirs, shape ``(Br, Bt)``."""
     own = gains[user]
-    sent = [pair[1] for pair in others.values()]
-    rates = np.log2(1.0 + own / (noise + own[:, sent].sum(axis=1, keepdims=True)))
+    taken = [pair[1] for pair in others.values()]
+    rates = np.log2(1.0 + own / (noise + own[:, taken].sum(axis=1, keepdims=True)))
     for v, (received, transmitted) in others.items():
         heard = gains[v][received]
         rest = noise + sum(heard[t] for w, (_, t) in others.items() if w != v)

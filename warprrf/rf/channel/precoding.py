@@ -77,8 +77,8 @@ def transmit_covariance(
                 total += (received * power[part]).sum()
                 continue
             away = departure[part]
-            sent = tx.response(away, 1.0) * np.sqrt(received * power[part] * tx.gain(away))[:, None]
-            total += sent.conj().T @ sent
+            transmitted = tx.response(away, 1.0) * np.sqrt(received * power[part] * tx.gain(away))[:, None]
+            total += transmitted.conj().T @ transmitted
     return found
 
 

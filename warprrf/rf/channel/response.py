@@ -198,9 +198,9 @@ def impulse_response(paths: PathArrays, **link: Unpack[LinkOptions]) -> tuple[np
     for one in _links(paths, **link):
         a = np.zeros((*one.ports, count), dtype=complex)
         each = np.full((*one.ports, count), np.nan)
-        for index, (received, sent), job in one.jobs():
+        for index, (received, transmitted), job in one.jobs():
             factor, longer = job.pairs(one.carrier_hz)
-            place = received, sent, one.index[index]
+            place = received, transmitted, one.index[index]
             a[place] = job.amplitude * factor * carrier_phase(-one.carrier_hz, one.shift_s)
             each[place] = longer / SPEED_OF_LIGHT + job.tau - one.shift_s
         tau = np.full(count, np.nan)
@@ -400,8 +400,8 @@ def _amplitudes(paths: PathArrays, tx: PlanarArray, rx: PlanarArray) -> np.ndarr
             "paths: polarised arrays need polarised amplitudes, but some paths hold powers alone; trace them in a "
             "scene with materials, or use arrays without polarisation"
         )
-    received, sent = rx.field(paths.arrival), tx.field(paths.departure)
-    return np.einsum("apx,pxy,bpy->abp", received, paths.jones, sent)
+    received, transmitted = rx.field(paths.arrival), tx.field(paths.departure)
+    return np.einsum("apx,pxy,bpy->abp", received, paths.jones, transmitted)
 
 
 def _choice(name: str, value: object, allowed: tuple[str, ...]) -> None:

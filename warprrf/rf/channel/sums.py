@@ -141,7 +141,7 @@ class Sum:
         own = self.lengths
         if own.separable:
             added = own.received()[0]
-            factor = self.received(frequency_hz)[:, None] * self.sent(frequency_hz)
+            factor = self.received(frequency_hz)[:, None] * self.transmitted(frequency_hz)
             return factor, added[:, None] + own.extra
         longer, ratio = own.longer()
         return ratio * _turn(frequency_hz, longer), longer
@@ -151,7 +151,7 @@ class Sum:
         added, ratio = self.lengths.received()
         return ratio * _turn(frequency_hz, added)
 
-    def sent(self, frequency_hz: float) -> np.ndarray:
+    def transmitted(self, frequency_hz: float) -> np.ndarray:
         """Of separable lengths: factors of transmitting elements at a frequency, shape ``(N, P)``."""
         return self.lengths.scale * _turn(frequency_hz, self.lengths.extra)
 
@@ -190,7 +190,7 @@ def squint_sum(job: Sum, frequencies_hz: np.ndarray, factor: np.ndarray | None) 
             weight = job.amplitude * carrier_phase(f - job.carrier_hz, job.tau)
             if factor is not None:
                 weight = weight * factor[:, j]
-            out[m, n, j] = block.received(f) @ (block.sent(f) * weight).T
+            out[m, n, j] = block.received(f) @ (block.transmitted(f) * weight).T
     return out
 
 

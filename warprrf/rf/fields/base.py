@@ -103,9 +103,11 @@ class RadioField(ABC):
             ds: training set: spectra, and for a ``bistatic`` field also :class:`Readings`, or a list of both.
             model: ``"bistatic"``, ``"rf3dgs+"`` or ``"rf3dgs"``.
             options: by name, ``device`` and ``progress`` among them. A ``bistatic`` field takes ``client``, and those of
-                :class:`warprrf.FitOptions`: ``quick=True``, ``relevance``, ``mirror_order``, ``diffuse_order``, ``lobes``,
-                ``reciprocal``, ``residual``, ``gain_offset``, ``iterations``, ``seed``, ... The others take those of
-                :class:`warprrf.FieldOptions`: ``iterations``, ``batch``, ``sh_degree``, ``checkpoint``, ``seed``, ...
+                :class:`~warprrf.rf.fields.bistatic.fit.FitOptions`: ``quick=True``, ``relevance``,
+                ``mirror_order``, ``diffuse_order``, ``lobes``, ``reciprocal``, ``residual``, ``gain_offset``,
+                ``iterations``, ``seed``, ... The others take those of
+                :class:`~warprrf.rf.fields.harmonic.options.FieldOptions`: ``iterations``, ``batch``, ``sh_degree``,
+                ``checkpoint``, ``seed``, ...
 
         Raises:
             ValueError, TypeError: for an unknown model or bad arguments.
@@ -415,7 +417,11 @@ class RadioField(ABC):
         ends = self.check_positions(receivers, transmitter)
         rows, found = np.zeros(0, int), []
         for source, own in ends.groups():
-            tell = None if progress is None else partial(_told, progress, len(rows), len(ends.receivers))
+            tell = (
+                None
+                if progress is None
+                else partial(_progress_after, progress, len(rows), len(ends.receivers))
+            )
             options = LinkOptions(beam_sigma_rad, shape, mirror_order, client, tell)
             found.append(self.trace_links(ends.receivers[own], source, options))
             rows = np.concatenate([rows, own])
@@ -573,7 +579,7 @@ def _cfr(
     return {"cfr": np.stack(found)}
 
 
-def _told(progress: Progress, before: int, total: int, stage: str, done: int, _: int) -> None:
+def _progress_after(progress: Progress, before: int, total: int, stage: str, done: int, _: int) -> None:
     """Progress of a part, after ``before`` of ``total``."""
     progress(stage, before + done, total)
 

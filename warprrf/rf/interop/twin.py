@@ -40,7 +40,7 @@ from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.observations import NEPER
 
-ABOUT = "Digital twin written by warprrf.write_twin."
+ABOUT = "Digital twin written by warprrf."
 """First line of a twin's ``materials.json``: a folder that says so may be replaced."""
 LOSS_TANGENT = 0.02  # least that single precision, which Sionna computes in, surely turns into a decay
 THICKNESS_WAVELENGTHS = (
@@ -155,8 +155,9 @@ def write_twin(
     ``surface_<group>`` of a material ``fitted_<group>``, named by its largest group; it holds within 10 % of the
     field's carrier.
 
-    No material can hold a common gain (an uncalibrated receiver) or residuals of elements, and softened blocking belongs to the field's tracer: :attr:`Twin.left_out` says what this field has of the former, and
-    which materials let nothing through because nobody said how thick they are.
+    No material can hold a common gain (an uncalibrated receiver) or residuals of elements, and softened blocking belongs to
+    the field's tracer: :attr:`Twin.left_out` says what this field has of the former, and which materials let nothing
+    through because nobody said how thick they are.
     Sionna may find one mirror in several small triangles and count it as often; :func:`simulate` counts it once.
 
     Args:
@@ -465,7 +466,7 @@ def _check_replaceable(folder: Path) -> None:
         return
     try:
         table = read_json(folder / "materials.json")
-        twin = found <= _FILES and table["about"][0] == ABOUT
+        twin = found <= _FILES and str(table["about"][0]).startswith(ABOUT)
     except (OSError, ValueError, KeyError, TypeError, IndexError):
         twin = False
     if not twin:

@@ -1,7 +1,7 @@
 """Radio maps: what a link gets at every place of a floor plan.
 
 A cell holds what a receiver at its centre gets, not the mean over the cell. Cells inside solids, outside the room, on a
-surface or in the transmitter's reactive near field hold NaN: see :func:`warprrf.rf.positions.in_the_air`.
+surface or in the transmitter's reactive near field hold NaN: see :func:`warprrf.rf.positions.is_free`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from warprrf.rf.positions import (
     NEAR_FIELD,
     check_positions,
     ground_height,
-    in_the_air,
+    is_free,
 )
 
 BOLTZMANN = 1.380649e-23  # SI [J/K]
@@ -134,7 +134,7 @@ class RadioMap:
             gain = 10.0 * np.log10(self.best_beam_gain)
         return self.transmit_power_dbm + gain - self.noise_power_dbm
 
-    def shown(self, quantity: str) -> np.ndarray:
+    def plot_values(self, quantity: str) -> np.ndarray:
         """``quantity`` as it is drawn: gains in dB, delay spread in ns, shape ``(Y, X)``.
 
         Raises:
@@ -161,7 +161,7 @@ class RadioMap:
             ImportError: if matplotlib is missing.
             ValueError: for an unknown quantity.
         """
-        value = self.shown(quantity)
+        value = self.plot_values(quantity)
         if ax is None:
             _, ax = _device.require("matplotlib.pyplot", extra="plots").subplots(
                 figsize=(8.0, 6.0), layout="constrained"
@@ -191,7 +191,7 @@ class RadioMap:
         for ax, (quantity, name) in zip(figure.subplots(2, 2).flat, QUANTITIES.items(), strict=True):
             self.plot(quantity, ax=ax)
             ax.set_title(name, fontsize=11)
-        budget = f"{self.transmit_power_dbm:g} dBm sent, noise {self.noise_power_dbm:.1f} dBm"
+        budget = f"{self.transmit_power_dbm:g} dBm transmitted, noise {self.noise_power_dbm:.1f} dBm"
         figure.suptitle(
             f"{self.frequency_hz / 1e9:g} GHz at {self.height_m:g} m, cells of {self.cell_m:g} m; receive beam of "
             f"{np.rad2deg(self.beam_sigma_rad):.3g} degrees, {budget}",
@@ -295,7 +295,7 @@ def radio_map(
 ) -> RadioMap:
     """Links at the centres of cells over a floor plan.
 
-    Cells are left out that the field's mesh takes for solid; see :func:`warprrf.rf.positions.in_the_air`.
+    Cells are left out that the field's mesh takes for solid; see :func:`warprrf.rf.positions.is_free`.
 
     Args:
         field: a fitted field with a mesh.
@@ -330,7 +330,7 @@ def radio_map(
     places = np.stack(
         [across, along, np.full_like(across, height) + (0.0 if ground is None else ground)], axis=-1
     )
-    free = in_the_air(mesh, places.reshape(-1, 3), source, device=field.device).reshape(across.shape)
+    free = is_free(mesh, places.reshape(-1, 3), source, device=field.device).reshape(across.shape)
     free &= np.linalg.norm(places - source, axis=-1) > NEAR_FIELD * wavelength_m
     if not free.any():
         raise ValueError(f"bounds: no cell of the {free.size} at {height!r} m lies in the air")

@@ -35,7 +35,7 @@ CURVED_M2, CURVED_SHARE = 0.5, 0.01
 
 _SAMPLE = 1000  # chains from which the number of longer ones is estimated
 _FIRST, _LAUNCH_S = 4096, 0.1  # chains in the first launch; later ones take about so long
-_PARTS = 1000  # of a search, in which its progress is told
+_PARTS = 1000  # of a search, in which its progress is reported
 
 
 @dataclass(frozen=True)

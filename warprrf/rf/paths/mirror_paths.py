@@ -108,7 +108,7 @@ def zone_paths(
     receivers: np.ndarray,
     order: int,
     wavelength_m: float,
-    skin_m: float,
+    position_error_m: float,
     progress: Progress | None = None,
 ) -> MirrorPaths:
     """Paths to ``receivers`` (R, 3) with at most ``order`` reflections, and what share of their Fresnel zones is free.
@@ -121,7 +121,7 @@ def zone_paths(
         receivers: Positions [m].
         order: Most reflections.
         wavelength_m: Wavelength [m].
-        skin_m: Depth of the surface's skin, its position error: zones are wider, and rays end that much before it [m].
+        position_error_m: Position error of the surface: zones are wider, and rays end that much before it [m].
         progress: Called with the stage ``"mirrors"``.
 
     Returns:
@@ -130,7 +130,7 @@ def zone_paths(
     Raises:
         ValueError: before anything is traced, if more chains would be tried than ``images`` allow.
     """
-    zone = ZoneRays(images.patches, images.transmitter, wavelength_m, skin_m, images.device)
+    zone = ZoneRays(images.patches, images.transmitter, wavelength_m, position_error_m, images.device)
     parts = [_described(images.patches, images.transmitter, receivers, zone.line_of_sight(receivers), order)]
     for row, patch, point in images.search(receivers, order, progress):
         if patch.shape[1] > 1:
@@ -144,18 +144,18 @@ def zone_paths(
 
 
 class ZoneRays:
-    """Rays that fill Fresnel zones on a surface with a skin; see :func:`zone_paths`."""
+    """Rays that fill Fresnel zones on a surface with a position error; see :func:`zone_paths`."""
 
     def __init__(
         self,
         patches: PlanarPatches,
         source: np.ndarray,
         wavelength_m: float,
-        skin_m: float,
+        position_error_m: float,
         device: DeviceLike,
     ) -> None:
         self.patches, self.source, self.wavelength_m = patches, source, wavelength_m
-        self.skin_m, self.device = skin_m, device
+        self.position_error_m, self.device = position_error_m, device
         self.samples = np.array(
             [
                 (radius * np.cos(a), radius * np.sin(a))
@@ -166,7 +166,9 @@ class ZoneRays:
 
     def radius(self, near: np.ndarray, far: np.ndarray) -> np.ndarray:
         """Radius of the first zone between two legs, widened by the mesh's error [m]."""
-        return np.sqrt(self.wavelength_m * near * far / np.maximum(near + far, 1e-9) + self.skin_m**2)
+        return np.sqrt(
+            self.wavelength_m * near * far / np.maximum(near + far, 1e-9) + self.position_error_m**2
+        )
 
     def line_of_sight(self, receivers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Receiver, no patches, no points, and share, by rays over the zone's widest place."""
@@ -221,18 +223,18 @@ class ZoneRays:
             free[own] = self._meets(here[own], point[own, k], patch[own, k])
             normal, offset = self.patches.normal[patch[:, k]], self.patches.offset[patch[:, k]]
             side = np.sign((here * normal).sum(axis=1) - offset)
-            here = point[:, k] + (self.skin_m * side)[:, None] * normal
+            here = point[:, k] + (self.position_error_m * side)[:, None] * normal
         own = np.flatnonzero(free)
         free[own] = self.clear(point[own, 0], np.broadcast_to(self.source, (len(own), 3)))
         return free
 
     def clear(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Whether nothing lies between a and b (N, 3), but within the skin of either end."""
+        """Whether nothing lies between a and b (N, 3), but within the position error of either end."""
         way = b - a
         length = np.linalg.norm(way, axis=1)
         toward = way / np.maximum(length, 1e-12)[:, None]
-        hit = self.patches.mesh.cast(a + self.skin_m * toward, toward, device=self.device)
-        return (length <= 2 * self.skin_m) | (hit.t >= length - 2 * self.skin_m)
+        hit = self.patches.mesh.cast(a + self.position_error_m * toward, toward, device=self.device)
+        return (length <= 2 * self.position_error_m) | (hit.t >= length - 2 * self.position_error_m)
 
     def _meets(self, start: np.ndarray, target: np.ndarray, patch: np.ndarray) -> np.ndarray:
         """Whether the ray from ``start`` first meets a surface at ``target``, on the plane of ``patch``."""
@@ -240,11 +242,11 @@ class ZoneRays:
         way = target - start
         length = np.linalg.norm(way, axis=1)
         hit = p.mesh.cast(start, way / np.maximum(length, 1e-12)[:, None], device=self.device)
-        near = np.abs(hit.t - length) <= 2.0 * self.skin_m
+        near = np.abs(hit.t - length) <= 2.0 * self.position_error_m
         met = p.face_patch[np.maximum(hit.face, 0)]
         # A torn seam of the patch passes for it, another patch does not.
         off = np.abs((np.nan_to_num(hit.point) * p.normal[patch]).sum(axis=1) - p.offset[patch])
-        return (hit.face >= 0) & ((met == patch) | (near & (off <= self.skin_m) & (met < 0)))
+        return (hit.face >= 0) & ((met == patch) | (near & (off <= self.position_error_m) & (met < 0)))
 
 
 def _unobstructed(

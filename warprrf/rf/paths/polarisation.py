@@ -149,10 +149,10 @@ def chain_amplitude(
         The amplitude, shape ``(L,)``, and its derivatives to ``log_excess``, shape ``(L, k)``.
     """
     whole, slopes = _chains(log_excess, cosine, turn, reflects)
-    sent, received = ends
+    transmitted, received = ends
     return (
-        np.einsum("li,lij,lj->l", received, whole, sent),
-        np.einsum("li,klij,lj->lk", received, slopes, sent),
+        np.einsum("li,lij,lj->l", received, whole, transmitted),
+        np.einsum("li,klij,lj->lk", received, slopes, transmitted),
     )
 
 

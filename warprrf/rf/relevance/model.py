@@ -89,7 +89,9 @@ def full_field(
     materials come from: ``"scene"``, ``"fit"`` or ``"assumed"``."""
     if isinstance(geometry, BistaticField):
         effects = replace(EVERYTHING, residual=geometry.effects.residual)
-        whole = replace(geometry, effects=effects, transmitter=transmitter, air=None)  # air is judged by itself
+        whole = replace(
+            geometry, effects=effects, transmitter=transmitter, air=None
+        )  # air is judged by itself
         return whole, _unknown_walls(geometry.surface.mesh), "fit"
     surface = Surface.of(geometry)
     frame = Frame(transmitter, frequency_hz, shape, 1.0, (0.0, 1.0), beam_sigma_rad, None)
@@ -194,7 +196,10 @@ class FullModel:
 
     def reduced(self, kept: frozenset[str]) -> BistaticField:
         """The field with the effects ``kept`` alone."""
-        p, lobes = self.field.parameters, tuple(n for n in self.field.parameters.lobes if lobe_name(n) in kept)
+        p, lobes = (
+            self.field.parameters,
+            tuple(n for n in self.field.parameters.lobes if lobe_name(n) in kept),
+        )
         parameters = p if len(lobes) in (0, len(p.lobes)) else with_lobes(p, lobes)
         return replace(self.field, effects=effects_of(kept), parameters=parameters, errors=None)
 
@@ -221,7 +226,8 @@ class FullModel:
         if gas:
             length, records = view.single_bounce_m(), view.records
             own = {
-                name: power * self._air(view.paths.length_m if name == "sharp" else length[records[name].ray], True)
+                name: power
+                * self._air(view.paths.length_m if name == "sharp" else length[records[name].ray], True)
                 for name, power in gains.tables.items()
             }
             gains = replace(gains, tables=own)

@@ -152,13 +152,17 @@ class Relevance:
             )
         m, out = self.model, [e.name for e in self.effects if e.kept is False]
         most = replace(
-            m, mirrors=3 if m.mirrors == 2 else m.mirrors, residual="residual" not in out and m.scatterings > 0
+            m,
+            mirrors=3 if m.mirrors == 2 else m.mirrors,
+            residual="residual" not in out and m.scatterings > 0,
         )
         return most, None if self.materials == "assumed" and m.scatterings else self.lobes
 
     def reduce(self, full: BistaticField) -> BistaticField:
         """``full``, a field with the effects that this was made of, cut down to the smallest model."""
-        return replace(full, effects=self.model, parameters=with_lobes(full.parameters, self.lobes), errors=None)
+        return replace(
+            full, effects=self.model, parameters=with_lobes(full.parameters, self.lobes), errors=None
+        )
 
     def table(self) -> str:
         """The effects as a Markdown table, with what was chosen below it."""
@@ -465,5 +469,9 @@ def _lobe(model: FullModel, n: int) -> str:
         return "the only lobe"
     surface, weight = model.field.surface, model.field.parameters.weight
     area = np.bincount(surface.element_group, surface.element_area, minlength=surface.groups)
-    share = area @ weight[:, model.field.parameters.lobes.index(n)] / max(float(area @ weight.sum(axis=1)), 1e-300)
+    share = (
+        area
+        @ weight[:, model.field.parameters.lobes.index(n)]
+        / max(float(area @ weight.sum(axis=1)), 1e-300)
+    )
     return f"{_percent(float(share))} of the lobes' weight; its neighbours stand in for it"

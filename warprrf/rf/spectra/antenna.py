@@ -5,7 +5,7 @@ value there is y(d) = sum over paths of path gain times G(angle between d and th
 It is undone by Richardson-Lucy steps (Richardson 1972, Lucy 1974), weighted by the pixels' solid angles: estimates stay
 non-negative, a known noise power is part of the model, and each step conserves the total
 ``sum_i Omega_i (y_i - noise) / integral of G``, which is the total path gain whatever the horn. *Fixed*: the antenna
-does not turn and directions were told apart by other means; its pattern over absolute directions divides out.
+does not turn and directions were distinguished by other means; its pattern over absolute directions divides out.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class Deembedded(NamedTuple):
             ``(R, H, W)``, int; -1 where empty.
         steps: Steps taken, shape ``(R,)``, int; 0 for a fixed antenna.
         misfit: Relative misfit of the measurement, weighted by solid angle, shape ``(R,)``; 0 for a fixed antenna.
-        covered: Share of the sphere of which something can be told.
+        covered: Share of the sphere of which the spectrum is known.
         method: What was done, :data:`SCANNED` or :data:`FIXED`.
     """
 
@@ -259,11 +259,11 @@ def _deembed_fixed(power: np.ndarray, gain: np.ndarray, limit_db: float = 20.0) 
     blow up noise and leakage. The total path gain is then that of the directions that are left.
     """
     check_positive("limit_db", limit_db, "number of decibels")
-    told = gain >= gain.max() * 10.0 ** (-limit_db / 10.0)
-    path_gain = np.divide(power, gain, out=np.zeros(power.shape), where=told)
+    known = gain >= gain.max() * 10.0 ** (-limit_db / 10.0)
+    path_gain = np.divide(power, gain, out=np.zeros(power.shape), where=known)
     source = np.where(path_gain > 0, np.arange(gain.size).reshape(gain.shape), -1)
     weight = pixel_solid_angles(gain.shape)[:, None]
-    covered = float((weight * told).sum() / (weight * np.ones_like(gain)).sum())
+    covered = float((weight * known).sum() / (weight * np.ones_like(gain)).sum())
     none = np.zeros(len(power))
     return Deembedded(path_gain, source, none.astype(int), none, covered, FIXED)
 

@@ -168,7 +168,7 @@ class SpectrumDataset:
         The other arguments are the attributes of those names.
 
         Raises:
-            TypeError, ValueError: naming the argument; spectra that sum to as much as was sent are refused.
+            TypeError, ValueError: naming the argument; spectra that sum to as much as was transmitted are refused.
 
         Warns:
             UserWarning: naming receivers that get far more than line of sight would give; see
@@ -392,9 +392,9 @@ class SpectrumDataset:
         ``sum over pixels of (value - noise) times solid angle / integral of the pattern over the sphere``; a spectrum
         of which noise leaves nothing comes out empty.
 
-        A *fixed* antenna did not turn, and directions were told apart otherwise. ``pattern`` is then its gain in each
+        A *fixed* antenna did not turn, and directions were distinguished otherwise. ``pattern`` is then its gain in each
         pixel's direction, ``(H, W)``: pixels are divided by it. Where it lies more than ``limit_db`` below its peak
-        nothing can be told: those pixels become empty, and the sum is that of the others.
+        nothing is known: those pixels become empty, and the sum is that of the others.
 
         Delay and angle of departure are those measured in the direction that gives a pixel most of its power. The
         floor and range are chosen anew; attributes ``deembedded...`` say what was done.

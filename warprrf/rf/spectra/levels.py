@@ -1,4 +1,4 @@
-"""Whether measured powers can be path gains: none reaches what was sent, and few are far above line of sight.
+"""Whether measured powers can be path gains: none reaches what was transmitted, and few are far above line of sight.
 
 Free space gives (lambda / (4 pi d))^2 between isotropic antennas (Friis 1946). What surfaces add is bounded in practice by
 :data:`MARGIN_DB`. Numbers beyond it are mostly in another unit, which is guessed by what would bring the strongest of
@@ -42,7 +42,7 @@ def question_levels(
         hint: what else may have raised them.
 
     Raises:
-        ValueError: naming rows that got as much as was sent, and the likely unit.
+        ValueError: naming rows that received as much as was transmitted, and the likely unit.
 
     Warns:
         UserWarning: naming rows that are further above line of sight, and the likely unit.
@@ -58,12 +58,14 @@ def question_levels(
     elif not len(wrong):
         return
     unit = _likely_unit(level_db[wrong], line_of_sight_db[wrong])
-    told = f"{name}: {len(wrong)} of {len(power)} (rows {some_of(wrong)})"
+    rows = f"{name}: {len(wrong)} of {len(power)} (rows {some_of(wrong)})"
     end = f"{unit}{hint}; expected received over transmitted power"
     if len(impossible):
-        raise ValueError(f"{told} are up to {level_db[wrong].max():.4g} dB, no less than was sent{end}")
+        raise ValueError(
+            f"{rows} are up to {level_db[wrong].max():.4g} dB, no less than was transmitted{end}"
+        )
     warnings.warn(
-        f"{told} are up to {above[wrong].max():.3g} dB above line of sight in free space, where reflections add "
+        f"{rows} are up to {above[wrong].max():.3g} dB above line of sight in free space, where reflections add "
         f"{float(np.max(margin_db)):g} dB at most{end}",
         UserWarning,
         stacklevel=users_level(),
@@ -76,7 +78,7 @@ def _likely_unit(level_db: np.ndarray, line_of_sight_db: np.ndarray) -> str:
         readings = {
             "decibels whose minus signs were lost": -level_db,
             "amplitudes, not powers: square them": 2.0 * level_db,
-            "dBm, not dB: take off the power that was sent [dBm]": level_db - 30.0,
+            "dBm, not dB: subtract the transmitted power [dBm]": level_db - 30.0,
             "linear powers given as decibels": 10.0 * np.log10(level_db),
             "decibels, their minus signs lost, given as linear": -(10.0 ** (level_db / 10.0)),
         }

@@ -247,7 +247,7 @@ class Readings:
 
         Raises:
             ValueError: naming columns that are missing, misspelt or repeated, or calibrated readings of as much as was
-                sent.
+                transmitted.
 
         Warns:
             UserWarning: naming columns that are none of these, or readings far above line of sight.
@@ -334,7 +334,7 @@ def _check_columns(names: Sequence[str]) -> None:
 def question_readings(readings: Readings) -> None:
     """Question readings of too much power; see :func:`~warprrf.rf.spectra.levels.question_levels`.
 
-    Of chains whose gain is not known only readings above what was sent can be told.
+    Of chains whose gain is not known only readings above what was transmitted can be found.
     """
     r, gain_db, known = readings, 0.0, readings.chain == ""
     for pattern in (r.receive_pattern, r.transmit_pattern):
@@ -349,7 +349,7 @@ def question_readings(readings: Readings) -> None:
     if len(above):
         warnings.warn(
             f"power: {len(above)} readings (rows {some_of(above)}) of chains of unknown gain are above 0 dB, more than was "
-            "sent: were minus signs lost, or are they linear?",
+            "transmitted: were minus signs lost, or are they linear?",
             UserWarning,
             stacklevel=users_level(),
         )

@@ -230,7 +230,13 @@ class BistaticField(RadioField):
         effects = replace(o.candidates(frame.frequency_hz)[:2][-1], residual=False)
         lobes = o.exponents(frame.frequency_hz)
         prior = cls.prior(
-            geometry, frame, effects=effects, lobes=lobes, reciprocal=o.reciprocal, sub_pixels=o.rays, device=device
+            geometry,
+            frame,
+            effects=effects,
+            lobes=lobes,
+            reciprocal=o.reciprocal,
+            sub_pixels=o.rays,
+            device=device,
         )
         places_of(data, prior.mesh, device)
         known = [assumed_permittivity(name, prior.frequency_hz) for name in prior.surface.group_names]
@@ -275,7 +281,9 @@ class BistaticField(RadioField):
             range_db=(float(ds.range_db[0]), float(ds.range_db[1])),
             beam_sigma_rad=float(ds.beam_sigma_rad),
             effects=replace(SETS["single"], residual=False) if effects is None else effects,
-            parameters=Parameters.prior(surface.groups, *([] if lobes is None else [lobes]), reciprocal=reciprocal),
+            parameters=Parameters.prior(
+                surface.groups, *([] if lobes is None else [lobes]), reciprocal=reciprocal
+            ),
             material=surface.material,
             residual=np.zeros((2, surface.cells)),
             sub_pixels=sub_pixels,
@@ -502,7 +510,7 @@ class BistaticField(RadioField):
         sensitivity, unknowns = self._sensitivity(self.transmitter)
         places = np.zeros((0, 3)) if self.fitted_on is None else self.fitted_on
         variance = unknowns.variance(sensitivity.precision(places, progress=progress))
-        return uncertainty.NEPER * np.sqrt(variance[: len(self.surface.element_area)])
+        return NEPER * np.sqrt(variance[: len(self.surface.element_area)])
 
     def _sensitivity(self, transmitter: np.ndarray) -> tuple[Sensitivity, Unknowns]:
         tracer = self.tracer(transmitter)
@@ -531,14 +539,21 @@ class BistaticField(RadioField):
         lit = self.evaluation(view.tracer)
         materials = lit.by_materials(self.parameters.take(rows), self.material)
         layout = Layout(len(rows), len(self.parameters.lobes))
-        place = Place(0, rows[:1], view.tracer.transmitter, view.receivers[0], self.frequency_hz, self.shape, self.air)
+        place = Place(
+            0, rows[:1], view.tracer.transmitter, view.receivers[0], self.frequency_hz, self.shape, self.air
+        )
         o = Observation(place, view, SpectrumPixels(self._beam), Target(np.zeros(image.size)), self.floor)
         slopes, index = o.slopes(self.effects, materials, layout)
         power = image.ravel() / self.floor
         if len(self.errors.covariance) > layout.size:  # of a common gain
-            slopes, index = np.concatenate([slopes, power[None].astype(np.float32)]), np.append(index, layout.size)
+            slopes, index = (
+                np.concatenate([slopes, power[None].astype(np.float32)]),
+                np.append(index, layout.size),
+            )
         slopes *= (NEPER / (1.0 + power)).astype(np.float32)
-        return self.errors.std_db(NEPER * np.log1p(power).reshape(image.shape), view.receivers[0], slopes, index)
+        return self.errors.std_db(
+            NEPER * np.log1p(power).reshape(image.shape), view.receivers[0], slopes, index
+        )
 
     # ------------------------------------------------------------------------------------------ files
 

@@ -73,7 +73,8 @@ def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict
         "effects": Effects(**header["effects"]),
         "sub_pixels": header["sub_pixels"],
         "parameters": Parameters(
-            **{name: tensors[f"parameters/{name}"] for name in _PARAMETERS}, **{name: header[name] for name in _SINGLE}
+            **{name: tensors[f"parameters/{name}"] for name in _PARAMETERS},
+            **{name: header[name] for name in _SINGLE},
         ),
         "material": tensors["material"],
         "residual": tensors["residual"],

@@ -93,8 +93,8 @@ class FitOptions:
     Attributes:
         effects: what is modelled: :class:`Effects`, the name of one of :data:`SETS` (``"single"``, ``"room"``,
             ``"everything"``), or ``"auto"``: the set that errs least on receivers held out (a quarter, 30 at most), and the
-            residual if it does not err more. With fewer than eight receivers it is ``"room"``, or ``"single"`` if that fits
-            much better.
+            residual if it does not err more; a larger set is tried where the one before it was better. With fewer than
+            eight receivers it is ``"room"``, or ``"single"`` if that fits much better.
         lobes: exponents of the scattering lobes ((1 + cos psi) / 2)^n, 0 for Lambertian; None for 0, 2, 5, 12, 30.
         reciprocal: lobes that scatter alike when transmitter and receiver change places. By default they are those of
             Degli-Esposti et al. (2007), Sionna RT's, which do not.
@@ -309,7 +309,9 @@ def fit(
     if views is not None:
         places = places_of(data, as_mesh(geometry, "geometry"), device)
         views.check(places, options.sub_pixels)
-        views = replace(views, places=places)  # of a part of what was traced they say where in the whole readings are
+        views = replace(
+            views, places=places
+        )  # of a part of what was traced they say where in the whole readings are
     seen = views or trace(geometry, data, **where)
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
     with threadpool_limits(1, user_api="blas"):
@@ -326,7 +328,9 @@ def fit(
         training.names[k]: [(place.receiver.tolist(), offset.tolist()) for place, offset in own]
         for k, own in offsets.items()
     }
-    return replace(found, report=found.report | {"azimuth_zero_deg": zeros, "position_offset_m": places_moved})
+    return replace(
+        found, report=found.report | {"azimuth_zero_deg": zeros, "position_offset_m": places_moved}
+    )
 
 
 @dataclass(frozen=True)
@@ -397,7 +401,9 @@ class Training:
         totals = all(isinstance(one, Readings) and one.total for one in data)
         candidates = [replace(one, mirrors=min(one.mirrors, seen.mirrors)) for one in candidates]
         if len(candidates) > 1 and any(isinstance(one, ArraySpectra) for one in data):
-            candidates = [replace(one, mirrors=seen.mirrors) for one in candidates]  # they hear the phases of all
+            candidates = [
+                replace(one, mirrors=seen.mirrors) for one in candidates
+            ]  # they hear the phases of all
         if len(candidates) > 1 and totals:
             candidates = candidates[1:2]
         rng, chain = np.random.default_rng(options.seed), np.array([o.chain for o in observations])
@@ -444,9 +450,13 @@ class Training:
     def few(self, times: int) -> np.ndarray:
         """Places that fits which only decide about something learn from, those of every chain among them."""
         others = np.setdiff1d(self.kept, self.always)
-        return np.union1d(self.always, others[: max(times * MOST_TO_CHOOSE - len(self.always), 0)]).astype(int)
+        return np.union1d(self.always, others[: max(times * MOST_TO_CHOOSE - len(self.always), 0)]).astype(
+            int
+        )
 
-    def problem(self, effects: Effects, material: np.ndarray, places: Iterable[int], p: Parameters) -> Problem:
+    def problem(
+        self, effects: Effects, material: np.ndarray, places: Iterable[int], p: Parameters
+    ) -> Problem:
         """What is fitted to readings of ``places``, lit as under parameters ``p`` of materials."""
         return Problem.of(
             [self.parts[k] for k in places], effects, material, p, chains=len(self.chains),
@@ -479,7 +489,9 @@ class Training:
         """All readings at ``places`` under a model, in units of their floors."""
         return [o.predicted(here, materials) for o, here, materials in self.evaluated(model, places)]
 
-    def evaluated(self, model: Model, places: Iterable[int]) -> Iterable[tuple[Observation, Model, Evaluation]]:
+    def evaluated(
+        self, model: Model, places: Iterable[int]
+    ) -> Iterable[tuple[Observation, Model, Evaluation]]:
         """Observations with the model at their carriers, as kernels take it."""
         known: dict[Any, tuple[Model, Evaluation]] = {}
         for k in places:
@@ -493,7 +505,10 @@ class Training:
     def loss(self, model: Model, places: Sequence[int] | np.ndarray) -> float:
         """Mean loss of all readings at ``places`` [dB^2]."""
         predicted = self.predicted(model, places)
-        own = [self.observations[k].losses(x, self.huber_db).mean() for k, x in zip(places, predicted, strict=True)]
+        own = [
+            self.observations[k].losses(x, self.huber_db).mean()
+            for k, x in zip(places, predicted, strict=True)
+        ]
         return float(np.mean(own))
 
     def held_loss(self, choice: Choice) -> float:
@@ -548,7 +563,14 @@ def _fitted(t: Training) -> Fit:
         errors = replace(errors, covariance=_covariance(choice.fitted))
     t.step(last=True)
     rays = t.observations[0].view.tracer.grid.sub_pixels
-    return Fit(t.surface, model, choice.material, rays, errors, _report(t, choice, wrong, time.perf_counter() - started))
+    return Fit(
+        t.surface,
+        model,
+        choice.material,
+        rays,
+        errors,
+        _report(t, choice, wrong, time.perf_counter() - started),
+    )
 
 
 def choose(t: Training) -> Choice:
@@ -559,13 +581,17 @@ def choose(t: Training) -> Choice:
     if len(t.held) < (LEAST_HELD_OUT if len(trials) > 1 else 1):
         return _choose_of_few(t, trials)
     best, least = None, np.inf
-    for trial in trials:
-        trial = t.fitted(replace(trial, fitted=best.fitted if best else start), t.few(1), 2 * SHORT_STEPS, rounds=2)
+    for trial in trials:  # each holds the one before it: what is no better with some is not tried with more
+        if best is None:
+            trial = t.fitted(trial, t.few(1), 2 * SHORT_STEPS, rounds=2)
+        else:
+            trial = t.fitted(replace(trial, fitted=best.fitted), t.few(1), SHORT_STEPS)
         loss = t.held_loss(trial)
         kept = loss < BETTER * least
         t.note(_name(trial.effects), kept, loss)
-        if kept or best is None:
-            best, least = trial, loss
+        if not kept:
+            break
+        best, least = trial, loss
     if best is None:
         raise ValueError("effects: got none to choose from")
     if np.isfinite(t.surface.look).all() and material.max() > 0 and not t.totals:
@@ -631,7 +657,9 @@ def cross_validate(t: Training, choice: Choice) -> tuple[bool, ErrorModel | None
             model = t.model(own, residual=residual)
             found += t.predicted(with_residual(t, model, kept) if residual else model, held)
     loss = {
-        residual: float(np.mean([t.observations[k].losses(x, t.huber_db).mean() for k, x in zip(order, own, strict=True)]))
+        residual: float(
+            np.mean([t.observations[k].losses(x, t.huber_db).mean() for k, x in zip(order, own, strict=True)])
+        )
         for residual, own in power.items()
     }
     keep = loss[True] < CLEARLY_WORSE * loss[False] if free else choice.effects.residual
@@ -693,7 +721,9 @@ def unexplained(t: Training, model: Model) -> Unexplained:
             clear = ~target.censored & (target.db > CLEAR_DB)
             left.setdefault(t.names[o.place.data], []).extend((error / target.trust)[clear])
         rows.append(wrong)
-    noise = {name: NORMAL_MEDIAN * float(np.median(np.abs(errors))) for name, errors in left.items() if errors}
+    noise = {
+        name: NORMAL_MEDIAN * float(np.median(np.abs(errors))) for name, errors in left.items() if errors
+    }
     return Unexplained(rows, noise)
 
 
@@ -711,7 +741,9 @@ def left_out(t: Training, wrong: Sequence[np.ndarray]) -> Training:
 
 def _offsets(t: Training, found: Fit) -> dict[int, list[tuple[Place, np.ndarray]]]:
     """By data set of unknown positions its places, and how far each receiver is from where it is said to be [m]."""
-    unsure = [k for k, o in enumerate(t.observations) if getattr(t.data[o.place.data], "position_std_m", 0.0) > 0]
+    unsure = [
+        k for k, o in enumerate(t.observations) if getattr(t.data[o.place.data], "position_std_m", 0.0) > 0
+    ]
     offsets: dict[int, list[tuple[Place, np.ndarray]]] = {}
     for o, model, materials in t.evaluated(found.model, unsure):
         one = t.data[o.place.data]

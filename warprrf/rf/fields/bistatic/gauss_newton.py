@@ -68,7 +68,12 @@ class Problem:
 
     @classmethod
     def of(
-        cls, observations: Sequence[Observation], effects: Effects, material: np.ndarray, p: Parameters, **settings: Any
+        cls,
+        observations: Sequence[Observation],
+        effects: Effects,
+        material: np.ndarray,
+        p: Parameters,
+        **settings: Any,
     ) -> Problem:
         """That of observations where light comes as under parameters ``p`` of materials."""
         known: dict[Any, Evaluation] = {}
@@ -93,7 +98,9 @@ class Problem:
         known: dict[float, Evaluation] = {}
         for o, columns in zip(self.observations, self.by_materials, strict=True):
             if o.ratio not in known:
-                known[o.ratio] = Evaluation(p.at_ratio(o.ratio), self.material, device=o.view.tracer.grid.device)
+                known[o.ratio] = Evaluation(
+                    p.at_ratio(o.ratio), self.material, device=o.view.tracer.grid.device
+                )
             here = known[o.ratio].parameters
             power = here.gain * (columns.power(here) + o.direct(self.effects, known[o.ratio]))
             yield o, columns, known[o.ratio], power
@@ -103,11 +110,14 @@ class Problem:
         for o, _, _, power in self.evaluated(p):
             yield o.target.error(o.gain(p, power) * power)
 
-    def linearised(self, p: Parameters, layout: Layout) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    def linearised(
+        self, p: Parameters, layout: Layout
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """:meth:`errors_db` ``(N,)``, derivatives ``(C, N)`` float32, and the places of those parameters ``(C,)``."""
         for o, columns, materials, power in self.evaluated(p):
             table, index = _joined(
-                columns.slopes(materials.parameters, layout), o.slopes(self.effects, materials, layout, sharp=True)
+                columns.slopes(materials.parameters, layout),
+                o.slopes(self.effects, materials, layout, sharp=True),
             )
             table *= np.float32(materials.parameters.gain)
             if layout.gain:
@@ -162,9 +172,7 @@ def layout_of(problem: Problem, start: Parameters) -> Layout:
     )  # fmt: skip
 
 
-def priors(
-    p: Parameters, start: Parameters, layout: Layout, energy: float
-) -> tuple[np.ndarray, np.ndarray]:
+def priors(p: Parameters, start: Parameters, layout: Layout, energy: float) -> tuple[np.ndarray, np.ndarray]:
     """Residuals of the priors ``(K,)`` and their Jacobian ``(K, F)``: distance to the start, energy kept."""
     own = np.arange(layout.groups)
     residuals, rows = [], []
@@ -200,7 +208,9 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Fitted:
         steps: most steps.
     """
     if len(start.log_gains) != problem.chains:
-        start = replace(start, log_gains=np.array([_first_gain(problem, start, c) for c in range(problem.chains)]))
+        start = replace(
+            start, log_gains=np.array([_first_gain(problem, start, c) for c in range(problem.chains)])
+        )
     layout = layout_of(problem, start)
     vector, damping, weight = layout.pack(start), 1e-3, 1.0 / NOISE_DB**2
     count = max(sum(len(o.target.db) for o in problem.observations), 1)
@@ -210,7 +220,9 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Fitted:
         p = layout.unpack(x, start)
         prior = priors(p, start, layout, problem.energy)[0]
         errors = problem.errors_db(p)
-        return weight * sum(float(huber(e, problem.huber_db)[0].sum()) for e in errors) + float((prior**2).sum())
+        return weight * sum(float(huber(e, problem.huber_db)[0].sum()) for e in errors) + float(
+            (prior**2).sum()
+        )
 
     current = total(vector)
     for _ in range(steps):

@@ -74,7 +74,9 @@ class Interreflection:
         share = p.scattered_share[self.surface.side_group] / np.pi
         got = sum(np.bincount(r.ray, r.powers(materials), minlength=sides) for r in self.lit)
         if onto is not None:
-            got = got + self.between @ (share * np.bincount(onto.ray, onto.powers(materials), minlength=sides))
+            got = got + self.between @ (
+                share * np.bincount(onto.ray, onto.powers(materials), minlength=sides)
+            )
         first = got
         for _ in range(2, effects.scatterings):
             got = first + self.between @ (share * got)

@@ -43,7 +43,12 @@ class LinkTracer:
     """
 
     def __init__(
-        self, tracer: Tracer, model: Model, materials: Evaluation, options: LinkOptions, shape: tuple[int, int]
+        self,
+        tracer: Tracer,
+        model: Model,
+        materials: Evaluation,
+        options: LinkOptions,
+        shape: tuple[int, int],
     ) -> None:
         self._arguments = tracer.again, model, materials, replace(options, client=None, progress=None), shape
         effects, self._materials = model.effects, materials

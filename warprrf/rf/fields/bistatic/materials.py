@@ -167,7 +167,9 @@ class Parameters:
     def prior(cls, groups: int, lobes: Sequence[int] = LOBES, *, reciprocal: bool = False) -> Parameters:
         """What a surface is taken for before any measurement: half scattered, half mirrored, epsilon_r of 4."""
         share = np.full((groups, len(lobes)), np.log(0.5 / max(len(lobes), 1)))
-        return cls(share, np.full(groups, np.log(3.0)), np.full(groups, np.log(0.5)), tuple(lobes), reciprocal)
+        return cls(
+            share, np.full(groups, np.log(3.0)), np.full(groups, np.log(0.5)), tuple(lobes), reciprocal
+        )
 
 
 @dataclass(frozen=True)
@@ -210,7 +212,13 @@ class Layout:
     def __init__(
         self, groups: int, lobes: int, *, gain: bool = False, roughness: bool = False, chains: int = 0
     ) -> None:
-        self.groups, self.lobes, self.gain, self.roughness, self.chains = groups, lobes, gain, roughness, chains
+        self.groups, self.lobes, self.gain, self.roughness, self.chains = (
+            groups,
+            lobes,
+            gain,
+            roughness,
+            chains,
+        )
         self.stride = lobes + 2
         self.first_chain = groups * self.stride + gain + roughness
         self.size = self.first_chain + chains

@@ -18,8 +18,8 @@ from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.materials import Parameters
 from warprrf.rf.fields.bistatic.rays import RayGrid
-from warprrf.rf.fields.bistatic.render import PathGains
 from warprrf.rf.fields.bistatic.records import Records
+from warprrf.rf.fields.bistatic.render import PathGains
 from warprrf.rf.fields.bistatic.tracer import SHARP, View
 from warprrf.rf.paths.mirror_paths import stops_of
 from warprrf.rf.paths.polarisation import chain_amplitude, vertical_ends
@@ -327,9 +327,7 @@ class ArrayImage:
         return id(self)
 
     @classmethod
-    def of(
-        cls, view: View, array: PlanarArray, directions: np.ndarray, length_std_m: float
-    ) -> ArrayImage:
+    def of(cls, view: View, array: PlanarArray, directions: np.ndarray, length_std_m: float) -> ArrayImage:
         """That of the one receiver of ``view``, steered to ``directions`` (N, 3); lengths of paths are known to
         ``length_std_m`` [m]."""
         grid, paths = view.tracer.grid, view.paths

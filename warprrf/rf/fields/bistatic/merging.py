@@ -98,9 +98,7 @@ def _look_cost(look: np.ndarray, typical: np.ndarray, o: Merging) -> np.ndarray:
     return o.look_cost * np.minimum(np.nan_to_num(gap, nan=MOST_LOOK), MOST_LOOK)
 
 
-def _costs(
-    problem: Problem, p: Parameters, unit_of: np.ndarray, owner: np.ndarray
-) -> np.ndarray:
+def _costs(problem: Problem, p: Parameters, unit_of: np.ndarray, owner: np.ndarray) -> np.ndarray:
     """Rise of the objective if one unit alone became each material, ``(units, materials)``.
 
     Args:
@@ -118,7 +116,9 @@ def _costs(
         power, gain = gain * power, gain * p.gain
         loss = huber(o.target.error(power), problem.huber_db)[0].sum()
         mirrors = _mirror_changes(o, problem, materials, unit_of)
-        for unit in np.unique(np.concatenate([unit_of[c.groups], unit_of[c.senders], np.array(list(mirrors), int)])):
+        for unit in np.unique(
+            np.concatenate([unit_of[c.groups], unit_of[c.senders], np.array(list(mirrors), int)])
+        ):
             change = mirrors.get(int(unit), np.zeros((count, len(power)), np.float32)).copy()
             for a in np.flatnonzero(unit_of[c.groups] == unit):
                 change += (mix - mix[owner[unit]]) @ c.single[a].reshape(-1, len(power))
@@ -148,7 +148,9 @@ def _mirror_changes(
             continue
         own = np.flatnonzero((unit == one).any(axis=1))
         trial = np.where(unit[own] == one, np.arange(count, dtype=np.int32)[:, None, None], now[own])
-        several = replace(sharp.take(np.tile(own, count)), index=trial.reshape(-1, now.shape[1]).astype(np.int32))
+        several = replace(
+            sharp.take(np.tile(own, count)), index=trial.reshape(-1, now.shape[1]).astype(np.int32)
+        )
         new = several.powers(rows).reshape(count, -1)
         found[int(one)] = (new - before[own]).astype(np.float32) @ path[own]
     return found

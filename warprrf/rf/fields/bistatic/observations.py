@@ -23,7 +23,14 @@ from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import Data, Measured
 from warprrf.rf.fields.bistatic.materials import SETS, Effects, Layout, Model, Parameters
-from warprrf.rf.fields.bistatic.measured import ArrayImage, Measurement, SpectrumPixels, WeighedPaths, pixel_means, read
+from warprrf.rf.fields.bistatic.measured import (
+    ArrayImage,
+    Measurement,
+    SpectrumPixels,
+    WeighedPaths,
+    pixel_means,
+    read,
+)
 from warprrf.rf.fields.bistatic.records import Bins, Evaluation, Records
 from warprrf.rf.fields.bistatic.render import path_gains
 from warprrf.rf.fields.bistatic.tracer import SHARP, View
@@ -249,7 +256,9 @@ class Observation:
         found, column = np.unique(np.concatenate(group)[k], return_inverse=True)
         cell = np.concatenate(bins)[k] * len(found) + column.reshape(-1)
         table = np.bincount(cell, every[k], minlength=count * len(found)).reshape(count, len(found))
-        return found, np.maximum(self.measured.of_bins(table.astype(np.float32), quick=True).T, 0.0) / np.float32(self.floor)
+        return found, np.maximum(
+            self.measured.of_bins(table.astype(np.float32), quick=True).T, 0.0
+        ) / np.float32(self.floor)
 
     def further_tables(self, effects: Effects) -> list[Records]:
         """Of paths over more than one surface, at least one of which scatters."""
@@ -258,7 +267,15 @@ class Observation:
 
     def direct(self, effects: Effects, materials: Evaluation) -> np.ndarray:
         """Readings of line of sight and mirrors in units of the floor, shape ``(N,)``."""
-        return self._direct(effects, materials)[0]
+        kept, sharp, together = (
+            self.view.kept_paths(effects),
+            self.view.records[SHARP],
+            self.measured.together,
+        )
+        if together is None:
+            return np.where(kept, sharp.powers(materials), 0.0).astype(np.float32) @ self.path
+        amplitude = together.amplitudes(sharp, materials.parameters, materials.material)[0]
+        return together.received(np.where(kept, amplitude, 0.0)) / self.floor
 
     def slopes(
         self, effects: Effects, materials: Evaluation, layout: Layout, *, sharp: bool = False
@@ -281,32 +298,20 @@ class Observation:
             table = table + np.asarray(self.measured.of_bins(sums, quick=True)).T / np.float32(self.floor)
         return table, index
 
-    def _direct(self, effects: Effects, materials: Evaluation) -> tuple[np.ndarray, np.ndarray]:
-        """Readings of line of sight and mirrors ``(N,)``, and what their slopes are multiplied by ``(L, N)``."""
-        kept, sharp = self.view.kept_paths(effects), self.view.records[SHARP]
-        if (together := self.measured.together) is None:
-            power = np.where(kept, sharp.powers(materials), 0.0)
-            return power.astype(np.float32) @ self.path, self.path
-        amplitude = np.where(kept, together.amplitudes(sharp, materials.parameters, materials.material)[0], 0.0)
-        slopes = together.slopes(amplitude) / self.floor
-        return 0.5 * amplitude @ slopes, slopes
-
     def _direct_slopes(
         self, effects: Effects, materials: Evaluation, place: np.ndarray, count: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of path powers, or amplitudes where phases count, ``(L, count)``, and what each reads ``(L, N)``."""
-        kept, sharp = self.view.kept_paths(effects), self.view.records[SHARP]
-        columns = self._direct(effects, materials)[1]
+        kept, sharp, p = self.view.kept_paths(effects), self.view.records[SHARP], materials.parameters
         found = np.zeros((len(sharp), count))
         if (together := self.measured.together) is None:
-            each = Bins.of(np.arange(len(sharp)), len(sharp))
-            sharp.add_slopes(materials, each, place, found)
-        else:
-            amplitude, rise = together.amplitudes(sharp, materials.parameters, materials.material)
-            for path, mirror in zip(*np.nonzero(sharp.index >= 0), strict=True):
-                at = place[materials.material[sharp.index[path, mirror]]] + len(materials.parameters.lobes)
-                found[path, at : at + 2] += rise[path, mirror], 0.5 * amplitude[path]
-        return found * kept[:, None], columns
+            sharp.add_slopes(materials, Bins.of(np.arange(len(sharp)), len(sharp)), place, found)
+            return found * kept[:, None], self.path
+        amplitude, rise = together.amplitudes(sharp, p, materials.material)
+        for path, mirror in zip(*np.nonzero(sharp.index >= 0), strict=True):
+            at = place[materials.material[sharp.index[path, mirror]]] + len(p.lobes)
+            found[path, at : at + 2] += rise[path, mirror], 0.5 * amplitude[path]
+        return found * kept[:, None], together.slopes(np.where(kept, amplitude, 0.0)) / self.floor
 
     @cached_property
     def ray_bins(self) -> tuple[np.ndarray, int]:
@@ -340,14 +345,21 @@ class Columns:
 
     def by_materials(self, material: np.ndarray) -> Columns:
         """Those of materials; ``material`` (G,) is that of each group."""
-        return Columns(*_summed(material[self.groups], self.single), *_summed(material[self.senders], self.further))
+        return Columns(
+            *_summed(material[self.groups], self.single), *_summed(material[self.senders], self.further)
+        )
 
     def power(self, p: Parameters) -> np.ndarray:
         """Readings, shape ``(N,)``."""
         curves = fresnel_curves()
-        mixed = p.weight[self.groups][:, :, None] * curves.at(curves.coordinates, p.log_excess[self.groups])[0][:, None]
+        mixed = (
+            p.weight[self.groups][:, :, None]
+            * curves.at(curves.coordinates, p.log_excess[self.groups])[0][:, None]
+        )
         single = mixed.astype(np.float32).ravel() @ self.single.reshape(mixed.size, self.single.shape[-1])
-        return np.asarray(np.maximum(single, 0.0) + p.scattered_share[self.senders].astype(np.float32) @ self.further, float)
+        return np.asarray(
+            np.maximum(single, 0.0) + p.scattered_share[self.senders].astype(np.float32) @ self.further, float
+        )
 
     def slopes(self, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of the readings to parameters ``(C, N)`` float32, and their places ``(C,)``."""
@@ -356,7 +368,9 @@ class Columns:
         alpha, rise = curves.at(curves.coordinates, p.log_excess)
         for g, columns in zip(self.groups, self.single, strict=True):
             row = found[np.searchsorted(seen, g)]
-            row[: layout.lobes] += (p.weight[g] * np.einsum("c,lcn->nl", alpha[g].astype(np.float32), columns)).T
+            row[: layout.lobes] += (
+                p.weight[g] * np.einsum("c,lcn->nl", alpha[g].astype(np.float32), columns)
+            ).T
             row[layout.lobes] += p.weight[g] @ np.einsum("c,lcn->ln", rise[g].astype(np.float32), columns)
         even, steeper = curves.even(p.log_excess)
         for g, column in zip(self.senders, self.further, strict=True):
@@ -467,7 +481,9 @@ class _Tables:
                 at = int(first[number])
                 ends = one.transmitters[at], one.receivers[at]
                 name = str(names[chain[at]])
-                found.append(Place(self.number, rows, *ends, one.frequency_hz, READINGS_SHAPE, one.air, chain=name))
+                found.append(
+                    Place(self.number, rows, *ends, one.frequency_hz, READINGS_SHAPE, one.air, chain=name)
+                )
         return found
 
     def observe(self, place: Place, view: View) -> Observation:
@@ -534,7 +550,10 @@ class _Arrays:
         total = scattered + bare.direct(single, materials)
         gain = bare.gain(start, total)
         std_db = (
-            NEPER * gain * np.sqrt(scattered * np.maximum(2.0 * total - scattered, 0.0)) / (1.0 + gain * total)
+            NEPER
+            * gain
+            * np.sqrt(scattered * np.maximum(2.0 * total - scattered, 0.0))
+            / (1.0 + gain * total)
         )
         return replace(bare, target=target.trusted(NOISE_DB / np.hypot(NOISE_DB, std_db)), robust=True)
 
@@ -548,7 +567,10 @@ KINDS: dict[type, Any] = {SpectrumDataset: _Spectra, Readings: _Tables, ArraySpe
 
 def kinds_of(data: Sequence[Measured]) -> list[Kind]:
     """What takes each of ``data`` apart."""
-    return [next(make for kind, make in KINDS.items() if isinstance(one, kind))(k, one) for k, one in enumerate(data)]
+    return [
+        next(make for kind, make in KINDS.items() if isinstance(one, kind))(k, one)
+        for k, one in enumerate(data)
+    ]
 
 
 def observe(
@@ -565,7 +587,11 @@ def observe(
     found = []
     for place, view in zip(places, views, strict=True):
         one = kinds[place.data].observe(place, view)
-        found.append(replace(one, chain=index.get(place.chain, one.chain), ratio=float(place.frequency_hz / frequency_hz)))
+        found.append(
+            replace(
+                one, chain=index.get(place.chain, one.chain), ratio=float(place.frequency_hz / frequency_hz)
+            )
+        )
     return found, chains
 
 
@@ -613,7 +639,9 @@ def _frame_of_powers(one: Readings | ArraySpectra) -> Frame:
     """Floor and range are those of the powers."""
     floor = float(np.min(one.floor))
     levels = 10.0 * float(np.log10(floor)), 10.0 * float(np.log10(np.nanmax(one.power)))
-    return Frame(one.transmitters[0], one.frequency_hz, READINGS_SHAPE, floor, levels, BEAM_SIGMA_RAD, one.air)
+    return Frame(
+        one.transmitters[0], one.frequency_hz, READINGS_SHAPE, floor, levels, BEAM_SIGMA_RAD, one.air
+    )
 
 
 def frame_of(data: Sequence[Measured]) -> Frame:

@@ -17,7 +17,9 @@ PATH_SHARE = 1.0 / 200.0
 """A ray's part of the power that scattering brings to a pixel, at 64 rays a pixel and a beam of 3."""
 
 
-def paths_of(gains: PathGains, image: np.ndarray, floor: float, air: Air | None, max_paths: int | None) -> Paths:
+def paths_of(
+    gains: PathGains, image: np.ndarray, floor: float, air: Air | None, max_paths: int | None
+) -> Paths:
     """Paths of one receiver, strongest first; see :meth:`BistaticField.paths`.
 
     Args:

@@ -108,7 +108,9 @@ class RayGrid:
 
     def hit(self, receivers: np.ndarray) -> Hits:
         """What the grid's rays from ``receivers``, (3,) or (O, 3), hit."""
-        return self.hit_along(np.asarray(receivers, float).reshape(-1, 3), self.directions, self.solid_angle, True)
+        return self.hit_along(
+            np.asarray(receivers, float).reshape(-1, 3), self.directions, self.solid_angle, True
+        )
 
     def hit_along(
         self, origins: np.ndarray, directions: np.ndarray, solid_angle: np.ndarray, shared: bool = False
@@ -146,7 +148,9 @@ class RayGrid:
         count, where = len(hits.face) if ray is None else len(ray), self.device
         found = [wp.zeros(count, dtype=kind, device=where) for kind in (wp.float32, wp.vec3, wp.vec3d)]
         each = max(len(hits.face) // max(len(hits.origins), 1), 1)
-        vectors = [wp.array(np.reshape(a, (-1, 3)), dtype=wp.vec3d, device=where) for a in (sources, hits.origins)]
+        vectors = [
+            wp.array(np.reshape(a, (-1, 3)), dtype=wp.vec3d, device=where) for a in (sources, hits.origins)
+        ]
         inputs = [
             *self.surface.on_device(where), wp.array([] if ray is None else ray, dtype=wp.int32, device=where), *vectors, each,
             *(wp.array(a, dtype=kind, device=where, copy=False) for a, kind in (

@@ -7,7 +7,7 @@ of one direction each, are the table ``"sharp"``. All kinds are evaluated by :mo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -47,13 +47,16 @@ class Records:
     kind: int = 0
     gain: int = -1
     half_width: float = 0.0
+    _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(1))
 
     def __len__(self) -> int:
         return len(self.power)
 
     def take(self, rows: np.ndarray) -> Records:
         """The records ``rows``."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in ("power", "ray", "index", "angle")})
+        return replace(
+            self, **{name: getattr(self, name)[rows] for name in ("power", "ray", "index", "angle")}
+        )
 
     def rough_groups(self, side_group: np.ndarray) -> np.ndarray:
         """Group that scatters or sends in each, shape ``(N,)``; ``side_group`` (E,) is that of each side of an element."""
@@ -73,7 +76,11 @@ class Records:
             return np.zeros(0)
         table, m, launch = self._table(materials)
         out = wp.empty(len(self), dtype=REALS[self.power.dtype], device=materials.device)
-        launch(kernels.build(REALS[self.power.dtype])[2], len(self), [table, m, m.weight, m.excess, m.mirror, out])
+        launch(
+            kernels.build(REALS[self.power.dtype])[2],
+            len(self),
+            [table, m, m.weight, m.excess, m.mirror, out],
+        )
         return np.asarray(out.numpy(), np.float64)
 
     def add_slopes(self, materials: Evaluation, bins: Bins, place: np.ndarray, slopes: np.ndarray) -> None:
@@ -110,11 +117,16 @@ class Records:
 
     def _table(self, materials: Evaluation) -> tuple[Any, Any, Any]:
         real, where = REALS[self.power.dtype], materials.device
-        table = kernels.build(real)[1]()
-        table.power = wp.array(self.power, dtype=real, device=where, copy=False)
-        table.index = wp.array(self.index, dtype=wp.int32, device=where, copy=False)
-        table.angle = wp.array(self.angle, dtype=wp.types.vector(3, real), device=where, copy=False)
-        table.rough, table.kind, table.half_width = self.rough, self.kind, self.half_width
+
+        def upload() -> Any:
+            table = kernels.build(real)[1]()
+            table.power = wp.array(self.power, dtype=real, device=where, copy=False)
+            table.index = wp.array(self.index, dtype=wp.int32, device=where, copy=False)
+            table.angle = wp.array(self.angle, dtype=wp.types.vector(3, real), device=where, copy=False)
+            table.rough, table.kind, table.half_width = self.rough, self.kind, self.half_width
+            return table
+
+        table = self._uploaded.get(where, upload)
         return table, materials.on_device(real), lambda *given: _device.launch(*given, device=where)
 
 
@@ -197,4 +209,6 @@ def _lobes(exponents: tuple[int, ...], reciprocal: bool, real: Any, device: str)
     """Exponents of lobes, and a table over the cosine of each: 1 / norm, or the factor of a reciprocal one."""
     cosine = np.linspace(0.0, 1.0, COSINES)
     scale = [reciprocal_factor(n, cosine) if reciprocal else 1.0 / lobe_norm(n, cosine) for n in exponents]
-    return wp.array(exponents, dtype=wp.int32, device=device), wp.array(np.stack(scale), dtype=real, device=device)
+    return wp.array(exponents, dtype=wp.int32, device=device), wp.array(
+        np.stack(scale), dtype=real, device=device
+    )

@@ -95,7 +95,10 @@ class Sensitivity:
         pixel = np.ravel_multi_index(pixel_of(view.paths.arrival, SHAPE), SHAPE)
         mirror = view.records[SHARP].index[:, 0]
         own = mirror >= 0
-        parts, rest = [(pixel[own], 2 * elements + mirror[own], found.sharp[own])], [(pixel[~own], found.sharp[~own])]
+        parts, rest = (
+            [(pixel[own], 2 * elements + mirror[own], found.sharp[own])],
+            [(pixel[~own], found.sharp[~own])],
+        )
         for name, power in found.tables.items():
             ray, gain = view.records[name].ray, view.records[name].gain
             if gain >= 0:

@@ -9,7 +9,6 @@ what differs within a group is told apart at both scales.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 import warp as wp

@@ -44,7 +44,9 @@ _TRACED = Cache(6)  # a lobby's take up to 90 MB each; the bound is the process'
 
 def sequences(effects: Effects) -> tuple[str, ...]:
     """Names of the tables that ``effects`` want besides :data:`SHARP`."""
-    found = ["S", *["MS"] * effects.mirror_scatter, *["SM"] * effects.scatter_mirror] * (effects.scatterings > 0)
+    found = ["S", *["MS"] * effects.mirror_scatter, *["SM"] * effects.scatter_mirror] * (
+        effects.scatterings > 0
+    )
     found += ["MSM"] * (effects.scatterings > 0 and effects.mirror_scatter and effects.scatter_mirror)
     found += ["E", *["EM"] * effects.scatter_mirror] * (effects.scatterings > 1)
     return tuple(found)
@@ -80,7 +82,9 @@ class View:
         """Length from the transmitter over what each ray meets to the receiver [m], shape ``(R K,)``; 0 where that is nothing."""
         ray = np.flatnonzero(self.hits.face >= 0)
         found = np.zeros(len(self.hits.face))
-        found[ray] = np.linalg.norm(self.hits.points(ray) - self.tracer.transmitter, axis=1) + self.hits.range_m[ray]
+        found[ray] = (
+            np.linalg.norm(self.hits.points(ray) - self.tracer.transmitter, axis=1) + self.hits.range_m[ray]
+        )
         return found
 
     def tables(self, effects: Effects) -> dict[str, Records]:
@@ -233,7 +237,9 @@ class Tracer:
         group = np.append(self.surface.patch_group, -1)[p.patch]  # no patch has no group
         angle = np.stack([p.cosine, np.where(p.patch >= 0, p.turn, 0.0), 0.0 * p.cosine], axis=2)
         power = friis * self.grid.transmittance(p.length_m)
-        return Records(power, np.arange(len(p), dtype=np.int32), group.astype(np.int32), angle, group.shape[1])
+        return Records(
+            power, np.arange(len(p), dtype=np.int32), group.astype(np.int32), angle, group.shape[1]
+        )
 
     def lit(self, rays: _Rays) -> Records:
         """What rays see of surfaces that the transmitter lights."""
@@ -247,7 +253,9 @@ class Tracer:
         if rays.group is None:
             places = places_of_rays(self.grid.per_pixel, THROUGH_MIRRORS)
         chosen = np.flatnonzero(np.isin(rays.ray % self.grid.per_pixel, places) & (rays.hits.face >= 0))
-        times = ((self.grid.per_pixel if rays.group is None else min(INTO_MIRRORS, self.grid.per_pixel))) / len(places)
+        times = (self.grid.per_pixel if rays.group is None else min(INTO_MIRRORS, self.grid.per_pixel)) / len(
+            places
+        )
         row, image = self.mirrored.pairs(rays.hits.face[chosen])
         row, m = chosen[row], self.mirrored
         light = self.grid.light_through(rays.hits, m.image[image], row)
@@ -266,7 +274,11 @@ class Tracer:
         each = row % len(hits.directions)
         side = s.side_met(hits.face[row], hits.directions[each])
         solid_angle = hits.solid_angle[row % len(hits.solid_angle)]
-        power = (self.wavelength_m / (4.0 * np.pi)) ** 2 * solid_angle * self.grid.transmittance(hits.range_m[row])
+        power = (
+            (self.wavelength_m / (4.0 * np.pi)) ** 2
+            * solid_angle
+            * self.grid.transmittance(hits.range_m[row])
+        )
         return self._records(rays, row, power, side, np.zeros((len(row), 3), np.float32), SOURCE)
 
     def _scattered(
@@ -333,9 +345,7 @@ def places_of_rays(per_pixel: int, count: int) -> np.ndarray:
     return ((np.arange(count) + 0.5) * per_pixel / count).astype(int)
 
 
-def traced(
-    again: Callable[[], Tracer], effects: Effects, part: tuple[np.ndarray, MirrorPaths]
-) -> View:
+def traced(again: Callable[[], Tracer], effects: Effects, part: tuple[np.ndarray, MirrorPaths]) -> View:
     """What a receiver (3,) of known line of sight and mirror paths sees, without what all receivers share."""
     view = again().view(part[0], effects.mirrors, paths=part[1])
     view.tables(effects)

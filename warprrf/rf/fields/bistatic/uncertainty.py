@@ -17,7 +17,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from warprrf.checks import Expected, check_arrays, lengths
-from warprrf.rf.fields.bistatic.observations import NEPER
 
 STEEPNESS_DB = (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, 3.5, 6.0, 10.0, 20.0)  # lower ends of the bins
 LEVEL_DB = (0.0, 0.02, 0.3, 3.0, 12.0, 30.0)

@@ -151,7 +151,7 @@ class HarmonicField(RadioField):
             transport: blending weights of ``ds.receivers``, if they were computed before.
             device: where to compute.
             progress: called with the stages ``"transport"`` and ``"fit"``.
-            settings: attributes of :class:`warprrf.FieldOptions`, in place of those of
+            settings: attributes of :class:`~warprrf.rf.fields.harmonic.options.FieldOptions`, in place of those of
                 ``options``: ``gain="linear"``, ``iterations=600``, ``seed=1``, ...
 
         Raises:
@@ -246,18 +246,18 @@ class HarmonicField(RadioField):
         """
         field = self.on_grid(shape)
         return field._looked(
-            receivers, transmitter, lambda at, source: field._look(at, source, transport).spectrum
+            receivers, transmitter, lambda at, source: field._view_from(at, source, transport).spectrum
         )
 
     def _trace_spectrum(self, receiver: np.ndarray, transmitter: np.ndarray) -> Spectrum:
-        return self._look(receiver, transmitter, None).spectrum
+        return self._view_from(receiver, transmitter, None).spectrum
 
     def _trace_paths(self, receiver: np.ndarray, transmitter: np.ndarray, max_paths: int | None) -> Paths:
         """At least one diffuse path is kept to carry what is below the floor. With ``line_of_sight="explicit"`` the ``los``
         path carries Friis gain; without, the power of the pixels within 3 beam sigmas of the transmitter's direction,
         merged. Direction and delay of ``los`` are exact; a diffuse path arrives from its pixel's centre."""
         found = paths_of(
-            self._look(receiver, transmitter, None),
+            self._view_from(receiver, transmitter, None),
             beam_sigma_rad=self.beam_sigma_rad,
             frequency_hz=self.frequency_hz,
             max_paths=max_paths,
@@ -338,7 +338,7 @@ class HarmonicField(RadioField):
         _device.launch(kernels.predict, len(out), inputs, device=device)
         return out.numpy().reshape(self.shape).astype(np.float64)
 
-    def _look(self, receiver: np.ndarray, source: np.ndarray, seen: Transport | None) -> View:
+    def _view_from(self, receiver: np.ndarray, source: np.ndarray, seen: Transport | None) -> View:
         """Spectrum at one receiver and what it was made of."""
         seen = self._seen_from(receiver[None], seen, None)
         law = self.law
@@ -425,7 +425,7 @@ def _train(
         state = fit_layer(
             problem, target, steps=steps, rates=options.rates if is_gain else CHANNEL_RATES,
             degree=options.sh_degree, opacity=opacity, state=state,
-            each=_told(kept, name, steps, progress, (done, total)),
+            each=_after_step(kept, name, steps, progress, (done, total)),
         )  # fmt: skip
         done += steps
         everyone = np.zeros((len(gaussians), _kernels.COEFFICIENTS), np.float32)
@@ -459,7 +459,7 @@ def _train(
     )
 
 
-def _told(
+def _after_step(
     kept: Checkpoint, name: str, steps: int, progress: Progress | None, place: tuple[int, int]
 ) -> Callable[[int, Callable[[], State]], None]:
     """What follows each step of layer ``name``: progress, ``place`` being the steps before it and in all, and now and

@@ -317,7 +317,7 @@ class Targets:
     Attributes:
         layers: target of each layer: ``gain`` first, then ``delay``, ``aod_x``, ``aod_y``, ``aod_z`` for ``rf3dgs``.
         unseen: degree-0 coefficient of each layer for Gaussians that no training receiver sees: the median.
-        gain_unit: linear factor of the gain: its median over the lit pixels.
+        gain_unit: linear factor of the gain: its median over the pixels above the floor.
         delay_unit: seconds per unit of the delay layer: the longest delay.
     """
 
@@ -341,13 +341,13 @@ def targets(law: SingleBounce, ds: SpectrumDataset, images: np.ndarray, seen: Tr
         beam = law.beam(receiver, transmitter)
         extra[i] = 0.0 if beam is None else beam
     blended = factor * seen.pixel_weight
-    lit = (images - extra > floor) & (blended > 0)
-    if not lit.any():
+    above = (images - extra > floor) & (blended > 0)
+    if not above.any():
         raise ValueError(
             "ds: got no pixel above the floor where a ray meets a Gaussian; expected spectra with power and "
             "geometry around the receivers"
         )
-    gain_unit = float(np.median((images - extra)[lit] / blended[lit]))
+    gain_unit = float(np.median((images - extra)[above] / blended[above]))
     # Each Gaussian starts from the mean gain, in dB, of the pixels that see it: shadows lie 14 nepers below the median.
     met = blended > 0
     floored = np.maximum(images - extra, DARK * floor)

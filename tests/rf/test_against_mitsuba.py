@@ -1,0 +1,128 @@
+"""Path gains and images of every sequence against Mitsuba's path tracer, and against quadrature where a scene has one."""
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from mitsuba_reference import (
+    MIRROR,
+    SCATTER,
+    Estimate,
+    Link,
+    closed_forms,
+    floor_and_mirror,
+    mitsuba_sequences,
+)
+from places import LOBBY
+from rooms import rms_change_db
+from sionna_room import sionna_or_skip
+
+import warprrf as wr
+from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.materials import Effects, Parameters
+from warprrf.rf.fields.bistatic.observations import Frame
+from warprrf.rf.fields.bistatic.render import PathGains
+from warprrf.rf.spectra.beam import beam_operator
+
+BEAM_RAD = np.radians(2.0)
+
+
+def sequences(link: Link) -> dict[str, np.ndarray]:
+    """Ours: path gain of sharp paths, shape ``(L,)``, and of others per pixel, before any beam, shape ``(H, W)``."""
+    scene = wr.Scene(link.mesh, [wr.Material(name, ()) for name in ("scatter", "mirror", "black")], link.does)
+    frame = Frame(link.transmitter, link.frequency_hz, link.shape, 1e-17, (-170.0, -60.0), BEAM_RAD, None)
+    no = -40.0  # ln of what is not there
+    shares = (
+        np.array([[0.0], [no], [no]]),
+        np.full(3, np.log(link.permittivity - 1.0)),
+        np.array([no, 0.0, no]),
+    )
+
+    def traced(**effects: Any) -> PathGains:
+        made = BistaticField.prior(scene, frame, lobes=(0,), effects=Effects(residual=False, **effects))
+        made = replace(made, parameters=Parameters(*shares, lobes=(0,)))
+        return made.path_gains(made.view(link.receiver))
+
+    def binned(gains: PathGains, name: str) -> np.ndarray:
+        return gains.by_ray([name]).reshape(*link.shape, -1).sum(axis=2)
+
+    once = traced(mirrors=1, scatterings=1)
+    twice, thrice = (binned(traced(scatterings=n, mirror_scatter=False, mirrors=0), "E") for n in (2, 3))
+    order = once.view.paths.order
+    return {
+        "LOS": once.sharp[order == 0], "M": once.sharp[order == 1], "SS": twice, "SSS": thrice - twice,
+        **{name: binned(once, name) for name in ("S", "MS", "SM", "MSM")},
+    }  # fmt: skip
+
+
+def lobby(receiver: int = 0) -> Link:
+    """The lobby, all Lambertian but for its western wall."""
+    scene, ds = wr.Scene.load(LOBBY / "scene.xml"), wr.SpectrumDataset.load(LOBBY / "spectra.nc")
+    does = np.where(scene.face_object == scene.object_names.index("wall_west"), MIRROR, SCATTER)
+    return Link(scene.mesh, does, ds.transmitter, ds.receivers[receiver], ds.frequency_hz)
+
+
+@cache
+def compared(room: str) -> tuple[dict[str, np.ndarray], dict[str, Estimate]]:
+    """Path gain of each sequence, ours and Mitsuba's."""
+    link = {"floor": floor_and_mirror, "lobby": lobby}[room]()
+    return sequences(link), mitsuba_sequences(link, samples=64)
+
+
+def beamed(power: np.ndarray) -> np.ndarray:
+    """What a receiver's beam makes of it, shape ``(1, H, W)``; differences of noisy images may be below zero."""
+    return np.moveaxis(beam_operator(power.shape, BEAM_RAD)(np.maximum(power, 0.0)[:, :, None].copy()), -1, 0)
+
+
+LOOK, LIT = "4 rays a pixel look into mirrors", "mirrors light whole faces"
+ELEMENTS = "elements are lit evenly"
+
+
+def cases(**wrong: str) -> list[object]:
+    """Rooms and sequences; marked are those that are known to be ``wrong``, and why."""
+    found = []
+    for case in "floor_S floor_SM floor_MS lobby_S lobby_SM lobby_MS lobby_SS lobby_SSS".split():
+        why = wrong.get(case, "")
+        known = pytest.mark.xfail(bool(why), strict=True, raises=AssertionError, reason=why)
+        found.append(pytest.param(*case.split("_"), marks=known))
+    return found
+
+
+@pytest.mark.parametrize(
+    "known",
+    ["LOS M S MS SM", "MSM"],
+)  # fmt: skip
+def test_sequences_over_a_floor_and_a_mirror_follow_closed_forms(known):
+    ours, exact = sequences(floor_and_mirror()), closed_forms(floor_and_mirror())
+    for sequence in known.split():
+        assert abs(10.0 * np.log10(ours[sequence].sum() / exact[sequence])) < 0.05, sequence
+
+
+def test_mitsuba_follows_closed_forms():
+    sionna_or_skip()
+    exact = closed_forms(floor_and_mirror())
+    for sequence in ("S", "SM", "MS"):
+        found = compared("floor")[1][sequence]
+        assert found.error < 2e-3 * found.total
+        assert found.total == pytest.approx(exact[sequence], rel=1e-4, abs=4.0 * found.error)
+
+
+@pytest.mark.parametrize(("room", "sequence"), cases(lobby_SM=LOOK, lobby_MS=LIT, lobby_SSS=ELEMENTS))
+def test_totals_are_those_of_mitsuba(room, sequence):
+    sionna_or_skip()
+    ours, found = (both[sequence] for both in compared(room))
+    assert found.error < 5e-3 * found.total
+    assert ours.sum() == pytest.approx(found.total, rel=0.01, abs=0.0)
+
+
+@pytest.mark.parametrize(
+    ("room", "sequence"),
+    cases(floor_SM=LOOK, floor_MS=LIT, lobby_SM=LOOK, lobby_MS=LIT, lobby_SS=ELEMENTS, lobby_SSS=ELEMENTS),
+)  # fmt: skip
+def test_images_are_those_of_mitsuba(room, sequence):
+    sionna_or_skip()
+    ours, found = (both[sequence] for both in compared(room))
+    noise_db = rms_change_db(*(beamed(found.runs[k::2].mean(axis=0)) for k in (0, 1))) / 2.0  # of their mean
+    assert rms_change_db(beamed(ours), beamed(found.image)) < np.hypot(0.1, noise_db)
