@@ -8,6 +8,7 @@ from golden.make import joined as joined
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.exact import ExactEngine
+from warprrf.rf.fields.bistatic.gauss_newton import Problem
 from warprrf.rf.fields.bistatic.observations import Observation, Place, Target
 from warprrf.rf.fields.bistatic.tracer import MIRROR_SLACK_M
 from warprrf.rf.paths.images import MirrorImages
@@ -115,3 +116,9 @@ def observation(view, measured, floor, db=None, **how):
     )
     count = len(measured.of_bins(np.zeros((measured.bins(view)[1], 1))))
     return Observation(place, view, measured, Target(np.zeros(count) if db is None else db), floor, **how)
+
+
+def as_fits_predict(o, effects, p):
+    """Readings of an observation as a fit predicts them of parameters of groups, in units of the floor."""
+    ((*_, power),) = Problem.of([o], effects, np.arange(len(p.log_excess)), p).evaluated(p)
+    return power

@@ -4,20 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import warp as wp
 from furnished import RECEIVERS, TX, F, furnished, spectra
 from radio_scenes import RadioScene, SlabMaterial
 from twin_fields import known_field
 
-from warprrf.rf.em.fresnel import fresnel_curves, lobe, slab_reflection
+from warprrf.kernels.radio.records import SCATTER
+from warprrf.rf.em.fresnel import lobe, slab_reflection
 from warprrf.rf.em.materials import NARROWEST_LOBE
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
-from warprrf.rf.fields.bistatic.materials import Terms
-from warprrf.rf.fields.bistatic.rays import Illumination, RayGrid
-from warprrf.rf.fields.bistatic.scattering import resolve, scatter
-from warprrf.rf.fields.bistatic.surface import Surface
+from warprrf.rf.fields.bistatic.materials import Parameters
+from warprrf.rf.fields.bistatic.records import Evaluation, Records
 
 WAVELENGTH = SPEED_OF_LIGHT / F
 RX = RECEIVERS[0]
@@ -93,53 +91,33 @@ def test_the_exact_engines_diffuse_power_is_the_same_both_ways():
     assert abs(there / back - 1.0) > 0.03
 
 
-LOBES = Terms(lobes=(0, 4, 30), reciprocal=True)
-WEIGHT, EXCESS = np.array([[0.1, 0.2, 0.3], [0.3, 0.1, 0.05]]), np.log([2.0, 5.0])
-
-
 def test_scattering_of_a_field_takes_both_ends_alike():
-    # Rays with a unit of light, then the same with the two cosines exchanged: equal to the bit.
-    surface = Surface.of(room(reciprocal=False))
+    # Records of a unit of light, then the same with the two cosines exchanged: equal to the bit.
     rng = np.random.default_rng(4)
-    a, b, mirror = rng.uniform(0.0, 1.0, 4000), rng.uniform(0.0, 1.0, 4000), rng.uniform(-1.0, 1.0, 4000)
-    face = wp.array(rng.integers(0, len(surface.group), 4000), dtype=wp.int32)
+    angle = np.stack([*rng.uniform(0.0, 1.0, (2, 4000)), rng.uniform(-1.0, 1.0, 4000)], axis=1)[:, None]
+    group, ones = rng.integers(0, 2, (4000, 1)).astype(np.int32), np.ones(4000, np.float32)
+    weight = np.log([[0.1, 0.2, 0.3], [0.3, 0.1, 0.05]])
+    p = Parameters(weight, np.log([2.0, 5.0]), np.zeros(2), (0, 4, 30), reciprocal=True)
 
-    def power(terms, cos_in, cos_out):
-        columns = (np.ones(4000), cos_in, cos_out, mirror, np.ones(4000))
-        light = Illumination(*(wp.array(c, dtype=wp.float32) for c in columns))
-        return scatter(surface, face, light, terms, WEIGHT, EXCESS, WAVELENGTH)
+    def power(p, angle):
+        records = Records(ones, group[:, 0], group, angle.astype(np.float32), 0, SCATTER, half_width=0.01)
+        return records.powers(Evaluation(p))
 
-    assert np.array_equal(power(LOBES, a, b), power(LOBES, b, a))
-    plain = replace(LOBES, reciprocal=False)
-    assert not np.allclose(power(plain, a, b), power(plain, b, a), rtol=0.1)
+    back = angle[..., [1, 0, 2]]
+    assert np.array_equal(power(p, angle), power(p, back))
+    plain = replace(p, reciprocal=False)
+    assert not np.allclose(power(plain, angle), power(plain, back), rtol=0.1)
 
 
 def test_a_fields_scattered_power_is_the_same_both_ways():
-    field = known_field(terms=Terms(lobes=(0, 4, 12), reciprocal=True))
+    plain = known_field()
+    field = replace(plain, parameters=replace(plain.parameters, reciprocal=True))
 
     def total(f, transmitter, receiver):
-        return f.render(f.view(receiver, transmitter)).powers.single.sum()
+        return f.path_gains(f.view(receiver, transmitter)).single.sum()
 
     assert total(field, TX, RX) == pytest.approx(total(field, RX, TX), rel=5e-3)
-    plain = replace(field, terms=replace(field.terms, reciprocal=False))
     assert abs(total(plain, TX, RX) / total(plain, RX, TX) - 1.0) > 0.05
-
-
-def test_what_a_fit_sees_is_what_the_field_gives():
-    surface = Surface.of(room(reciprocal=False))
-    grid = RayGrid(surface, (24, 48), 2)
-    hits = grid.hit(RX)
-    light = grid.light(hits, TX)
-    power = scatter(surface, hits.face, light, LOBES, WEIGHT, EXCESS, WAVELENGTH)
-    groups, images = resolve(
-        surface, hits.face, light, LOBES, WAVELENGTH, np.arange(len(power)) // 4, 24 * 48
-    )
-    curves = fresnel_curves()
-    mixed = WEIGHT[groups][:, :, None] * curves.at(curves.coordinates, EXCESS[groups])[0][:, None]
-    found = np.einsum("nglm,glm->n", images, mixed)
-    # A few components stand for the whole family of Fresnel curves: to 13 % at grazing, as for other lobes.
-    np.testing.assert_allclose(found, power.reshape(-1, 4).sum(axis=1), rtol=0.13, atol=1e-5 * power.max())
-    assert found.sum() == pytest.approx(power.sum(), rel=0.02)
 
 
 def test_a_fit_takes_reciprocal_lobes_and_its_file_says_so(tmp_path):
@@ -148,6 +126,6 @@ def test_a_fit_takes_reciprocal_lobes_and_its_file_says_so(tmp_path):
     field = RadioField.fit(scene, ds, quick=True, reciprocal=True)
     field.save(tmp_path / "field.safetensors")
     again = RadioField.load(tmp_path / "field.safetensors")
-    assert again.terms.reciprocal
+    assert again.parameters.reciprocal
     assert np.array_equal(again.spectrum(RX).path_gain, field.spectrum(RX).path_gain)
-    assert not RadioField.fit(scene, ds, quick=True).terms.reciprocal
+    assert not RadioField.fit(scene, ds, quick=True).parameters.reciprocal

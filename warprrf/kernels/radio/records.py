@@ -111,15 +111,14 @@ def build(real: type) -> Any:
         value = real(0.3183098861837907)
         n = int(m.exponent[which])
         if n > 0:
-            value = wp.pow(wp.max(real(0.5) * (real(1.0) + angle[2]), real(0.0)), real(n)) * at(
-                m.scale, which, angle[0]
-            )
+            scale = at(m.scale, which, angle[0])
             if m.reciprocal == 1:
-                value *= at(m.scale, which, angle[1])
+                scale *= at(m.scale, which, angle[1])
             else:
                 high = angle[1] + half_width
                 low = wp.max(angle[1] - half_width, real(0.01) * half_width)
-                value *= wp.log(high / low) / (high - low)
+                scale *= wp.log(high / low) / (high - low)
+            value = wp.pow(wp.max(real(0.5) * (real(1.0) + angle[2]), real(0.0)), real(n)) * scale
         return value
 
     @wp.func

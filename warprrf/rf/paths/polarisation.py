@@ -111,27 +111,6 @@ def _rotations(turn: np.ndarray) -> np.ndarray:
     return np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)
 
 
-def chain_reflection(
-    log_excess: np.ndarray, cosine: np.ndarray, turn: np.ndarray, reflects: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Share of unpolarised power that chains of half-spaces of real permittivity reflect.
-
-    Source: ITU-R P.2040-4, eqs. (37a) and (37b).
-
-    Args:
-        log_excess: ln(epsilon_r - 1) of each mirror of each chain, shape ``(L, k)``.
-        cosine: of incidence, shape ``(L, k)``.
-        turn: as :func:`turns` gives them, shape ``(L, k)``.
-        reflects: which mirrors there are, shape ``(L, k)``; the others let everything pass.
-
-    Returns:
-        The share, shape ``(L,)``, and its logarithmic derivatives to ``log_excess``, shape ``(L, k)``.
-    """
-    whole, slopes = _chains(log_excess, cosine, turn, reflects)
-    share = 0.5 * (whole**2).sum(axis=(1, 2))
-    return share, (whole * slopes).sum(axis=(2, 3)).T / np.maximum(share, 1e-12)[:, None]
-
-
 def chain_amplitude(
     log_excess: np.ndarray,
     cosine: np.ndarray,
@@ -141,8 +120,13 @@ def chain_amplitude(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Amplitude between two polarised antennas over chains of half-spaces of real permittivity: it is real too.
 
+    Source: ITU-R P.2040-4, eqs. (37a) and (37b).
+
     Args:
-        log_excess, cosine, turn, reflects: as for :func:`chain_reflection`.
+        log_excess: ln(epsilon_r - 1) of each mirror of each chain, shape ``(L, k)``.
+        cosine: of incidence, shape ``(L, k)``.
+        turn: as :func:`turns` gives them, shape ``(L, k)``.
+        reflects: which mirrors there are, shape ``(L, k)``; the others let everything pass.
         ends: fields of the antennas, as :func:`vertical_ends` gives them.
 
     Returns:

@@ -5,18 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from furnished import RECEIVERS, TX, furnished
-from radio_scenes import RadioScene, SlabMaterial
+from radio_scenes import RadioScene, SlabMaterial, as_fits_predict, observation
 
 from warprrf.rf.channel.array_spectra import UP, ArraySpectra, hemisphere
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Terms
+from warprrf.rf.fields.bistatic.materials import SETS, Effects
 from warprrf.rf.fields.bistatic.measured import ArrayImage, read
 from warprrf.rf.fields.bistatic.observations import Frame
-from warprrf.rf.fields.bistatic.render import path_powers
-from warprrf.rf.fields.bistatic.response import predict, respond
+from warprrf.rf.fields.bistatic.tracer import SHARP
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.trace import trace_paths
 from warprrf.rf.spectra.spectrum import directions_from_angles
@@ -27,6 +26,7 @@ ARRAY = PlanarArray(4, 4, orientation=UP)
 DIRECTIONS = hemisphere((18, 36))
 STEERED = ARRAY.response(DIRECTIONS, 1.0).conj() / ARRAY.elements
 WALLS = SlabMaterial("walls", 5.0, 0.0, np.inf, 0.2)
+SINGLE = replace(SETS["single"], mirrors=2, residual=False)
 BOX = SlabMaterial("box", 12.0, 0.0, np.inf, 0.6)
 
 
@@ -38,7 +38,7 @@ def scene() -> RadioScene:
 @pytest.fixture(scope="module")
 def field(scene: RadioScene) -> BistaticField:
     frame = Frame(TX, F, (24, 48), 1e-12, (-120.0, -40.0), np.radians(5.0), None)
-    prior = BistaticField.prior(scene, frame, terms=Terms(mirror_order=2, sub_pixels=2))
+    prior = BistaticField.prior(scene, frame, effects=SINGLE, sub_pixels=2)
     known = prior.parameters
     share = np.log([1.0 - m.scattering**2 for m in (WALLS, BOX)])
     excess = np.log([m.relative_permittivity - 1.0 for m in (WALLS, BOX)])
@@ -57,7 +57,7 @@ def test_mirrors_and_line_of_sight_add_up_as_complex_paths_do(
     scene: RadioScene, field: BistaticField
 ) -> None:
     """Of the exact paths of the scene with their Jones matrices; zones that a mirror's edge covers in part are left out."""
-    alone = replace(field, terms=replace(field.terms, diffuse=False))
+    alone = replace(field, effects=replace(SINGLE, scatterings=0))
     compared = 0
     for place in RECEIVERS:
         view = alone.view(place)
@@ -72,7 +72,7 @@ def test_mirrors_and_line_of_sight_add_up_as_complex_paths_do(
 
 
 def test_one_path_alone_peaks_at_its_path_gain(field: BistaticField) -> None:
-    alone = replace(field, terms=replace(field.terms, diffuse=False, mirror_order=0))
+    alone = replace(field, effects=Effects(mirrors=0, scatterings=0))
     place = RECEIVERS[1]
     toward = (TX - place) / np.linalg.norm(TX - place)
     found = alone.array_spectrum(place, ARRAY, toward[None])
@@ -82,12 +82,12 @@ def test_one_path_alone_peaks_at_its_path_gain(field: BistaticField) -> None:
 
 
 def test_scattered_light_is_the_mean_over_its_random_phases(field: BistaticField) -> None:
-    alone = replace(field, terms=replace(field.terms, line_of_sight=False, mirror_order=0))
+    alone = replace(field, effects=replace(SINGLE, line_of_sight=False, mirrors=0))
     place = RECEIVERS[0]
     view = alone.view(place)
-    power = path_powers(view, alone.materials, None).single
+    power = alone.path_gains(view).single
     lit = np.flatnonzero(power > 1e-4 * power.max())
-    wave = ARRAY.response(view.transport.grid.directions[lit], 1.0) * np.sqrt(power[lit])[:, None]
+    wave = ARRAY.response(view.tracer.grid.directions[lit], 1.0) * np.sqrt(power[lit])[:, None]
     rng = np.random.default_rng(0)
     phases = np.exp(2j * np.pi * rng.random((2000, len(lit))))
     drawn = (np.abs(np.einsum("hwm,sm->shw", STEERED, phases @ wave)) ** 2).mean(axis=0)
@@ -97,12 +97,10 @@ def test_scattered_light_is_the_mean_over_its_random_phases(field: BistaticField
 
 def test_paths_of_unknown_length_add_in_power(field: BistaticField) -> None:
     place = RECEIVERS[0]
-    alone = replace(field, terms=replace(field.terms, diffuse=False))
+    alone = replace(field, effects=replace(SINGLE, scatterings=0))
     view = alone.view(place)
     together = ArrayImage.of(view, ARRAY, DIRECTIONS.reshape(-1, 3), 0.0).together
-    amplitude = together.amplitudes(
-        view.friis, view.path_groups, view.paths.cosine, view.paths.turn, alone.parameters
-    )[0]
+    amplitude = together.amplitudes(view.records[SHARP], alone.parameters)[0]
     each = sum(np.abs(a * row) ** 2 for a, row in zip(amplitude, together.field, strict=True))
     found = alone.array_spectrum(place, ARRAY, DIRECTIONS, length_std_m=1.0).ravel()
     np.testing.assert_allclose(found, each, rtol=1e-4)
@@ -119,9 +117,9 @@ def test_paths_of_unknown_length_add_in_power(field: BistaticField) -> None:
 def test_what_a_fit_predicts_is_what_is_read(field: BistaticField) -> None:
     view = field.view(RECEIVERS[0])
     image = ArrayImage.of(view, ARRAY, DIRECTIONS.reshape(-1, 3), 0.0004)
-    power = read(view, image, path_powers(view, field.materials, None))
-    floor = 1e-2 * power.max()
-    found = predict(respond(view, image, field.terms, floor), field.parameters) * floor
+    power = read(field.path_gains(view), image)
+    found = as_fits_predict(observation(view, image, 1e-2 * power.max()), SINGLE, field.parameters)
+    found *= 1e-2 * power.max()
     np.testing.assert_allclose(found, power, rtol=0.02, atol=0.01 * power.max())
 
 
@@ -132,14 +130,14 @@ def test_a_fit_to_normalised_pictures_beats_the_nearest(scene: RadioScene, field
         exact = trace_paths(scene, transmitter=TX, receivers=place, frequency_hz=F, mirror_order=2)
         h = heard(exact)
         view = field.view(place)
-        power = path_powers(view, field.materials, None).single
+        power = field.path_gains(view).single
         phase = np.exp(2j * np.pi * rng.random(len(power)))
-        h = h + ARRAY.response(view.transport.grid.directions, 1.0).T @ (np.sqrt(power) * phase)
+        h = h + ARRAY.response(view.tracer.grid.directions, 1.0).T @ (np.sqrt(power) * phase)
         seen = np.abs(STEERED @ h) ** 2
         truth.append(np.round(255 * seen / seen.max()) / 255)
     pictures = np.array(truth)
     known = ArraySpectra(TX, RECEIVERS[:6], pictures[:6], F, ARRAY, DIRECTIONS)
-    fitted = RadioField.fit(scene, known, quick=True, mirror_order=2)
+    fitted = RadioField.fit(scene, known, quick=True, effects=replace(SETS["single"], mirrors=2))
     assert isinstance(fitted, BistaticField)
 
     def psnr(a: np.ndarray, b: np.ndarray) -> float:

@@ -8,11 +8,11 @@ from furnished import RECEIVERS, ROOM, TX, F, spectra
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Terms
+from warprrf.rf.fields.bistatic.materials import Effects, Parameters
+from warprrf.rf.fields.bistatic.records import Evaluation, Records
 from warprrf.rf.fields.bistatic.surface import SKIN_M, Surface
-from warprrf.rf.paths.polarisation import chain_reflection, turns
+from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.paths.trace import MirrorTracer
 
 RX = RECEIVERS[0]
@@ -34,6 +34,16 @@ def reflected_ways(count: int, mirrors: int, seed: int) -> tuple[np.ndarray, np.
     return np.stack(stops, axis=1), normal, np.stack(cosine, axis=1)
 
 
+def reflected(excess: np.ndarray, cosine: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Share of unpolarised light that chains of mirrors (L, k) reflect, by the kernel of records; 0 in ``excess`` is none."""
+    index = np.where(excess > 0, np.arange(excess.size).reshape(excess.shape), -1).astype(np.int32)
+    none = np.zeros(excess.size)
+    p = Parameters(none[:, None], np.log(np.where(excess > 0, excess, 1.0)).ravel(), none, (0,))
+    angle = np.stack([cosine, turn, 0.0 * turn], axis=2)
+    ones, mirrors = np.ones(len(excess)), excess.shape[1]
+    return Records(ones, np.arange(len(excess)), index, angle, mirrors).powers(Evaluation(p))
+
+
 @pytest.mark.usefixtures("device")
 def test_mirrors_one_after_the_other_reflect_as_jones_matrices_say() -> None:
     """The image method on the true scene multiplies Jones matrices."""
@@ -44,7 +54,7 @@ def test_mirrors_one_after_the_other_reflect_as_jones_matrices_say() -> None:
     ]
     scene = RadioScene(mesh, part, room)
     ds = spectra(scene, RX[None], shape=(12, 24), sigma=np.radians(10.0))
-    field = BistaticField.prior(scene, ds, terms=Terms(mirror_order=2))
+    field = BistaticField.prior(scene, ds, effects=Effects(mirrors=2, scatterings=0))
     permittivity = np.array([m.relative_permittivity for m in room])
     mirrored = 1.0 - np.array([m.scattering for m in room]) ** 2
     p = replace(field.parameters, log_excess=np.log(permittivity - 1.0), log_mirror=np.log(mirrored))
@@ -52,7 +62,7 @@ def test_mirrors_one_after_the_other_reflect_as_jones_matrices_say() -> None:
     view = field.view(RX)
     found = view.paths
     true = MirrorTracer(scene, transmitter=TX, frequency_hz=F).trace(RX, 2)
-    power = field.render(view).powers.mirror
+    power = field.path_gains(view).sharp
     compared = 0
     for path in np.flatnonzero(found.order == 2):
         same = (np.abs(true.length_m - found.length_m[path]) < 1e-6) & (
@@ -65,27 +75,20 @@ def test_mirrors_one_after_the_other_reflect_as_jones_matrices_say() -> None:
 
 
 def test_one_mirror_reflects_the_mean_of_both_polarisations_and_absent_ones_nothing() -> None:
-    log_excess, cosine = np.linspace(-2.0, 4.0, 20), np.linspace(0.05, 1.0, 20)
+    excess, cosine = np.geomspace(0.1, 50.0, 20), np.linspace(0.05, 1.0, 20)
+    root = np.sqrt(excess + cosine**2)
+    te, tm = ((a - root) / (a + root) for a in (cosine, (1.0 + excess) * cosine))
     rest = np.zeros((20, 2))
-    share, slope = chain_reflection(
-        np.column_stack([log_excess, rest]), np.column_stack([cosine, rest]), np.zeros((20, 3)),
-        np.tile([True, False, False], (20, 1)),
-    )  # fmt: skip
-    value, rise = fresnel_curves().value(log_excess, cosine)
-    np.testing.assert_allclose(share, value, rtol=5e-3)  # a table over permittivity and cosine
-    assert (slope[:, 1:] == 0).all()
-    steps = np.abs(slope[:, 0] - rise / value)
-    assert np.median(steps) < 0.02  # the table's derivative is that of a chord
+    share = reflected(np.column_stack([excess, rest]), np.column_stack([cosine, rest]), np.zeros((20, 3)))
+    np.testing.assert_allclose(share, 0.5 * (te**2 + tm**2), rtol=1e-12)
 
 
 def test_a_mirror_met_head_on_has_no_plane_of_incidence() -> None:
     """A wave that goes to a wall and back keeps its polarisation, whichever plane stands in for the missing one."""
     stops = np.array([[[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [0.0, 0.0, 4.0], [0.0, 0.0, 1.0]]])
     normal = np.array([[[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
-    share = chain_reflection(
-        np.log([[3.0, 3.0]]), np.ones((1, 2)), turns(stops, normal), np.ones((1, 2), bool)
-    )
-    np.testing.assert_allclose(share[0], (1.0 / 3.0) ** 4, rtol=1e-12)
+    share = reflected(np.array([[3.0, 3.0]]), np.ones((1, 2)), turns(stops, normal))
+    np.testing.assert_allclose(share, (1.0 / 3.0) ** 4, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -132,8 +135,8 @@ def test_any_chain_reflects_as_fields_in_space_do(mirrors: int) -> None:
     With three mirrors the sense of each turn counts: of two, only its size.
     """
     stops, normal, cosine = reflected_ways(200, mirrors, 11)
-    log_excess = np.log(np.random.default_rng(4).uniform(0.5, 12.0, (200, mirrors)))
-    share, _ = chain_reflection(log_excess, cosine, turns(stops, normal), np.ones(cosine.shape, bool))
+    excess = np.random.default_rng(4).uniform(0.5, 12.0, (200, mirrors))
+    share = reflected(excess, cosine, turns(stops, normal))
     leg = np.diff(stops, axis=1)
     leg /= np.linalg.norm(leg, axis=2, keepdims=True)
     for path in range(200):
@@ -142,7 +145,7 @@ def test_any_chain_reflects_as_fields_in_space_do(mirrors: int) -> None:
             s = np.cross(leg[path, k], normal[path, k])
             s /= np.linalg.norm(s)
             before, after = np.cross(s, leg[path, k]), np.cross(s, leg[path, k + 1])
-            c, permittivity = cosine[path, k], 1.0 + np.exp(log_excess[path, k])
+            c, permittivity = cosine[path, k], 1.0 + excess[path, k]
             root = np.sqrt(permittivity - 1.0 + c**2)
             te, tm = (c - root) / (c + root), (permittivity * c - root) / (permittivity * c + root)
             u = te * np.outer(u @ s, s) + tm * np.outer(u @ before, after)

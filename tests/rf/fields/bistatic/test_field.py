@@ -6,21 +6,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 from furnished import MATERIALS, RECEIVERS, ROOM, SHAPE, SIGMA, TX, F, spectra
-from radio_scenes import RadioScene, box_mesh, joined, mirror_paths
+from radio_scenes import RadioScene, box_mesh, joined, mirror_paths, observation
+from twin_fields import known_field, room
 
 from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import fit as fitting
-from warprrf.rf.fields.bistatic import training
+from warprrf.rf.fields.bistatic import gauss_newton as newton
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Parameters, Terms
-from warprrf.rf.fields.bistatic.rays import RayGrid
-from warprrf.rf.fields.bistatic.response import Response, predict
-from warprrf.rf.fields.bistatic.scattering import scatter
+from warprrf.rf.fields.bistatic.fit import trace
+from warprrf.rf.fields.bistatic.materials import SETS, Effects, Parameters
+from warprrf.rf.fields.bistatic.measured import WeighedPaths
+from warprrf.rf.fields.bistatic.observations import NEPER, Columns
 from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.training import trace
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.lookups import nearest
@@ -47,7 +47,7 @@ def psnr(field: RadioField, ds: SpectrumDataset, transmitter: np.ndarray | None 
 def test_spectra_that_would_not_fit_into_memory_are_refused(
     scene: RadioScene, data: SpectrumDataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(training, "MOST_RAYS", 10 * 24 * 48 * 4 - 1)
+    monkeypatch.setattr(fitting, "MOST_RAYS", 10 * 24 * 48 * 4 - 1)
     with pytest.raises(ValueError, match="ds: 10 spectra of 24 x 48 pixels take 4.6e.04 rays"):
         trace(scene, data, sub_pixels=2)
     assert len(trace(scene, data.subset(np.arange(9)), sub_pixels=2).views) == 9
@@ -102,7 +102,7 @@ def test_before_any_spectrum_the_field_is_that_of_the_prior(scene: RadioScene, d
     assert np.allclose(image, unfitted.spectrum(RECEIVERS[4]).path_gain, rtol=1e-6)
     dark = replace(data, path_gain=np.zeros_like(data.path_gain))
     assert np.array_equal(image, BistaticField.prior(scene, dark).spectrum(RECEIVERS[4]).path_gain)
-    bare = BistaticField.prior(scene, data, terms=Terms(line_of_sight=False, mirror_order=0, diffuse=False))
+    bare = BistaticField.prior(scene, data, effects=Effects(line_of_sight=False, mirrors=0, scatterings=0))
     assert bare.spectrum(RECEIVERS[4]).path_gain.max() == 0
 
 
@@ -206,11 +206,12 @@ def test_an_empty_spectrum_is_refused_and_one_among_others_is_not(
     ).all()
 
 
-def test_terms_may_change_after_the_fit_but_not_for_the_uncertainty(field: BistaticField) -> None:
-    other = replace(field, terms=replace(field.terms, indirect=not field.terms.indirect))
-    assert (other.spectrum(RECEIVERS[7]).path_gain > 0).any()
-    with pytest.raises(ValueError, match="uncertainty: this field's errors were learned for"):
-        other.spectrum(RECEIVERS[7], uncertainty=True)
+def test_effects_may_change_after_the_fit(field: BistaticField) -> None:
+    place = RECEIVERS[3]
+    all_on, bare = (replace(field, effects=e) for e in (Effects(), Effects(True, 0, 0)))
+    more, less = (one.spectrum(place, uncertainty=True) for one in (all_on, bare))
+    assert more.total_path_gain > field.spectrum(place).total_path_gain > less.total_path_gain > 0
+    assert np.isfinite(more.std_db).all()
 
 
 def test_one_training_receiver_is_enough_for_a_field(scene: RadioScene, data: SpectrumDataset) -> None:
@@ -228,19 +229,14 @@ def test_duplicate_receivers_change_little(scene: RadioScene, data: SpectrumData
 
 
 def test_what_was_traced_at_other_places_is_refused(scene: RadioScene, data: SpectrumDataset) -> None:
-    with pytest.raises(ValueError, match="transport"):
-        RadioField.fit(scene, data.subset([1]), transport=trace(scene, data.subset([0])))
+    with pytest.raises(ValueError, match="views"):
+        RadioField.fit(scene, data.subset([1]), views=trace(scene, data.subset([0])))
 
 
-def test_a_tracer_on_true_materials_matches_the_exact_engine(scene: RadioScene) -> None:
-    surface = Surface.of(scene)
-    grid = RayGrid(surface, SHAPE, 3)
-    hits = grid.hit(RECEIVERS[0])
-    weight = np.array([[0.0, 0.25], [0.64, 0.0]])
-    power = scatter(
-        surface, hits.face, grid.light(hits, TX), Terms(lobes=(0, 4)), weight, np.log([2.0, 5.0]), WAVELENGTH
-    )
-    engine = ExactEngine(scene, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA)
+def test_a_tracer_on_true_materials_matches_the_exact_engine() -> None:
+    field = known_field()
+    engine = ExactEngine(room(), transmitter=TX, frequency_hz=F, shape=field.shape, beam_sigma_rad=SIGMA)
+    power = field.path_gains(field.view(RECEIVERS[0])).single
     assert power.sum() == pytest.approx(engine.diffuse(RECEIVERS[0]).power.sum(), rel=0.02)
 
 
@@ -258,44 +254,43 @@ def test_the_beam_operator_is_the_beam_of_every_pixel() -> None:
     found = beam(images)
     np.testing.assert_allclose(found, expected, atol=1e-13 * expected.max())
     pixels = np.array([5, 400, 777])
-    np.testing.assert_allclose(
-        beam.at(pixels, images.reshape(-1, 2)), expected.reshape(-1, 2)[pixels], rtol=1e-5
-    )
+    some = beam.at(pixels) @ images.reshape(-1, 2)
+    np.testing.assert_allclose(some, expected.reshape(-1, 2)[pixels], rtol=1e-5)
 
 
 def test_a_quick_fit_tries_nothing_and_is_near(scene: RadioScene, data: SpectrumDataset) -> None:
     few, test = data.subset(np.arange(6)), data.subset(np.arange(6, 10))
     quick = RadioField.fit(scene, few, quick=True)
-    assert quick.terms == Terms(mirror_order=1, indirect=True, residual=True, sub_pixels=1)
-    tried = {choice["term"] for choice in quick.report["choices"]}
-    assert tried <= {"single bounces", "2 materials as 2", "residual"}
+    assert quick.sub_pixels == 1
+    assert quick.effects in (SETS["single"], SETS["room"])
+    assert {choice["term"] for choice in quick.report["choices"]} <= {"single", "room"}
     assert psnr(quick, test) > evaluate(test, nearest(few))["psnr_db"] + 8
-    finer = RadioField.fit(scene, few, quick=True, sub_pixels=2, mirror_order=2)
-    assert (finer.terms.sub_pixels, finer.terms.mirror_order) == (2, 2)
+    finer = RadioField.fit(scene, few, quick=True, sub_pixels=2, effects=Effects(mirrors=2))
+    assert (finer.sub_pixels, finer.effects) == (2, Effects(mirrors=2))
     with pytest.raises(ValueError, match="sub_pixels"):
         RadioField.fit(scene, few, sub_pixels=0)
 
 
-def test_a_fit_goes_on_after_steps_that_were_cut_short() -> None:
+def test_a_fit_goes_on_after_steps_that_were_cut_short(
+    field: BistaticField, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """One weight has 9 nepers to go, 1.5 a step, while pixels that nothing explains hide how much each step gains."""
-    lit, hopeless = 20, 4000
-    count = lit + hopeless
-    none = np.zeros((0, count), np.float32)
-    bounce = np.zeros((1, 1, 3, count), np.float32)
-    true = Parameters.prior(1, 1)
-    component = fresnel_curves().at(fresnel_curves().coordinates, true.log_excess)[0][0]
-    bounce[0, 0, :, :lit] = 200.0 * component[:, None]
-    index, angle = np.zeros((0, 3), int), np.zeros((0, 3))
-    response = Response(
-        group=np.array([0]), bounce=bounce, seen=np.zeros(0, int), indirect=none, sender=np.zeros(0, int), sent=none,
-        path_group=index, cosine=angle, turn=angle, path_power=np.zeros(0), path=none, offset=np.zeros(count),
-    )  # fmt: skip
+    lit, count = 20, 4020
+    true = Parameters.prior(1, (0,))
+    curves = fresnel_curves()
+    single = np.zeros((1, 1, 3, count), np.float32)
+    single[0, 0, :, :lit] = 200.0 * curves.at(curves.coordinates, true.log_excess)[0][0][:, None]
+    columns = Columns(np.zeros(1, int), single, np.zeros(0, int), np.zeros((0, count), np.float32))
     target = np.full(count, 40.0)
-    target[:lit] = fitting.NEPER * np.log1p(predict(response, true)[0])
-    reading = fitting.Reading(response, fitting.Target(target))
-    start = replace(true, log_weight=true.log_weight - 9.0)
-    loose = fitting.Deviations(weight=1e3, excess=1e-3, mirror=1e3, energy=1e6)
-    found = fitting.fit_groups([reading], start, np.ones(1), fitting.GroupFit(deviations=loose))
-    now = reading.error_db(found.parameters)[:lit]
-    assert found.steps > 5
-    assert np.abs(now).max() < 0.1
+    target[:lit] = NEPER * np.log1p(columns.power(true)[:lit])
+    view = field.view(RECEIVERS[0])
+    nowhere = np.full(len(view.hits.face), -1)  # the bin of each ray
+    unlit = np.zeros((count, 1), np.float32), np.arange(count), np.zeros((len(view.paths), count), np.float32)
+    o = observation(view, WeighedPaths(nowhere, *unlit), 1.0, target)
+    problem = newton.Problem([o], [columns], Effects(True, 0, 0), np.zeros(1, int), energy=1e6)
+    for name, loose in {"WEIGHT": 1e3, "EXCESS": 1e-3, "MIRROR": 1e3}.items():
+        monkeypatch.setattr(newton, name, loose)
+    found = newton.gauss_newton(problem, replace(true, log_weight=true.log_weight - 9.0), 40)
+    (now,) = problem.errors_db(found.parameters)
+    assert len(found.losses) > 5
+    assert np.abs(now[:lit]).max() < 0.1

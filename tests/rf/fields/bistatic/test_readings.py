@@ -9,11 +9,11 @@ import pandas as pd
 import pytest
 from furnished import RECEIVERS, SHAPE, SIGMA, TX, F, spectra
 from radio_scenes import RadioScene
+from warprrf.rf.fields.bistatic.training import Selection
 
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.fit import Target
-from warprrf.rf.fields.bistatic.training import Selection
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.readings import COLUMNS, Readings, horn, path_weights

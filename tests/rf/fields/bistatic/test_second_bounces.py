@@ -6,24 +6,24 @@ import numpy as np
 import pytest
 from furnished import RECEIVERS, ROOM, SHAPE, TX, F, spectra
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths
-
-from warprrf.geometry.mesh import Mesh
-from warprrf.rf.em.fresnel import fresnel_curves
-from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.fit import Reading, Target, fit_groups
 from warprrf.rf.fields.bistatic.grouping import regroup
-from warprrf.rf.fields.bistatic.materials import Parameters, Terms
-from warprrf.rf.fields.bistatic.measured import SpectrumPixels
 from warprrf.rf.fields.bistatic.response import (
     predict,
     respond,
     with_further_bounces,
 )
 from warprrf.rf.fields.bistatic.scattering import send
-from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.training import trace
 from warprrf.rf.fields.bistatic.transport import Transport
+
+from warprrf.geometry.mesh import Mesh
+from warprrf.rf.em.fresnel import fresnel_curves
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.fit import Reading, Target, fit_groups
+from warprrf.rf.fields.bistatic.materials import Parameters, Terms
+from warprrf.rf.fields.bistatic.measured import SpectrumPixels
+from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.spectrum import to_db
 

@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from furnished import RECEIVERS, ROOM, SHAPE, SIGMA, TX, spectra
-from radio_scenes import RadioScene, SlabMaterial
+from radio_scenes import RadioScene, SlabMaterial, observation
 from scipy import sparse
 from trimesh.remesh import subdivide_to_size
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.fit import NEPER, Target
 from warprrf.rf.fields.bistatic.links import LinkTracer
-from warprrf.rf.fields.bistatic.materials import Terms
+from warprrf.rf.fields.bistatic.materials import Effects
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
-from warprrf.rf.fields.bistatic.residuals import ResidualFit, Shares, fit_residual, gather_shares
+from warprrf.rf.fields.bistatic.observations import NEPER
+from warprrf.rf.fields.bistatic.residual import Shares, fit_residual, shares_of
 from warprrf.rf.fields.bistatic.surface import CELLS, ELEMENT_M, Surface
 from warprrf.rf.maps.links import LinkOptions
 from warprrf.rf.spectra.beam import BeamOperator
@@ -30,24 +30,19 @@ def field() -> BistaticField:
     mesh = Mesh(*subdivide_to_size(*ROOM, 0.25))
     walls = SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5)
     scene = RadioScene(mesh, np.zeros(len(mesh.faces), np.int32), [walls])
-    terms = Terms(diffuse_order=2, mirror_scatter=True, residual=True)
-    return BistaticField.prior(scene, spectra(scene, RECEIVERS[:1]), terms=terms)
+    effects = Effects(mirrors=1, scatterings=2, scatter_mirror=False)
+    return BistaticField.prior(scene, spectra(scene, RECEIVERS[:1]), effects=effects)
 
 
-def shares_of(field: BistaticField, planted: np.ndarray) -> list[Shares]:
-    """What the receivers would see of ``field`` with the gains ``planted``, written out term by term."""
-    surface, pixels, found = field.surface, SHAPE[0] * SHAPE[1], []
+def planted_shares(field: BistaticField, planted: np.ndarray) -> list[Shares]:
+    """What cells give receivers of ``field``, who read it with the gains ``planted``."""
+    textured, found = replace(field, residual=planted), []
     for receiver in RECEIVERS:
-        view = field.view(receiver)
-        bare = replace(field, residual=np.zeros_like(field.residual))
-        powers = bare.render(view).powers
-        per_pixel = len(powers.single) // pixels
-        pixel, face = np.arange(len(powers.single)) // per_pixel, view.hits.face.numpy()
-        single = gather_shares(pixel, pixels, face, powers.single / field.floor, surface)
-        further = gather_shares(pixel, pixels, face, powers.sent / field.floor, surface)
-        image = replace(field, residual=planted).render(view).image / field.floor
-        specular = np.tensordot(powers.mirror, view.beams, axes=1).ravel() / field.floor
-        found.append(Shares(single, further, specular, MEASURED, Target(NEPER * np.log1p(image.ravel()))))
+        view, power = field.view(receiver), textured.spectrum(receiver).path_gain.ravel() / field.floor
+        o = observation(view, MEASURED, field.floor, NEPER * np.log1p(power))
+        found.append(shares_of(o, field.state, field.evaluation(view.tracer)))
+        again = MEASURED.of_bins((found[-1].power @ np.exp(planted).ravel())[:, None])[:, 0] + found[-1].rest
+        np.testing.assert_allclose(again, power, rtol=1e-4, atol=1e-6 * power.max())
     return found
 
 
@@ -70,15 +65,15 @@ def test_planted_gains_come_back(field: BistaticField) -> None:
     for seed in (3, 4, 5):
         rng = np.random.default_rng(seed)
         smooth = rng.normal(0.0, 0.3, (2, len(field.surface.element_area)))[:, field.surface.cell_element]
-        shares = shares_of(field, smooth)
-        found = fit_residual(shares, field.surface, ResidualFit(noise_db=0.1))
+        shares = planted_shares(field, smooth)
+        found = fit_residual(shares, field.surface, noise_db=0.1)
         assert found.shape == (2, field.surface.cells)
         known, gaps = replace(field, residual=found), []
         for receiver, share in zip(RECEIVERS, shares, strict=True):
-            image = known.render(known.view(receiver)).image.ravel() / field.floor
+            image = known.spectrum(receiver).path_gain.ravel() / field.floor
             gaps.append(NEPER * np.log1p(image) - share.target.db)
         assert np.sqrt(np.mean(np.square(gaps))) < 0.1
-        power = sum(np.asarray(s.single.sum(axis=0)).ravel() for s in shares)
+        power = sum(np.asarray(s.power.sum(axis=0)).ravel()[: field.surface.cells] for s in shares)
         element = field.surface.cell_element
         bright = power > np.quantile(power, 0.75)
         found_again.append(np.corrcoef(found[0][bright], smooth[0][bright])[0, 1])
@@ -90,7 +85,7 @@ def test_planted_gains_come_back(field: BistaticField) -> None:
 
 def test_nothing_seen_is_nothing_learned(field: BistaticField) -> None:
     """Spectra that the field explains already, and surfaces that no spectrum shows, have gains of 1."""
-    shares = shares_of(field, np.zeros_like(field.residual))
+    shares = planted_shares(field, np.zeros_like(field.residual))
     assert np.abs(fit_residual(shares, field.surface)).max() < 1e-4
     surface = field.surface
     shown = np.isin(
@@ -99,11 +94,9 @@ def test_nothing_seen_is_nothing_learned(field: BistaticField) -> None:
     shown &= (
         surface.element_centre[surface.cell_element][:, 2] < 2.9
     )  # no ceiling, and else all cells but one
-    hide = sparse.diags_array(shown.astype(np.float32))
-    doubled = [
-        replace(s, single=s.single @ hide, further=s.further @ hide)
-        for s in shares_of(field, np.full_like(field.residual, np.log(2.0)))
-    ]
+    hide = sparse.diags_array(np.tile(shown.astype(np.float32), 2))
+    twice = planted_shares(field, np.full_like(field.residual, np.log(2.0)))
+    doubled = [replace(s, power=s.power @ hide) for s in twice]
     found = fit_residual(doubled, surface)
     dark = np.bincount(surface.cell_element, shown)[surface.cell_element] == 0
     assert dark.any() and np.array_equal(found[:, dark], np.zeros((2, dark.sum())))
@@ -112,16 +105,13 @@ def test_nothing_seen_is_nothing_learned(field: BistaticField) -> None:
 
 
 def test_gains_multiply_their_own_light_alone(field: BistaticField) -> None:
-    view = field.view(RECEIVERS[0])
-    bare = field.render(view)
-    ones, twos = np.zeros(field.surface.cells), np.full(field.surface.cells, np.log(2.0))
-    single = replace(field, residual=np.stack([twos, ones])).render(view)
-    np.testing.assert_allclose(single.powers.single, 2.0 * bare.powers.single, rtol=1e-12)
-    np.testing.assert_array_equal(single.further, bare.further)
-    further = replace(field, residual=np.stack([ones, twos])).render(view)
-    np.testing.assert_array_equal(further.powers.single, bare.powers.single)
-    np.testing.assert_allclose(further.further, 2.0 * bare.further, rtol=1e-12)
-    assert bare.further.sum() > 0
+    view, cells = field.view(RECEIVERS[0]), field.surface.cells
+    bare = field.path_gains(view).tables
+    for row, own in enumerate((["S"], ["MS", "E"])):
+        gained = replace(field, residual=np.log(2.0) * (np.arange(2) == row)[:, None] * np.ones(cells))
+        for name, power in gained.path_gains(view).tables.items():
+            np.testing.assert_allclose(power, (1 + (name in own)) * bare[name], rtol=1e-12)
+        assert all(bare[name].sum() > 0 for name in own)
 
 
 def test_another_transmitters_light_falls_elsewhere(field: BistaticField) -> None:
@@ -131,13 +121,10 @@ def test_another_transmitters_light_falls_elsewhere(field: BistaticField) -> Non
     rng = np.random.default_rng(5)
     own = replace(field, residual=rng.normal(size=field.residual.shape))
     view = own.view(RECEIVERS[0], there)
-    ours, bare = own.render(view), field.render(view)
-    np.testing.assert_array_equal(ours.further, bare.further)
-    assert not np.allclose(ours.powers.single, bare.powers.single, atol=0.0)
-    moved = replace(own, residual=own.residual * [[1.0], [0.0]])
-    np.testing.assert_array_equal(
-        own.spectrum(RECEIVERS[0], there).path_gain, moved.spectrum(RECEIVERS[0], there).path_gain
-    )
+    ours, bare = own.path_gains(view).tables, field.path_gains(view).tables
+    for name in ("MS", "E"):
+        np.testing.assert_array_equal(ours[name], bare[name])
+    assert not np.allclose(ours["S"], bare["S"], atol=0.0)
 
 
 def test_links_have_the_same_gains(field: BistaticField) -> None:
@@ -145,9 +132,8 @@ def test_links_have_the_same_gains(field: BistaticField) -> None:
     rng = np.random.default_rng(6)
 
     def totals(asked: BistaticField) -> tuple[np.ndarray, np.ndarray]:
-        transport = asked.transport()
-        sent, options = asked.sent_radiance(transport), LinkOptions(asked.beam_sigma_rad, SHAPE)
-        links = LinkTracer(transport, asked.materials, sent, options, SHAPE)(RECEIVERS)
+        tracer, options = asked.tracer(), LinkOptions(asked.beam_sigma_rad, SHAPE)
+        links = LinkTracer(tracer, asked.state, asked.evaluation(tracer), options, SHAPE)(RECEIVERS)
         return links.total_path_gain, np.array([asked.spectrum(r).path_gain.sum() for r in RECEIVERS])
 
     bare = totals(field)
