@@ -95,7 +95,10 @@ def build(real: type) -> Any:
         """Size of the reflection (TE, TM) of a slab of ``thickness`` wavelengths. ITU-R P.2040-4, eqs. (37), (43a), (44)."""
         a = eta - vec2(real(1.0) - c * c, real(0.0))
         size = wp.length(a)
-        root = vec2(wp.sqrt(real(0.5) * wp.max(size + a[0], real(0.0))), wp.sqrt(real(0.5) * wp.max(size - a[0], real(0.0))))
+        root = vec2(
+            wp.sqrt(real(0.5) * wp.max(size + a[0], real(0.0))),
+            wp.sqrt(real(0.5) * wp.max(size - a[0], real(0.0))),
+        )
         if a[1] < real(0.0):
             root = vec2(root[0], -root[1])
         echo = vec2(real(0.0), real(0.0))  # a half-space sends none back

@@ -102,7 +102,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class _Rays:
+class Rays:
     """Rays and what they hit: ``ray`` of the receiver's grid that each belongs to, and the interaction between the hit and
     the receiver, if any: group ``(N,)`` and cosine ``(N,)`` of a mirror."""
 
@@ -220,12 +220,12 @@ class Tracer:
 
     def trace(self, view: View, names: Sequence[str]) -> dict[str, Records]:
         """Tables of sequences that a receiver sees, by name."""
-        first, turned = _Rays(view.hits, np.arange(len(view.hits.face))), None
+        first, turned = Rays(view.hits, np.arange(len(view.hits.face))), None
         if any(name.endswith("M") for name in names):
             turned = self._turned(view)
         return {name: self._trace(name, turned if name.endswith("M") and turned else first) for name in names}
 
-    def _trace(self, name: str, rays: _Rays) -> Records:
+    def _trace(self, name: str, rays: Rays) -> Records:
         """Records of one sequence."""
         if name.startswith("E"):
             return self.seen(rays)
@@ -241,13 +241,13 @@ class Tracer:
             power, np.arange(len(p), dtype=np.int32), group.astype(np.int32), angle, group.shape[1]
         )
 
-    def lit(self, rays: _Rays) -> Records:
+    def lit(self, rays: Rays) -> Records:
         """What rays see of surfaces that the transmitter lights."""
         light = self.grid.light(rays.hits, self.transmitter)
         row = np.flatnonzero(light.strength > 0)
-        return self._scattered(rays, row, light.strength[row], light.angle[row])
+        return self.scattered(rays, row, light.strength[row], light.angle[row])
 
-    def lit_by_mirrors(self, rays: _Rays) -> Records:
+    def lit_by_mirrors(self, rays: Rays) -> Records:
         """What some rays of each pixel see of surfaces that images of the transmitter light."""
         chosen, times = np.flatnonzero(rays.hits.face >= 0), 1.0
         if rays.group is None:
@@ -264,9 +264,11 @@ class Tracer:
         way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
         cosine = np.abs(np.einsum("ni,ni->n", way, self.surface.plane_normal[patch]))
         before = self.surface.patch_group[patch], cosine
-        return self._scattered(rays, row[k], light.strength[k] * np.float32(times), light.angle[k], before)
+        return self.scattered(
+            rays, row[k], light.strength[k] * self.grid.dtype.type(times), light.angle[k], before
+        )
 
-    def seen(self, rays: _Rays) -> Records:
+    def seen(self, rays: Rays) -> Records:
         """What rays see of elements."""
         hits, s = rays.hits, self.surface
         row = np.flatnonzero(hits.face >= 0)
@@ -278,11 +280,11 @@ class Tracer:
             * solid_angle
             * self.grid.transmittance(hits.range_m[row])
         )
-        return self._records(rays, row, power, side, np.zeros((len(row), 3), np.float32), SOURCE)
+        return self._records(rays, row, power, side, np.zeros((len(row), 3)), SOURCE)
 
-    def _scattered(
+    def scattered(
         self,
-        rays: _Rays,
+        rays: Rays,
         row: np.ndarray,
         strength: np.ndarray,
         angle: np.ndarray,
@@ -294,7 +296,7 @@ class Tracer:
 
     def _records(
         self,
-        rays: _Rays,
+        rays: Rays,
         row: np.ndarray,
         power: np.ndarray,
         index: np.ndarray,
@@ -303,18 +305,18 @@ class Tracer:
         before: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> Records:
         after = None if rays.group is None or rays.cosine is None else (rays.group[row], rays.cosine[row])
-        columns, angles = [index], [angle]
+        columns, angles, dtype = [index], [angle], self.grid.dtype
         for mirror, where in ((before, 0), (after, len(columns) + (before is not None))):
             if mirror is not None:
                 columns.insert(where, mirror[0])
                 angles.insert(where, np.column_stack([mirror[1], 0.0 * mirror[1], 0.0 * mirror[1]]))
         gain = -1 if after is not None else int(kind == SOURCE or before is not None)
         return Records(
-            np.asarray(power, np.float32), rays.ray[row].astype(np.int32), np.stack(columns, axis=1).astype(np.int32),
-            np.stack(angles, axis=1).astype(np.float32), int(before is not None), kind, gain, self.grid.half_width,
+            np.asarray(power, dtype), rays.ray[row].astype(np.int32), np.stack(columns, axis=1).astype(np.int32),
+            np.stack(angles, axis=1).astype(dtype), int(before is not None), kind, gain, self.grid.half_width,
         )  # fmt: skip
 
-    def _turned(self, view: View) -> _Rays:
+    def _turned(self, view: View) -> Rays:
         """Rays of a coarser lattice turned at the mirrors that they hit, and what they hit there. Of the receiver's grid each
         belongs to a ray of the same pixel that hits something, if one does."""
         s, per_pixel = self.surface, self.grid.per_pixel
@@ -334,7 +336,7 @@ class Tracer:
         place = ((place + 0.5) * per_pixel / grid.per_pixel).astype(int)
         met = view.hits.face.reshape(-1, per_pixel) >= 0
         place = np.where(met[pixel, place], place, met.argmax(axis=1)[pixel])
-        return _Rays(found, pixel * per_pixel + place, s.group[face], cosine)
+        return Rays(found, pixel * per_pixel + place, s.group[face], cosine)
 
     def adopted(self, view: View) -> View:
         """What :func:`traced` found, as a view of this tracer."""
