@@ -1,0 +1,208 @@
+"""What is read of paths, delay profiles and horns among it, as sums of records; and slopes of all of it by materials."""
+
+import copy
+import pickle
+import weakref
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import warp as wp
+from furnished import RECEIVERS, SHAPE, SIGMA, TX, F, spectra
+from radio_scenes import RadioScene, as_fits_predict, observation
+
+from warprrf.rf.channel.array_spectra import UP, hemisphere
+from warprrf.rf.channel.arrays import PlanarArray
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.gauss_newton import Problem
+from warprrf.rf.fields.bistatic.interreflection import irradiance
+from warprrf.rf.fields.bistatic.materials import SETS, Effects, Layout
+from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, WeighedPaths, read
+from warprrf.rf.fields.bistatic.observations import OWN_GAIN, observe, places_of
+from warprrf.rf.fields.bistatic.records import Bins, Evaluation, Records
+from warprrf.rf.fields.bistatic.tracer import SHARP, View
+from warprrf.rf.spectra.beam import BeamOperator
+from warprrf.rf.spectra.readings import Readings, horn, path_weights
+
+RX = RECEIVERS[0]
+SINGLE, EVERYTHING = replace(SETS["single"], residual=False), Effects(residual=False)
+
+
+def delay_profile(view: View) -> WeighedPaths:
+    """Power in windows of 2 ns, summed over all directions."""
+    start = np.arange(0.0, 50e-9, 2e-9)
+
+    def weigh(arrival: np.ndarray, departure: np.ndarray, delay_s: np.ndarray) -> np.ndarray:
+        return (delay_s >= start[:, None]) & (delay_s < start[:, None] + 2e-9)
+
+    return WeighedPaths.of(view, weigh, arrival=True, departure=False, delay_step_s=2e-9)
+
+
+@pytest.fixture(scope="module")
+def field(scene: RadioScene) -> BistaticField:
+    return BistaticField.prior(scene, spectra(scene, RX[None]), effects=SINGLE)
+
+
+def test_a_delay_profile_is_the_sum_of_its_paths(field: BistaticField) -> None:
+    view = field.view(RX)
+    profile = delay_profile(view)
+    found = as_fits_predict(observation(view, profile, field.floor), SINGLE, field.parameters) * field.floor
+    gains = field.path_gains(view)
+    ray = np.flatnonzero(view.hits.face >= 0)
+    length = np.linalg.norm(view.hits.points(ray) - TX, axis=1) + view.hits.range_m[ray]
+    edges = SPEED_OF_LIGHT * np.arange(0.0, 51e-9, 2e-9)
+    expected = np.histogram(length, edges, weights=gains.single[ray])[0]
+    expected += np.histogram(view.paths.length_m, edges, weights=gains.sharp)[0]
+    np.testing.assert_allclose(read(gains, profile), expected, rtol=1e-4)  # rays at a window's edge
+    assert (expected > 0).sum() >= 5
+    # three components resolve the Fresnel curves to a few parts in a thousand
+    np.testing.assert_allclose(found, expected, rtol=0.02, atol=1e-3 * expected.max())
+    assert found.sum() == pytest.approx(expected.sum(), rel=0.01)
+
+
+def test_places_where_a_horn_is_turned_alike_share_a_table(field: BistaticField) -> None:
+    """It says what a table of each place's own says, and memory does not grow with the places."""
+    places, azimuth = RX + [[0.0, 0, 0], [0.3, -0.4, 0.2]], np.linspace(-3.0, 3.0, 7)
+    arrival = np.tile(np.column_stack([np.full(7, 1.5), azimuth]), (2, 1))
+    horns = Readings(
+        TX,
+        np.repeat(places, 7, axis=0),
+        np.full(14, 1e-9),
+        F,
+        1e-15,
+        arrival=arrival,
+        receive_pattern=horn(0.3),
+    )
+    views, data = [field.view(place) for place in places], [horns]
+    where = places_of(data, field.mesh, None)
+    shared = [one.measured for one in observe(data, where, views, 1.0)[0]]
+    assert shared[0].of_bin is shared[1].of_bin and shared[0].alike == shared[1].alike
+    own = [
+        WeighedPaths.of(
+            view, partial(path_weights, horns, place.rows), arrival=True, departure=False, delay_step_s=None
+        )
+        for view, place in zip(views, where, strict=True)
+    ]
+    some = np.array([5, 2])
+    for a, b, view in zip(shared, own, views, strict=True):
+        gains = field.path_gains(view)
+        expected = read(gains, b)
+        np.testing.assert_allclose(read(gains, a), expected, rtol=1e-3)
+        np.testing.assert_allclose(read(gains, a.part(some)), expected[some], rtol=1e-3)
+        back = [m.to_bins(np.eye(7)[:, some])[m.bins(view)[0]] for m in (a, b)]
+        back += [m.part(some).to_bins(np.eye(2))[m.bins(view)[0]] for m in (a, b)]
+        for found in back[1:]:
+            np.testing.assert_allclose(found, back[0], rtol=0.05, atol=1e-3 * back[0].max())
+
+
+def differences(ask, x: np.ndarray, step: float) -> np.ndarray:
+    """Slopes of the readings ``ask(x)`` by each parameter, shape (parameters, readings)."""
+    steps = step * np.eye(len(x))
+    return np.stack([(ask(x + s) - ask(x - s)) / (2.0 * step) for s in steps])
+
+
+def dense(table: np.ndarray, index: np.ndarray, layout: Layout) -> np.ndarray:
+    """A Jacobian with the rows of what is not seen: zeros."""
+    whole = np.zeros((layout.size, table.shape[1]))
+    whole[index] = table
+    return whole
+
+
+def array_image(view: View) -> ArrayImage:
+    """Half a hemisphere as an array of 4 x 4 elements sees it, whose paths' lengths are known to 0.4 mm."""
+    array, directions = PlanarArray(4, 4, orientation=UP), hemisphere((18, 36)).reshape(-1, 3)
+    return ArrayImage.of(view, array, directions, 0.0004).part(np.arange(0, len(directions), 13))
+
+
+def pixels(view: View) -> SpectrumPixels:
+    return SpectrumPixels(BeamOperator(SHAPE, SIGMA), np.arange(0, SHAPE[0] * SHAPE[1], 7))
+
+
+@pytest.mark.parametrize(
+    ("measured", "effects", "how"),
+    [
+        (delay_profile, SINGLE, {}), (array_image, SINGLE, {}), (pixels, SINGLE, {}),
+        (pixels, replace(EVERYTHING, line_of_sight=False, mirrors=0), {}),  # without beams of single paths, that drown it
+        (delay_profile, SINGLE, {"ratio": 0.6}), (array_image, SINGLE, {"chain": OWN_GAIN}),
+    ],
+)  # fmt: skip
+def test_errors_of_a_fit_have_the_slopes_of_differences(
+    field: BistaticField, measured, effects: Effects, how: dict
+) -> None:
+    """Also at another carrier, and where the readings' common gain is unknown."""
+    view, rng = field.view(RX), np.random.default_rng(5)
+    o = observation(view, measured(view), field.floor, **how)
+    power = as_fits_predict(o, effects, field.parameters)
+    o = observation(view, measured(view), field.floor, 10 * np.log10(1 + np.roll(power, 3)), **how)
+    groups, lobes = field.parameters.log_weight.shape
+    layout = Layout(groups, lobes, gain=True, roughness="ratio" in how)
+    x = layout.pack(replace(field.parameters, log_gain=0.1)) + rng.normal(0.0, 0.3, layout.size)
+    p = layout.unpack(x, field.parameters)
+    problem = Problem.of([o], effects, np.arange(groups), p, gain_offset=True)
+    ((_, table, index),) = problem.linearised(p, layout)
+    slopes = differences(lambda x: next(problem.errors_db(layout.unpack(x, p))), x, 0.02)
+    caught = []
+    for place, (row, slope) in enumerate(zip(dense(table, index, layout), slopes, strict=True)):
+        allowed = 0.1 if place % layout.stride == layout.lobes else 0.01  # that of permittivity is a table's
+        bound = allowed * np.abs(slope).max() + 1e-4
+        assert np.abs(row - slope).max() <= bound
+        caught.append(np.abs(1.2 * row - slope).max() > bound)
+    assert np.mean(np.array(caught)[index]) > 0.7  # planted errors, but those of what is hardly seen
+
+
+@pytest.mark.usefixtures("device")
+@pytest.mark.parametrize("reciprocal", [False, True])
+def test_slopes_of_records_of_every_sequence_are_those_of_differences(
+    scene: RadioScene, reciprocal: bool
+) -> None:
+    """In float64 and summed by pixels; what comes to the elements that send is held. And, in float32, what is read of all."""
+    field = BistaticField.prior(scene, spectra(scene, RX[None]), effects=EVERYTHING, reciprocal=reciprocal)
+    view, side = field.view(RX), field.surface.side_group
+    got = irradiance(view.tracer, field.parameters, EVERYTHING)
+    groups, lobes = field.parameters.log_weight.shape
+    layout = Layout(groups, lobes)
+    x = layout.pack(field.parameters) + np.random.default_rng(1).normal(0.0, 0.3, layout.size)
+
+    def materials(x: np.ndarray) -> Evaluation:
+        p = layout.unpack(x, field.parameters)
+        return Evaluation(p, None, side, got * p.scattered_share[side] / np.pi)
+
+    def sums(records: Records, own: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return np.bincount(own, records.powers(materials(x)))
+
+    where = layout.stride * np.arange(groups)
+    for name, records in view.tables(EVERYTHING).items():
+        exact = replace(records, power=records.power.astype(float))
+        own = records.ray if name == SHARP else records.ray // view.tracer.grid.per_pixel
+        bins = Bins.of(own, int(own.max()) + 1)
+        found = np.zeros((bins.count, layout.size))
+        exact.add_slopes(materials(x), bins, where, found)
+        slopes = differences(partial(sums, exact, own), x, 1e-5)
+        bound = 1e-7 * np.abs(slopes).max(axis=1)
+        assert (np.abs(found.T - slopes).max(axis=1) <= bound).all(), name
+        seen = np.abs(slopes).max(axis=1) > 1e-9 * np.abs(slopes).max()
+        assert (np.abs((1 + 1e-6) * found.T - slopes).max(axis=1) > bound)[seen].all() and seen.any(), name
+    o = observation(view, pixels(view), field.floor)
+    table, index = o.slopes(EVERYTHING, materials(x), layout)
+    slopes = differences(lambda x: o.predicted(field.state, materials(x)), x, 0.02)
+    bound = 5e-3 * np.abs(slopes).max(axis=1)
+    assert (np.abs(dense(table, index, layout) - slopes).max(axis=1) <= bound).all()
+
+
+def test_a_used_field_is_copied_and_pickled(field: BistaticField) -> None:
+    field = replace(field, device=wp.get_device("cpu"))
+    expected = field.spectrum(RX).path_gain
+    for again in (copy.deepcopy(field), pickle.loads(pickle.dumps(field))):
+        np.testing.assert_array_equal(again.spectrum(RX).path_gain, expected)
+
+
+def test_what_was_traced_for_old_transmitters_and_dropped_fields_goes(field: BistaticField) -> None:
+    traced = []
+    for x in np.linspace(0.5, 1.5, 10):
+        again = copy.deepcopy(field)
+        traced.append(weakref.ref(again.tracer([x, 0.9, 2.2])))
+        again.spectrum(RX, [x, 0.9, 2.2])
+        del again  # no reference cycle: nothing waits for the garbage collector
+        assert sum(t() is not None for t in traced) <= 6
