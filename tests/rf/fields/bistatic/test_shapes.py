@@ -6,8 +6,8 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, join
 from trimesh.remesh import subdivide_to_size
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos.snapping import is_scan, scanned_patches
 from warprrf.geometry.planar_patches import planar_patches
+from warprrf.geometry.scans import is_scan, scanned_patches
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.shapes import shape_groups
 from warprrf.rf.fields.bistatic.surface import Surface
