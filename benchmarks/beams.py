@@ -105,7 +105,7 @@ class Links:
 
     def __init__(self, scene: Any, ds: wr.SpectrumDataset, seed: int = 0, device: Any = None) -> None:
         known = {"transmitter": ds.transmitter, "frequency_hz": ds.frequency_hz, "device": device}
-        self.tracer, self.seed, self.transmitter = MirrorTracer(scene, **known), seed, ds.transmitter
+        self.tracer, self.seed = MirrorTracer(scene, **known), seed
         self.engine = ExactEngine(scene, shape=ds.shape, sub_pixels=3, **known)
 
     def link(self, receiver: np.ndarray) -> Link:
@@ -113,14 +113,10 @@ class Links:
         specular, rays = self.tracer.trace(receiver, 1), self.engine.diffuse(receiver)
         weakest = np.argsort(rays.power)
         kept = weakest[np.cumsum(rays.power[weakest]) > NEGLIGIBLE * rays.power.sum()]
-        leg = receiver + rays.range_m[kept, None] * rays.direction[kept] - self.transmitter
-        first = np.linalg.norm(leg, axis=1)
-        (theta_r, phi_r), (theta_t, phi_t) = map(
-            angles_from_directions, (rays.direction[kept], leg / first[:, None])
-        )
+        (theta_r, phi_r), (theta_t, phi_t) = map(angles_from_directions, (rays.direction[kept], rays.departure[kept]))
         count = len(kept)
         scattered = replace(
-            specular, gain=np.sqrt(rays.power[kept]).astype(complex), tau=(first + rays.range_m[kept]) / SPEED_OF_LIGHT,
+            specular, gain=np.sqrt(rays.power[kept]).astype(complex), tau=rays.length_m[kept] / SPEED_OF_LIGHT,
             theta_r=theta_r, phi_r=phi_r, theta_t=theta_t, phi_t=phi_t, kind=np.full(count, "diffuse", dtype="<U7"),
             vertices=np.full((count, *specular.vertices.shape[1:]), np.nan), valid=np.ones(count, bool), jones=None,
         )  # fmt: skip

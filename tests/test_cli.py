@@ -12,13 +12,13 @@ import pytest
 from golden import make
 from places import ROOT
 from radio_scenes import box_mesh
+from warprrf.rf.fields.bistatic.training import FitOptions
 
 import warprrf as wr
 from warprrf import cli
 from warprrf.cli.inputs import read_positions, read_receivers
 from warprrf.cli.views import _look_at
 from warprrf.geometry.mesh_files import write_mesh
-from warprrf.rf.fields.bistatic.training import FitOptions
 from warprrf.rf.fields.harmonic.options import FieldOptions
 from warprrf.rf.maps.radio_map import RadioMap
 from warprrf.rf.spectra.spectrum import pixel_directions

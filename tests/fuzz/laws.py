@@ -136,7 +136,10 @@ def _free_places(place: Place, edits: tuple[Edit, ...]) -> str:
         f"is_free is wrong at {n} of {len(points)} places": n
         for n in [(scene.is_free(points) != free(points)).sum()]
     }
-    drawn = wr.sample_receivers(scene, 30, clearance=0.1, seed=0)
+    floor, height = mesh.bounds[0, 2], np.ptp(mesh.bounds[:, 2])
+    drawn = wr.sample_receivers(
+        scene, 30, z=(floor + 0.25 * height, floor + 0.75 * height), clearance=0.1, seed=0
+    )
     bad[f"sample_receivers draws {(~free(drawn)).sum()} of 30 in solids"] = (~free(drawn)).sum()
     source = drawn[0]
     field = _fit(scene, wr.SpectrumDataset.empty(transmitter=source, frequency_hz=28e9, shape=(6, 12)))

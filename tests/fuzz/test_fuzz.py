@@ -114,7 +114,7 @@ metrics.beam_gain_loss_db: width_rad=tiny; metrics.beam_response: width_rad=tiny
 metrics.psnr: truth=empty, prediction=no list; metrics.unit_image: floor=minus one; reconstruct: photos=list
 Spectrum.stack: spectra=nested; Paths.stack: length=2^31; em.Band.widened: low_hz=numpy integer
 lookups.Lookup.spectrum: receivers=no rows; lookups.mean: train=readings
-em.slab_transmission: cos_incidence=zeros, thickness_m=tiny
+em.slab_transmission: cos_incidence=zeros, thickness_m=tiny; em.slab_transmission: cos_incidence=zero, permittivity=list
 """
 """Findings of earlier hours, one of each cause."""
 

@@ -16,10 +16,12 @@ from mitsuba_reference import (
     mitsuba_sequences,
 )
 from places import LOBBY
+from radio_scenes import RadioScene, SlabMaterial
 from rooms import rms_change_db
 from sionna_room import sionna_or_skip
 
 import warprrf as wr
+from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.materials import Effects, Parameters
 from warprrf.rf.fields.bistatic.observations import Frame
@@ -55,6 +57,20 @@ def sequences(link: Link) -> dict[str, np.ndarray]:
         "LOS": once.sharp[order == 0], "M": once.sharp[order == 1], "SS": twice, "SSS": thrice - twice,
         **{name: binned(once, name) for name in ("S", "MS", "SM", "MSM")},
     }  # fmt: skip
+
+
+def exact_totals(link: Link) -> dict[str, float]:
+    """Path gain of each sequence by the exact engine."""
+    shares = (
+        ("scatter", 1.0, link.permittivity),
+        ("mirror", 0.0, link.permittivity),
+        ("black", 0.0, 1.0 + 1e-9),
+    )
+    materials = [SlabMaterial(name, eta, 0.0, np.inf, s) for name, s, eta in shares]
+    scene = RadioScene(link.mesh, np.asarray(link.does), materials)
+    known = {"transmitter": link.transmitter, "frequency_hz": link.frequency_hz, "shape": link.shape}
+    engine = ExactEngine(scene, **known, effects=Effects(), sub_pixels=4)
+    return {paths.sequence: paths.power.sum() for paths in engine.sequences(np.asarray(link.receiver, float))}
 
 
 def lobby(receiver: int = 0) -> Link:
@@ -98,6 +114,18 @@ def test_sequences_over_a_floor_and_a_mirror_follow_closed_forms(known):
     ours, exact = sequences(floor_and_mirror()), closed_forms(floor_and_mirror())
     for sequence in known.split():
         assert abs(10.0 * np.log10(ours[sequence].sum() / exact[sequence])) < 0.05, sequence
+
+
+def test_the_exact_engine_follows_closed_forms_and_mitsuba():
+    ours, exact = exact_totals(floor_and_mirror()), closed_forms(floor_and_mirror())
+    for sequence in "S MS SM MSM".split():
+        assert abs(10.0 * np.log10(ours[sequence] / exact[sequence])) < 0.05, sequence
+    sionna_or_skip()
+    ours, found = exact_totals(lobby()), compared("lobby")[1]
+    for sequence in "S MS SM SS SSS".split():
+        assert ours[sequence] == pytest.approx(
+            found[sequence].total, rel=0.01, abs=2.0 * found[sequence].error
+        ), sequence
 
 
 def test_mitsuba_follows_closed_forms():

@@ -59,7 +59,8 @@ def test_every_path_follows_the_scattering_formula(material):
     found = e.diffuse(RX)
     assert len(found.power) == 64 * SHAPE[0] * SHAPE[1]  # all of an empty convex room is lit
     some = slice(None, None, 29 if material.reciprocal else 1)  # that lobe's norm takes its time
-    index, length, d, power = (x[some] for x in (found.index, found.range_m, found.direction, found.power))
+    index, d, power = (x[some] for x in (np.arange(len(found.power)), found.direction, found.power))
+    length = np.linalg.norm(found.departure[some] + TX - RX, axis=1)  # of the last leg
     point = RX + length[:, None] * d
     with np.errstate(divide="ignore"):
         exits = np.where(d > 0, (HIGH - RX) / d, (LOW - RX) / d)
@@ -94,7 +95,7 @@ def test_a_solid_throws_a_shadow():
     scene = RadioScene(mesh, part, [SlabMaterial(scattering=0.5), SlabMaterial(scattering=0.0)])
     above = np.array([-0.25, 0.25, 3.5])
     found = engine(scene, above).diffuse(RX)
-    floor = RX + found.range_m[:, None] * found.direction
+    floor = above + found.departure
     floor = floor[floor[:, 2] < 1e-9]
     # Central projection of the top face's outline onto the floor.
     scale = 3.5 / (3.5 - 1.2)
@@ -143,7 +144,7 @@ def test_the_spectrum_holds_all_power_and_exact_delays():
     e = engine(room(SlabMaterial(scattering=0.5)))
     got = e.receive(RX)
     assert got.line_of_sight
-    specular, d = e.tracer.trace(RX, 1), np.linalg.norm(TX - RX)
+    specular, d = e.mirrors.trace(RX, 1), np.linalg.norm(TX - RX)
     assert got.path_gain.sum() == pytest.approx(specular.power.sum() + e.diffuse(RX).power.sum(), rel=1e-12)
     assert specular.power[0] == pytest.approx((WAVELENGTH / (4 * np.pi * d)) ** 2, rel=1e-12)
     row, column = pixel_of(TX - RX, SHAPE)

@@ -1,10 +1,13 @@
-"""Spectra of a single bounce without sampling noise: line of sight, mirror reflections and diffuse scattering.
+"""Spectra of a scene with known materials, by the tracer of radio fields: a truth to compare with.
 
-Line of sight and mirrors come from the image method (:mod:`warprrf.rf.paths.trace`). Diffuse scattering is evaluated along 64
-directions per pixel, each with one receiver ray and one shadow ray on the mesh, as a path of its own: path gain
+Line of sight and mirrors come from the image method (:mod:`warprrf.rf.paths.trace`). Scattering is evaluated along 64
+directions per pixel, each with one receiver ray and one shadow ray on the mesh, without sampling noise: path gain
 (lambda / 4 pi)^2 S^2 |Gamma|^2 f_s cos(theta_i) / (cos(theta_s) d1^2) times its share of the pixel's solid angle, with
 |Gamma|^2 the mean over transmit polarisations. All paths are spread by one receiver beam. Absorption by the air, where asked
 for, is that of each path's own length.
+
+What more effects bring goes through fewer rays: they are turned at mirrors, connected to images of the transmitter, and
+scattered on, one direction a ray, drawn by the cosine from a stated seed: unbiased, with sampling noise.
 
 Diffuse power changes, by some decibels a path, when transmitter and receiver change places: lobes are normalised by the
 direction of incidence (Degli-Esposti et al. 2007). Materials with ``reciprocal`` scatter alike both ways, with |Gamma|^2 the
@@ -16,28 +19,30 @@ would meet upright edges in whole columns, and errs 3 to 5 times more.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
-import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array
+from warprrf.checks import check_array, check_seed
 from warprrf.device import DeviceLike
-from warprrf.geometry.mesh import ENDPOINT_CLEARANCE
-from warprrf.kernels.radio import scatter
+from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
+from warprrf.kernels.radio.records import SCATTER
 from warprrf.rf.em.absorption import Gas, air_of
-from warprrf.rf.em.fresnel import SurfaceTable, reciprocal_factor
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.fields.bistatic.materials import Effects
+from warprrf.rf.fields.bistatic.rays import Hits, RayGrid
+from warprrf.rf.fields.bistatic.records import Records, SlabEvaluation
+from warprrf.rf.fields.bistatic.surface import Surface
+from warprrf.rf.fields.bistatic.tracer import Rays, Tracer
+from warprrf.rf.paths.mirror_paths import unobstructed
 from warprrf.rf.paths.trace import MirrorTracer
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
-    SpreadPaths,
     angles_from_directions,
     beam_sums,
     check_shape,
@@ -49,13 +54,15 @@ SUB_PIXELS = 8
 """Default square root of the directions per pixel.
 
 Error of the total diffuse power at 60 x 120 over 17 places in a furnished room, rms (largest): 4: 0.3 % (0.8 %),
-8: 0.05 % (0.13 %), 16: 0.02 % (0.04 %). Coarse grids have fewer directions: at
-18 x 36, out of sight in the lobby, one of them or none meets a desk top seen at one degree, and the total moves by up to
-0.07 dB when the room is turned; 16: 0.04 dB, 32: 0.01 dB, 64: 0.002 dB.
+8: 0.05 % (0.13 %), 16: 0.02 % (0.04 %).
 """
-FACTORS = 1025
-"""Entries of a reciprocal lobe's factor over the cosine: interpolation errs by 1e-5 at most up to an exponent of 100."""
-REVISION = 4
+FURTHER_SUB_PIXELS = 3
+"""That for light over more than one surface."""
+THROUGH_MIRRORS = 3
+"""Of how many rays one looks for light by way of mirrors: a search for each."""
+SINGLE = Effects(mirrors=1, scatterings=1, mirror_scatter=False, scatter_mirror=False, residual=False)
+"""Line of sight, one mirror, scattering once: what has no noise."""
+REVISION = 5
 """Raised whenever the engine's numbers change: finished receivers of another revision are not used."""
 
 
@@ -78,23 +85,47 @@ class ReceivedPaths:
 
 @dataclass(frozen=True)
 class DiffusePaths:
-    """Diffuse paths of one receiver, one per direction that meets an illuminated surface.
+    """Paths of one receiver that scatter, in rows.
 
     Attributes:
         direction: Direction of arrival, shape ``(L, 3)``.
         power: Path gain [linear], shape ``(L,)``.
-        range_m: Distance to the scattering point [m], shape ``(L,)``.
-        index: Which of the engine's directions, shape ``(L,)``.
+        length_m: Whole length [m], shape ``(L,)``.
+        departure: Where they left the transmitter towards, not of unit length, shape ``(L, 3)``.
+        beams: Sums of the beam about each direction over the pixels, shape ``(L,)``.
+        sequence: ``"S"`` scattered, ``"M"`` mirrored, from the transmitter on.
     """
 
     direction: np.ndarray
     power: np.ndarray
-    range_m: np.ndarray
-    index: np.ndarray
+    length_m: np.ndarray
+    departure: np.ndarray
+    beams: np.ndarray
+    sequence: str
+
+
+_ARRAYS = ("direction", "power", "length_m", "departure", "beams")
+_NO_PATHS = {name: np.zeros((0, 3) if name in ("direction", "departure") else 0) for name in _ARRAYS}
+
+
+@dataclass(frozen=True)
+class _Beams:
+    """Rays that went ``length_m`` (N,) from the receiver to where they start, along the directions ``ray`` (N,) of its
+    grid, over ``sequence``; solid angles of ``hits`` hold what they lost on the way."""
+
+    hits: Hits
+    ray: np.ndarray
+    length_m: np.ndarray
+    sequence: str
+
+    def take(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where the rays ``rows`` hit, their directions, and the faces that they meet."""
+        directions = self.hits.directions[rows % len(self.hits.directions)]
+        return self.hits.points(rows), directions, self.hits.face[rows]
 
 
 class ExactEngine:
-    """Deterministic single-bounce propagation from one transmitter.
+    """Propagation from one transmitter in a scene.
 
     Args:
         scene: Scene with ``mesh``, ``face_material`` and ``materials``.
@@ -102,7 +133,9 @@ class ExactEngine:
         frequency_hz: Carrier frequency [Hz].
         shape: Rows and columns of the spectrum.
         beam_sigma_rad: Receiver beam width [rad].
+        effects: What is modelled; by default :data:`SINGLE`.
         sub_pixels: Square root of the number of directions per pixel.
+        seed: Of the directions in which light is scattered on.
         gas: Absorption of the air: see :meth:`Paths.with_gas`.
         device: Where rays are cast and beams spread.
     """
@@ -115,122 +148,215 @@ class ExactEngine:
         frequency_hz: float,
         shape: tuple[int, int],
         beam_sigma_rad: float = BEAM_SIGMA_RAD,
+        effects: Effects = SINGLE,
         sub_pixels: int = SUB_PIXELS,
+        seed: int = 0,
         gas: Gas = False,
         device: DeviceLike = None,
     ) -> None:
         if sub_pixels < 1:
             raise ValueError(f"sub_pixels: got {sub_pixels!r}, expected at least 1")
-        self.shape = check_shape(shape)
-        self.beam_sigma_rad = beam_sigma_rad
-        self.sub_pixels = sub_pixels
-        self.air = air_of(gas)
-        self.tracer = MirrorTracer(scene, transmitter=transmitter, frequency_hz=frequency_hz, device=device)
-        if self.tracer.table is None:
+        self.shape, self.beam_sigma_rad, self.sub_pixels = check_shape(shape), beam_sigma_rad, sub_pixels
+        self.effects, self.seed, self.air = effects, check_seed(seed), air_of(gas)
+        self.mirrors = MirrorTracer(scene, transmitter=transmitter, frequency_hz=frequency_hz, device=device)
+        table = self.mirrors.table
+        if table is None:
             raise TypeError(
                 "scene: got a bare Mesh, expected a Scene with materials, because scattering needs them"
             )
         self.device = _device.resolve(device)
         # Of faces at one place rays may meet any: each is of the first one's material.
-        material = np.asarray(scene.face_material, dtype=np.int32)[self.tracer.patches.first]
-        self._surface = self._upload(self.tracer.table, material)
-
-    def _upload(self, table: SurfaceTable, face_material: np.ndarray) -> list[Any]:
-        where, mesh = self.device, self.tracer.mesh
-        materials = scatter.Materials()
-        eta = np.column_stack([table.permittivity.real, table.permittivity.imag])
-        materials.permittivity = wp.array(eta, dtype=wp.vec2d, device=where)
-        materials.thickness = wp.array(table.thickness_m, dtype=wp.float64, device=where)
-        materials.scattering = wp.array(table.scattering, dtype=wp.float64, device=where)
-        materials.alpha_r = wp.array(table.alpha_r, dtype=wp.int32, device=where)
-        materials.reciprocal = wp.array(table.reciprocal, dtype=wp.int32, device=where)
-        cosine, factor = np.linspace(0.0, 1.0, FACTORS), np.zeros((len(table.alpha_r), FACTORS))
-        for k in np.flatnonzero(table.reciprocal):
-            factor[k] = reciprocal_factor(table.alpha_r[k], cosine)
-        materials.factor = wp.array(factor, dtype=wp.float64, device=where)
-        return [
-            wp.array(mesh.triangles[:, 0], dtype=wp.vec3d, device=where),
-            wp.array(mesh.face_normals, dtype=wp.vec3d, device=where),
-            wp.array(face_material, dtype=wp.int32, device=where),
-            materials,
-        ]
+        material = np.asarray(scene.face_material, dtype=np.int32)[self.mirrors.patches.first]
+        self.surface = Surface.of_materials(self.mirrors.patches, material, [m.name for m in scene.materials])
+        self.materials = SlabEvaluation(
+            table, self.mirrors.wavelength_m, np.arange(len(table.scattering)), device
+        )
+        loss = 0.0 if self.air is None else self.air.loss_per_m(self.mirrors.frequency_hz)
+        self._tracers = {
+            n: Tracer(
+                self.surface, self.mirrors.transmitter, self.mirrors.frequency_hz,
+                RayGrid(self.surface, self.shape, n, loss_per_m=loss, dtype=np.float64, device=device),
+            )
+            for n in {sub_pixels, min(sub_pixels, FURTHER_SUB_PIXELS)}
+        }  # fmt: skip
 
     def diffuse(self, receiver: np.ndarray) -> DiffusePaths:
-        """Diffuse paths of one receiver (3,), one per direction that meets an illuminated surface."""
-        grid = _sub_pixel_grid(self.shape, self.sub_pixels, str(self.device))
-        mesh, count = self.tracer.mesh, len(grid.solid_angles)
-        radiance = wp.zeros(count, dtype=wp.float64, device=self.device)
-        range_m = wp.zeros(count, dtype=wp.float64, device=self.device)
-        inputs = [
-            mesh.on_device(self.device).id,
-            wp.vec3d(*mesh.center),
-            *self._surface,
-            wp.vec3d(*self.tracer.transmitter),
-            wp.vec3d(*receiver),
-            wp.float64(self.tracer.wavelength_m),
-            # The lattice has as many levels in a pixel as directions.
-            wp.float64(0.5 * np.pi / (self.shape[0] * self.sub_pixels**2)),
-            wp.float64(ENDPOINT_CLEARANCE),
-            4 if mesh.is_closed else 0,
-            grid.on_device,
-            radiance,
-            range_m,
-        ]
-        _device.launch(scatter.scatter_to_receiver, count, inputs, device=self.device)
-        power = radiance.numpy() * grid.solid_angles
-        positive = np.flatnonzero(power > 0)
-        direction, power, reach = grid.directions[positive], power[positive], range_m.numpy()[positive]
-        if self.air is not None:
-            way = receiver + reach[:, None] * direction - self.tracer.transmitter
-            power = power * self.air.transmittance(
-                self.tracer.frequency_hz, np.linalg.norm(way, axis=1) + reach
-            )
-        return DiffusePaths(direction, power, reach, positive)
-
-    def spread(self, specular: Paths, scattered: DiffusePaths) -> SpreadPaths:
-        """Paths of both kinds on the grid, the specular ones counted first."""
-        beam = self.shape, self.beam_sigma_rad
-        # Every receiver has the same lattice of directions, whose beams are summed once.
-        lattice = _lattice_beams(self.sub_pixels, *beam, str(self.device))[scattered.index]
-        return spread_paths(
-            np.concatenate([specular.arrival, scattered.direction]),
-            np.concatenate([specular.power, scattered.power]),
-            *beam,
-            beams=np.concatenate([beam_sums(specular.arrival, *beam, device=self.device), lattice]),
-            device=self.device,
+        """Paths of one receiver (3,) that scatter, one sequence after another."""
+        every = list(self.sequences(receiver))
+        joined = (
+            {n: np.concatenate([getattr(paths, n) for paths in every]) for n in _ARRAYS}
+            if every
+            else _NO_PATHS
         )
+        return DiffusePaths(**joined, sequence=", ".join(paths.sequence for paths in every))
+
+    def sequences(self, receiver: np.ndarray) -> Iterator[DiffusePaths]:
+        """Paths of one receiver (3,) that scatter, by sequence."""
+        e = self.effects
+        if not e.scatterings:
+            return
+        fine, coarse = (
+            self._first(n, receiver) for n in (self.sub_pixels, min(self.sub_pixels, FURTHER_SUB_PIXELS))
+        )
+        yield self._lit(fine, self.sub_pixels)
+        if e.mirror_scatter:
+            yield self._lit_by_mirrors(coarse)
+        starts = [self._scattered_on(coarse, 1)] if e.scatterings > 1 else []
+        if e.scatter_mirror:
+            starts.append(self._turned(coarse))
+        for rays in starts:
+            depth = rays.sequence.count("S")
+            while True:
+                yield self._lit(rays, FURTHER_SUB_PIXELS)
+                if e.mirror_scatter:
+                    yield self._lit_by_mirrors(rays)
+                depth += 1
+                if depth >= e.scatterings:
+                    break
+                rays = self._scattered_on(rays, depth)
 
     def receive(self, receiver: ArrayLike) -> ReceivedPaths:
         """The spectrum of one receiver (3,)."""
         point = check_array("receiver", receiver, (3,))
-        specular = self.tracer.trace(point, 1).with_gas(self.air)
-        scattered = self.diffuse(point)
-        spread = self.spread(specular, scattered)
-        leg = point + scattered.range_m[:, None] * scattered.direction - self.tracer.transmitter
-        tau = (np.linalg.norm(leg, axis=1) + scattered.range_m) / SPEED_OF_LIGHT
-        aod = np.column_stack(angles_from_directions(leg))
+        specular = self.mirrors.trace(point, self.effects.mirrors).with_gas(self.air)
+        specular = specular.select(np.flatnonzero((specular.kind != "los") | self.effects.line_of_sight))
+        scattered, beam = self.diffuse(point), (self.shape, self.beam_sigma_rad)
+        sharp = beam_sums(specular.arrival, *beam, device=self.device)
+        spread = spread_paths(
+            np.concatenate([specular.arrival, scattered.direction]), np.concatenate([specular.power, scattered.power]), *beam,
+            beams=np.concatenate([sharp, scattered.beams]), device=self.device,
+        )  # fmt: skip
         departure = np.column_stack([specular.theta_t, specular.phi_t])
+        aod = np.column_stack(angles_from_directions(scattered.departure))
         return ReceivedPaths(
             path_gain=spread.path_gain,
-            delay_s=spread.of_strongest(np.concatenate([specular.tau, tau])),
+            delay_s=spread.of_strongest(np.concatenate([specular.tau, scattered.length_m / SPEED_OF_LIGHT])),
             aod=spread.of_strongest(np.concatenate([departure, aod])),
             line_of_sight=bool((specular.kind == "los").any()),
         )
 
+    def _first(self, sub_pixels: int, receiver: np.ndarray) -> _Beams:
+        """Rays that fill the sphere around a receiver."""
+        hits = self._tracers[sub_pixels].grid.hit(receiver)
+        return _Beams(hits, np.arange(len(hits.face)), np.zeros(len(hits.face)), "")
 
-@dataclass(frozen=True)
-class _SubPixels:
-    directions: np.ndarray
-    solid_angles: np.ndarray
-    on_device: wp.array
+    def _lit(self, rays: _Beams, sub_pixels: int) -> DiffusePaths:
+        """What the transmitter lights where rays hit."""
+        tracer = self._tracers[min(sub_pixels, self.sub_pixels)]
+        records = tracer.lit(Rays(rays.hits, np.arange(len(rays.ray))))
+        out = rays.hits.points(records.ray) - tracer.transmitter
+        return self._paths(rays, records, np.linalg.norm(out, axis=1), out, "S", tracer)
+
+    def _lit_by_mirrors(self, rays: _Beams) -> DiffusePaths:
+        """What images of the transmitter light there, by one ray of :data:`THROUGH_MIRRORS`."""
+        tracer, patches = self._tracers[min(FURTHER_SUB_PIXELS, self.sub_pixels)], self.mirrors.patches
+        every = min(THROUGH_MIRRORS, tracer.grid.per_pixel)
+        ray = np.flatnonzero((rays.hits.face >= 0) & (rays.ray % every == every // 2))
+        point, direction, face = rays.take(ray)
+        row, patch, met = self.mirrors.images.candidates(point, 1)
+        normal = self._toward(face, direction)[row]
+        own = ((met[:, 0] - point[row]) * normal).sum(axis=1) > 0
+        own &= patches.contains(patch[:, 0], met[:, 0])
+        row, patch, met = row[own], patch[own], met[own]
+        free = unobstructed(patches, tracer.transmitter, point[row], patch, met, tracer.grid.device)
+        row, patch = row[free], patch[free, 0]
+        image = self.surface.images(tracer.transmitter)[0][patch]
+        light = tracer.grid.light_through(rays.hits, image, ray[row])
+        k = np.flatnonzero(light.strength > 0)
+        row, patch, way = row[k], patch[k], point[row[k]] - image[k]
+        length, plane = np.linalg.norm(way, axis=1), self.surface.plane_normal[patch]
+        across = (way * plane).sum(axis=1)
+        before = self.surface.patch_group[patch], np.abs(across) / np.maximum(length, 1e-9)
+        strength = every * light.strength[k]
+        records = tracer.scattered(
+            Rays(rays.hits, np.arange(len(rays.ray))), ray[row], strength, light.angle[k], before
+        )
+        return self._paths(rays, records, length, way - 2.0 * across[:, None] * plane, "MS", tracer)
+
+    def _paths(
+        self,
+        rays: _Beams,
+        records: Records,
+        legs: np.ndarray,
+        departure: np.ndarray,
+        name: str,
+        tracer: Tracer,
+    ) -> DiffusePaths:
+        """Paths over where rays hit, ``legs`` (N,) from the transmitter; ``records`` name rows of ``rays``."""
+        row, ray = records.ray, rays.ray[records.ray]
+        length = rays.length_m[row] + rays.hits.range_m[row] + legs
+        beams = _lattice_beams(tracer.grid.sub_pixels, self.shape, self.beam_sigma_rad, str(self.device))[ray]
+        power = records.powers(self.materials)
+        return DiffusePaths(
+            tracer.grid.directions[ray], power, length, departure, beams, name + rays.sequence
+        )
+
+    def _turned(self, rays: _Beams) -> _Beams:
+        """Rays turned at the mirrors that they hit."""
+        ray = np.flatnonzero(
+            (rays.hits.face >= 0) & (self.surface.patch.take(rays.hits.face, mode="wrap") >= 0)
+        )
+        point, direction, face = rays.take(ray)
+        normal = self._toward(face, direction)
+        cosine = -(direction * normal).sum(axis=1)
+        angle = np.column_stack([cosine, 0.0 * cosine, 0.0 * cosine])[:, None]
+        onward = direction + 2.0 * cosine[:, None] * normal
+        return self._on(
+            rays,
+            ray,
+            point,
+            normal,
+            onward,
+            Records(self._left(rays, ray), ray, self._groups(face), angle, 1),
+            "M",
+        )
+
+    def _scattered_on(self, rays: _Beams, depth: int) -> _Beams:
+        """Rays scattered where they hit, one direction each, drawn by the cosine."""
+        ray = np.flatnonzero(rays.hits.face >= 0)
+        point, direction, face = rays.take(ray)
+        normal = self._toward(face, direction)
+        u, v = np.random.default_rng([self.seed, depth, len(rays.sequence)]).random((2, len(ray)))
+        a, b = vectors_across(normal)
+        radius, turn, up = np.sqrt(u), 2.0 * np.pi * v, np.sqrt(1.0 - u)
+        onward = (
+            (radius * np.cos(turn))[:, None] * a + (radius * np.sin(turn))[:, None] * b + up[:, None] * normal
+        )
+        cos_out = np.clip(-(direction * normal).sum(axis=1), 0.0, 1.0)
+        cos_mirror = np.clip(2.0 * up * cos_out + (onward * direction).sum(axis=1), -1.0, 1.0)
+        angle = np.column_stack([up, cos_out, cos_mirror])[:, None]
+        records = Records(
+            np.pi * self._left(rays, ray), ray, self._groups(face), angle, 0, SCATTER,
+            half_width=self._tracers[min(FURTHER_SUB_PIXELS, self.sub_pixels)].grid.half_width,
+        )  # fmt: skip
+        return self._on(rays, ray, point, normal, onward, records, "S")
+
+    def _on(
+        self, rays: _Beams, ray: np.ndarray, point: np.ndarray, normal: np.ndarray, onward: np.ndarray, weighed: Records, name: str
+    ) -> _Beams:  # fmt: skip
+        """Rays that go on from where the rows ``ray`` hit, with the power of ``weighed`` in the place of solid angles."""
+        grid = self._tracers[min(FURTHER_SUB_PIXELS, self.sub_pixels)].grid
+        hits = grid.hit_along(point + ENDPOINT_CLEARANCE * normal, onward, weighed.powers(self.materials))
+        length = rays.length_m[ray] + rays.hits.range_m[ray]
+        return _Beams(hits, rays.ray[ray], length, name + rays.sequence)
+
+    def _left(self, rays: _Beams, ray: np.ndarray) -> np.ndarray:
+        """Solid angles, less what the air absorbs up to where the rays hit, shape ``(N,)``."""
+        grid = self._tracers[min(FURTHER_SUB_PIXELS, self.sub_pixels)].grid
+        left = rays.hits.solid_angle[ray % len(rays.hits.solid_angle)] * grid.transmittance(
+            rays.hits.range_m[ray]
+        )
+        return np.asarray(left)
+
+    def _toward(self, face: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Normals of faces on the side that a ray of ``direction`` (N, 3) meets."""
+        normal = self.surface.mesh.face_normals[face]
+        return np.where((normal * direction).sum(axis=1, keepdims=True) > 0, -normal, normal)
+
+    def _groups(self, face: np.ndarray) -> np.ndarray:
+        return self.surface.group[face][:, None]
 
 
-@lru_cache(maxsize=4)
-def _sub_pixel_grid(shape: tuple[int, int], sub_pixels: int, device: str) -> _SubPixels:
-    directions, solid_angles = sub_pixel_directions(shape, sub_pixels)
-    return _SubPixels(directions, solid_angles, wp.array(directions, dtype=wp.vec3d, device=device))
-
-
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=2)
 def _lattice_beams(sub_pixels: int, shape: tuple[int, int], sigma: float, device: str) -> np.ndarray:
-    return beam_sums(_sub_pixel_grid(shape, sub_pixels, device).directions, shape, sigma, device=device)
+    return beam_sums(sub_pixel_directions(shape, sub_pixels)[0], shape, sigma, device=device)

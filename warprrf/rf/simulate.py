@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any
 
@@ -13,14 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from warprrf.cache import Cache, making
-from warprrf.checks import check_array, check_count, check_number, check_seed, checked
+from warprrf.checks import check_array, check_count, check_number, check_seed, check_type, checked
 from warprrf.cluster import each
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import as_mesh
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.fresnel import surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
-from warprrf.rf.exact import REVISION, SUB_PIXELS, ExactEngine, ReceivedPaths
+from warprrf.rf.exact import REVISION, SINGLE, SUB_PIXELS, ExactEngine, ReceivedPaths
+from warprrf.rf.fields.bistatic.materials import Effects
 from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
 from warprrf.rf.positions import (
     check_positions,
@@ -50,6 +51,7 @@ def simulate(
     frequency_hz: float,
     shape: tuple[int, int] = DEFAULT_SHAPE,
     engine: str = "exact",
+    effects: Effects = SINGLE,
     depth: int = 3,
     samples: int = 1_000_000,
     beam_sigma_rad: float = BEAM_SIGMA_RAD,
@@ -71,13 +73,15 @@ def simulate(
         receivers: Positions [m], shape ``(R, 3)``, or ``(3,)`` for a set of one.
         frequency_hz: Carrier frequency [Hz].
         shape: Rows and columns of a spectrum.
-        engine: "exact": line of sight, one mirror reflection and single-bounce scattering, without noise; ``depth``,
-            ``samples``, ``refraction`` and ``seed`` play no part. "sionna": Sionna RT's PathSolver.
+        engine: "exact": our own, with ``effects``; ``depth``, ``samples`` and ``refraction`` play no part. "sionna": Sionna
+            RT's PathSolver.
+        effects: What the exact engine models (``residual`` apart): by default line of sight, one mirror reflection and
+            single-bounce scattering, without noise. Light that is scattered more often is sampled, by ``seed``.
         depth: Most bounces on a path of Sionna's.
         samples: Rays per transmitter of Sionna's.
         beam_sigma_rad: Receiver beam width, kappa = 1 / sigma^2 [rad].
         refraction: Whether Sionna's paths go through slabs.
-        seed: Seed of Sionna's rays, and of the roles if none are given.
+        seed: Seed of Sionna's rays, of directions that are sampled, and of the roles if none are given.
         gas: Absorption of the air (ITU-R P.676) over every path's length: False for none, True for the standard
             atmosphere, :class:`Air`, or a :class:`Relevance`, which says whether it is worth its tolerance. Attributes
             ``air_...`` of the data set say which.
@@ -101,6 +105,7 @@ def simulate(
         raise TypeError(f"scene: got {type(scene).__name__}, expected a Scene (a mesh and its materials)")
     if engine not in ENGINES:
         raise ValueError(f"engine: got {engine!r}, expected one of {', '.join(ENGINES)}")
+    check_type("effects", effects, Effects)
     sampling = Sampling(depth=depth, samples=samples, refraction=refraction, seed=seed)
     points = np.atleast_2d(check_receivers("receivers", receivers))
     source = check_array("transmitter", transmitter, (3,))
@@ -117,7 +122,9 @@ def simulate(
     common |= {"shape": check_shape(shape), "beam_sigma_rad": check_beam(beam_sigma_rad)}
     versions = _versions(engine)
     surfaces = (scene.mesh.vertices, scene.mesh.faces, scene.face_material, *vars(table).values())
-    solver = (sampling, _versions(engine, solver_only=True)) if engine == "sionna" else None
+    solver: Any = sampling, _versions(engine, solver_only=True)
+    if engine == "exact":
+        solver = asdict(effects), seed if effects.scatterings > 1 else 0
     inputs = digest(engine, common, air, surfaces, solver)
     results: dict[int, Any] = {}  # ReceivedPaths
     if workspace is not None:
@@ -126,7 +133,7 @@ def simulate(
     tell = progress or (lambda *_: None)
     tell("simulate", len(results), len(points))
     missing = [k for k in range(len(points)) if k not in results]
-    receiver = _Receiver(engine, scene, common, None if engine == "exact" else sampling, air, device)
+    receiver = _Receiver(engine, scene, common, effects if engine == "exact" else sampling, seed, air, device)
     for at, found in each(receiver, [points[k] for k in missing], client):
         k = missing[at]
         results[k] = found if workspace is None else _kept(workspace, inputs, points[k], found)
@@ -134,7 +141,9 @@ def simulate(
     received = [results[k] for k in range(len(points))]
     settings = {"depth": depth, "samples": samples, "refraction": int(refraction)}
     if engine == "exact":
-        settings = {"depth": 1, "sub_pixels": SUB_PIXELS}
+        settings = {"sub_pixels": SUB_PIXELS} | {
+            f"effects_{name}": int(value) for name, value in asdict(effects).items()
+        }
     return SpectrumDataset.from_spectra(
         receivers=points,
         transmitter=source,
@@ -228,24 +237,25 @@ class _Receiver:
     engine: str
     scene: Scene
     common: dict[str, Any]
-    sampling: Sampling | None
+    how: Effects | Sampling
+    seed: int
     air: Air | None
     device: DeviceLike
     _running: Cache = field(default_factory=lambda: Cache(1))
 
     def __call__(self, point: np.ndarray) -> ReceivedPaths:
-        if self.sampling is None:
+        if isinstance(self.how, Effects):
             return self._running.get("engine", self._exact).receive(point)
         with making:  # Sionna RT's scene holds the receiver: one thread at a time
             return self._running.get("engine", self._sionna).receive(point)
 
     def _exact(self) -> ExactEngine:
-        return ExactEngine(self.scene, **self.common, gas=self.air, device=self.device)
+        return ExactEngine(
+            self.scene, **self.common, effects=self.how, seed=self.seed, gas=self.air, device=self.device
+        )  # type: ignore[arg-type]
 
     def _sionna(self) -> SionnaEngine:
-        return SionnaEngine(
-            self.scene, **self.common, sampling=self.sampling, gas=self.air, device=self.device
-        )
+        return SionnaEngine(self.scene, **self.common, sampling=self.how, gas=self.air, device=self.device)
 
 
 def _kept(

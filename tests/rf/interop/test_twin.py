@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from sionna_room import sionna_or_skip
-from twin_fields import BLOCKED, LOBES, MATERIALS, SEES, SHAPE, SIGMA, TX, F, known_field, room
+from twin_fields import BLOCKED, MATERIALS, SEES, SHAPE, SIGMA, TX, F, known_field, room
 
 import warprrf as wr
 from warprrf import cli
 from warprrf.rf.em.fresnel import lobe, slab_reflection
 from warprrf.rf.exact import ExactEngine
-from warprrf.rf.fields.bistatic.materials import Terms
+from warprrf.rf.fields.bistatic.materials import Effects
 from warprrf.rf.interop import twin as twins
 from warprrf.rf.spectra.spectrum import to_db
 
@@ -204,24 +204,17 @@ def test_slabs_are_as_thick_as_the_scene_or_the_caller_says_and_else_let_nothing
 
 def test_what_no_material_can_hold_is_said(field, tmp_path):
     assert wr.interop.write_twin(field, tmp_path / "plain").left_out == ()
-    parameters = replace(
-        field.parameters, log_gain=np.log(10**0.35), log_indirect=np.array([-9.0, -9.0, -9.0])
-    )
     residual = np.full((2, field.surface.cells), np.log(10**0.1))
+    parameters = replace(field.parameters, log_gain=np.log(10**0.35))
     rich = replace(
-        field,
-        parameters=parameters,
-        residual=residual,
-        terms=Terms(lobes=LOBES, residual=True, indirect=True),
+        field, parameters=parameters, residual=residual, effects=replace(field.effects, residual=True)
     )
-    found = wr.interop.write_twin(rich, tmp_path / "rich")
-    gain, elements, indirect = found.left_out
+    gain, elements = wr.interop.write_twin(rich, tmp_path / "rich").left_out
     assert "3.50 dB" in gain
     assert "1.00 dB" in elements
-    assert "indirect" in indirect
     about = json.loads((tmp_path / "rich" / "materials.json").read_text())["about"]
     assert gain in about
-    alike = replace(field, terms=Terms(lobes=LOBES, reciprocal=True))
+    alike = replace(field, parameters=replace(field.parameters, reciprocal=True))
     assert "reciprocity" in wr.interop.write_twin(alike, tmp_path / "alike").left_out[0]
 
 
@@ -274,7 +267,5 @@ def test_fields_without_materials_are_refused(field, tmp_path):
     with pytest.raises(TypeError, match="field.*RadioField"):
         wr.interop.write_twin(object(), tmp_path / "twin")
     with pytest.raises(ValueError, match="line of sight alone"):
-        wr.interop.write_twin(
-            replace(field, terms=Terms(lobes=LOBES, diffuse=False, mirror_order=0)), tmp_path / "x"
-        )
+        wr.interop.write_twin(replace(field, effects=Effects(mirrors=0, scatterings=0)), tmp_path / "x")
     assert list(tmp_path.iterdir()) == []

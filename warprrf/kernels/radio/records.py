@@ -32,7 +32,8 @@ def build(real: type) -> Any:
 
     @wp.struct
     class Materials:
-        """Rows are materials: lobe weights, epsilon_r - 1, mirrored share, slope of ln even reflection to ln(epsilon_r - 1);
+        """Rows are materials: lobe weights, epsilon_r - 1, mirrored share, slope of ln even reflection to ln(epsilon_r - 1),
+        1 where lobes are reciprocal; if ``slab`` is 1, complex permittivity and thickness in wavelengths;
         ``scale`` is a table over the cosine for each lobe; ``row`` and ``side_row`` are the material of each group and
         of each element's side, ``radiance`` what that sends."""
 
@@ -45,7 +46,10 @@ def build(real: type) -> Any:
         radiance: wp.array(dtype=real)
         exponent: wp.array(dtype=wp.int32)
         scale: wp.array2d(dtype=real)
-        reciprocal: int
+        reciprocal: wp.array(dtype=wp.int32)
+        slab: int
+        permittivity: wp.array(dtype=vec2)
+        thickness: wp.array(dtype=real)
 
     @wp.struct
     class Table:
@@ -77,6 +81,48 @@ def build(real: type) -> Any:
         return vec2(te, tm)
 
     @wp.func
+    def times(a: vec2, b: vec2):
+        """Product of complex numbers (real, imaginary)."""
+        return vec2(a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0])
+
+    @wp.func
+    def over(a: vec2, b: vec2):
+        """Quotient of complex numbers."""
+        return times(a, vec2(b[0], -b[1])) / wp.length_sq(b)
+
+    @wp.func
+    def slab(eta: vec2, thickness: real, c: real):
+        """Size of the reflection (TE, TM) of a slab of ``thickness`` wavelengths. ITU-R P.2040-4, eqs. (37), (43a), (44)."""
+        a = eta - vec2(real(1.0) - c * c, real(0.0))
+        size = wp.length(a)
+        root = vec2(
+            wp.sqrt(real(0.5) * wp.max(size + a[0], real(0.0))),
+            wp.sqrt(real(0.5) * wp.max(size - a[0], real(0.0))),
+        )
+        if a[1] < real(0.0):
+            root = vec2(root[0], -root[1])
+        echo = vec2(real(0.0), real(0.0))  # a half-space sends none back
+        if not wp.isinf(thickness):
+            q = real(12.566370614359172) * thickness * root
+            echo = wp.exp(q[1]) * vec2(wp.cos(q[0]), -wp.sin(q[0]))
+        one = vec2(real(1.0), real(0.0))
+        found = vec2()
+        for k in range(2):
+            near = vec2(c, real(0.0))
+            if k == 1:
+                near = c * eta
+            face = over(near - root, near + root)
+            found[k] = wp.length(over(times(face, one - echo), one - times(times(face, face), echo)))
+        return found
+
+    @wp.func
+    def reflection(m: Materials, x: real, row: int, c: real):
+        """Reflection (TE, TM) of a material: of a half-space with its sign; of a slab its size, as one mirror needs."""
+        if m.slab == 1:
+            return slab(m.permittivity[row], m.thickness[row], c)
+        return half_space(x, c)
+
+    @wp.func
     def mirrors(
         t: Table, m: Materials, excess: wp.array(dtype=real), i: int, begin: int, end: int, raised: int
     ):
@@ -87,7 +133,7 @@ def build(real: type) -> Any:
                 g = t.index[i, k]
                 if g >= 0:
                     x = excess[m.row[g]]
-                    r = half_space(x, t.angle[i, k][0])
+                    r = reflection(m, x, m.row[g], t.angle[i, k][0])
                     if k == raised:
                         r = half_space_slope(x, t.angle[i, k][0])
                     c = wp.cos(t.angle[i, k][1])
@@ -105,14 +151,14 @@ def build(real: type) -> Any:
         return (real(1.0) - s) * table[row, i] + s * table[row, i + 1]
 
     @wp.func
-    def lobe(m: Materials, which: int, angle: vec3, half_width: real):
+    def lobe(m: Materials, row: int, which: int, angle: vec3, half_width: real):
         """f_s / cos(theta_s) [1/sr] of a lobe; exponent 0 is Lambertian, whose cosine cancels. Else 1 / cos(theta_s) is
         replaced by its mean over what the ray stands for, what lies below the horizon left out."""
         value = real(0.3183098861837907)
         n = int(m.exponent[which])
         if n > 0:
             scale = at(m.scale, which, angle[0])
-            if m.reciprocal == 1:
+            if m.reciprocal[row] == 1:
                 scale *= at(m.scale, which, angle[1])
             else:
                 high = angle[1] + half_width
@@ -122,12 +168,12 @@ def build(real: type) -> Any:
         return value
 
     @wp.func
-    def unpolarised(x: real, angle: vec3, reciprocal: int):
+    def unpolarised(m: Materials, x: real, row: int, angle: vec3):
         """|Gamma|^2, mean of TE and TM, at incidence; of reciprocal lobes the mean of that at both angles."""
-        r = half_space(x, angle[0])
+        r = reflection(m, x, row, angle[0])
         value = real(0.5) * wp.dot(r, r)
-        if reciprocal == 1:
-            s = half_space(x, angle[1])
+        if m.reciprocal[row] == 1:
+            s = reflection(m, x, row, angle[1])
             value = real(0.5) * (value + real(0.5) * wp.dot(s, s))
         return value
 
@@ -136,7 +182,7 @@ def build(real: type) -> Any:
         """Sum of weight times lobe at the rough interaction of record i."""
         value = real(0.0)
         for j in range(m.exponent.shape[0]):
-            value += weight[row, j] * lobe(m, j, t.angle[i, t.rough], t.half_width)
+            value += weight[row, j] * lobe(m, row, j, t.angle[i, t.rough], t.half_width)
         return value
 
     @wp.func
@@ -158,7 +204,7 @@ def build(real: type) -> Any:
                     p = p * mirror[m.row[t.index[i, k]]]
         if t.kind == wp.static(SCATTER):
             row = m.row[t.index[i, t.rough]]
-            p = p * mixed(t, m, weight, i, row) * unpolarised(excess[row], t.angle[i, t.rough], m.reciprocal)
+            p = p * mixed(t, m, weight, i, row) * unpolarised(m, excess[row], row, t.angle[i, t.rough])
         if t.kind == wp.static(SOURCE):
             p = p * m.radiance[t.index[i, t.rough]]
         return p
@@ -216,14 +262,14 @@ def build(real: type) -> Any:
                     sum = mixed(t, m, m.weight, i, row)
                     for j in range(lobes):
                         slope[b, place[row] + j] += (
-                            p * m.weight[row, j] * lobe(m, j, angle, t.half_width) / sum
+                            p * m.weight[row, j] * lobe(m, row, j, angle, t.half_width) / sum
                         )
                     r = half_space(m.excess[row], angle[0])
                     rise = wp.dot(r, half_space_slope(m.excess[row], angle[0]))
-                    if m.reciprocal == 1:
+                    if m.reciprocal[row] == 1:
                         r2 = half_space(m.excess[row], angle[1])
                         rise = real(0.5) * (rise + wp.dot(r2, half_space_slope(m.excess[row], angle[1])))
-                    slope[b, place[row] + lobes] += p * rise / unpolarised(m.excess[row], angle, m.reciprocal)
+                    slope[b, place[row] + lobes] += p * rise / unpolarised(m, m.excess[row], row, angle)
                 if t.kind == wp.static(SOURCE):
                     row = m.side_row[t.index[i, t.rough]]
                     whole = real(0.0)
@@ -252,12 +298,13 @@ def build(real: type) -> Any:
         for s in range(first[b], first[b + 1]):
             i = order[s]
             angle = t.angle[i, t.rough]
+            row = m.row[t.index[i, t.rough]]
             base = place[t.index[i, t.rough]] * lobes * wp.static(MOMENTS)
             for j in range(lobes):
-                value = t.power[i] * lobe(m, j, angle, t.half_width)
+                value = t.power[i] * lobe(m, row, j, angle, t.half_width)
                 for c in range(wp.static(MOMENTS)):
                     part = at(moments, c, angle[0])
-                    if m.reciprocal == 1:
+                    if m.reciprocal[row] == 1:
                         part = real(0.5) * (part + at(moments, c, angle[1]))
                     out[b, base + j * wp.static(MOMENTS) + c] += value * part
 

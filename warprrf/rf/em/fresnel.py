@@ -124,7 +124,13 @@ def _slab(
     endless = np.isinf(thickness)
     q = 2.0 * np.pi * np.where(endless, 0.0, thickness) / wavelength * root
     once = np.where(endless, 0.0, np.exp(-1j * q))
-    return (cos - root) / (cos + root), (eta * cos - root) / (eta * cos + root), once
+    return _step(cos, root), _step(eta * cos, root), once
+
+
+def _step(before: np.ndarray, behind: np.ndarray) -> np.ndarray:
+    """Reflection where one turns into the other; 0 where both are 0, as at grazing of what is no other medium."""
+    both = before + behind
+    return (before - behind) / np.where(both == 0, 1.0, both)
 
 
 @checked

@@ -90,7 +90,7 @@ def exact_paths(
         for j in range(k):
             own = patches.contains(patch[:, j], point[:, j])
             row, patch, point = row[own], patch[own], point[own]
-        free = _unobstructed(patches, source, receivers[row], patch, point, images.device)
+        free = unobstructed(patches, source, receivers[row], patch, point, images.device)
         row, patch, point = row[free], patch[free], point[free]
         # Sheets closer than the tolerance don't hide each other: seen at a slant, their mirror points lie further apart.
         once = _distinct(row, point, 3.0 * patches.tolerance_m)
@@ -249,7 +249,7 @@ class ZoneRays:
         return (hit.face >= 0) & ((met == patch) | (near & (off <= self.position_error_m) & (met < 0)))
 
 
-def _unobstructed(
+def unobstructed(
     patches: PlanarPatches,
     source: np.ndarray,
     ends: np.ndarray,

@@ -15,7 +15,7 @@ from warprrf.geometry.mesh import vectors_across
 from warprrf.rf.fields.bistatic.materials import Effects, Parameters
 from warprrf.rf.fields.bistatic.records import Evaluation, Records
 from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.tracer import LIFT_M, Tracer, _Rays
+from warprrf.rf.fields.bistatic.tracer import LIFT_M, Rays, Tracer
 
 RAYS = 128  # from each element, over its hemisphere
 
@@ -52,7 +52,7 @@ class Interreflection:
             hits = grid.hit_along(point[new] + LIFT_M * normal[new], directions, np.ones(len(directions)))
             hit = np.flatnonzero(hits.face >= 0)
             side, met = np.repeat(new, RAYS), surface.side_met(hits.face[hit], directions[hit])
-            found = tracer.lit(_Rays(hits, side))
+            found = tracer.lit(Rays(hits, side))
             self.lit.append(replace(found, power=scale * found.power))
             rows.append(side[hit])
             columns.append(met)

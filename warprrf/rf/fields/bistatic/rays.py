@@ -7,6 +7,7 @@ transmitter besides.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -16,11 +17,13 @@ from warprrf import device as _device
 from warprrf.cache import cached_property
 from warprrf.device import DeviceLike
 from warprrf.geometry import rays as mesh_rays
-from warprrf.kernels.radio.illumination import illuminate
+from warprrf.kernels.radio import illumination
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.spectra.spectrum import sub_pixel_directions
 
 LEAST_M = 1e-6  # range of what is hit at the ray's very start
+REALS = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
+"""Warp's types of precisions."""
 NEAREST_M = 0.05  # an element at the transmitter spans directions: its distance counts as no less
 
 
@@ -31,7 +34,7 @@ class Hits:
     Attributes:
         origins: where they start [m], shape ``(O, 3)``.
         directions: unit vectors, one for each ray, or one set for every origin, shape ``(K, 3)``.
-        solid_angle: that each ray stands for [sr], shape ``(K,)`` float32.
+        solid_angle: that each ray stands for [sr], shape ``(K,)``.
         face: face that each hits, one origin's rays after another's, -1 for none, shape ``(O K,)`` int32.
         range_m: distance to it, shape ``(O K,)``; infinite for none.
     """
@@ -73,6 +76,7 @@ class RayGrid:
         shape: rows and columns of a spectrum.
         sub_pixels: square root of the rays per pixel.
         loss_per_m: absorption by the air [neper/m].
+        dtype: precision of angles and of light.
         device: where rays are cast.
     """
 
@@ -83,13 +87,14 @@ class RayGrid:
         sub_pixels: int,
         *,
         loss_per_m: float = 0.0,
+        dtype: Any = np.float32,
         device: DeviceLike = None,
     ) -> None:
-        self.surface, self.shape, self.sub_pixels = surface, shape, sub_pixels
+        self.surface, self.shape, self.sub_pixels, self.dtype = surface, shape, sub_pixels, np.dtype(dtype)
         self.loss_per_m = float(loss_per_m)
         self.device = _device.resolve(device)
         self.directions, solid_angle = sub_pixel_directions(shape, sub_pixels)
-        self.solid_angle = solid_angle.astype(np.float32)
+        self.solid_angle = solid_angle.astype(self.dtype)
         self.half_width = 0.5 * np.pi / (shape[0] * sub_pixels**2)
 
     @cached_property
@@ -122,7 +127,7 @@ class RayGrid:
             origins, directions, per_origin=max(each, 1), device=self.device, backend=self._backend(each * len(origins))
         )  # fmt: skip
         return Hits(
-            origins, directions, np.asarray(solid_angle, np.float32), np.asarray(hit.face, np.int32),
+            origins, directions, np.asarray(solid_angle, self.dtype), np.asarray(hit.face, np.int32),
             np.maximum(hit.t, LEAST_M, out=hit.t),
         )  # fmt: skip
 
@@ -146,16 +151,21 @@ class RayGrid:
         """How transmitters at ``sources`` (3,) or (K, 3) [m] would illuminate what rays of index ``ray`` (K,), by default
         all, hit if nothing threw a shadow."""
         count, where = len(hits.face) if ray is None else len(ray), self.device
-        found = [wp.zeros(count, dtype=kind, device=where) for kind in (wp.float32, wp.vec3, wp.vec3d)]
+        real = REALS[self.dtype]
+        found = [
+            wp.zeros(count, dtype=kind, device=where) for kind in (real, wp.types.vector(3, real), wp.vec3d)
+        ]
         each = max(len(hits.face) // max(len(hits.origins), 1), 1)
         vectors = [
             wp.array(np.reshape(a, (-1, 3)), dtype=wp.vec3d, device=where) for a in (sources, hits.origins)
         ]
+        of_rays = (
+            (hits.directions, wp.vec3d), (hits.face, wp.int32), (hits.range_m, wp.float64), (hits.solid_angle, real),
+        )  # fmt: skip
         inputs = [
-            *self.surface.on_device(where), wp.array([] if ray is None else ray, dtype=wp.int32, device=where), *vectors, each,
-            *(wp.array(a, dtype=kind, device=where, copy=False) for a, kind in (
-                (hits.directions, wp.vec3d), (hits.face, wp.int32), (hits.range_m, wp.float64), (hits.solid_angle, wp.float32),
-            )), NEAREST_M, self.loss_per_m, *found,
+            *self.surface.on_device(where, real), wp.array([] if ray is None else ray, dtype=wp.int32, device=where),
+            *vectors, each, *(wp.array(a, dtype=kind, device=where, copy=False) for a, kind in of_rays), NEAREST_M,
+            self.loss_per_m, *found,
         ]  # fmt: skip
-        _device.launch(illuminate, count, inputs, device=where)
+        _device.launch(illumination.build(real), count, inputs, device=where)
         return Light(*(a.numpy() for a in found))

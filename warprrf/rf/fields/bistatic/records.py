@@ -18,10 +18,12 @@ from warprrf import device as _device
 from warprrf.cache import Cache
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import records as kernels
-from warprrf.rf.em.fresnel import COSINES, fresnel_curves, lobe_norm, reciprocal_factor
+from warprrf.rf.em.fresnel import COSINES, SurfaceTable, fresnel_curves, lobe_norm, reciprocal_factor
 from warprrf.rf.fields.bistatic.materials import Parameters
+from warprrf.rf.fields.bistatic.rays import REALS
 
-REALS = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
+FINE_COSINES = 4097
+"""Entries of a lobe's table for a truth: interpolation errs by 1e-6 at most up to an exponent of 100."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,24 +193,66 @@ class Evaluation:
     def _upload(self, real: Any) -> Any:
         p, m, where = self.parameters, kernels.build(real)[0](), self.device
         even, slope = fresnel_curves().even(p.log_excess)
+        rows, count = self.material, len(p.log_excess)
         values = {
             "weight": p.weight, "excess": p.excess, "mirror": np.exp(p.log_mirror), "even_slope": slope / even,
             "radiance": self._radiance,
         }  # fmt: skip
+        indices = {
+            "row": rows,
+            "side_row": rows[self._side_group],
+            "reciprocal": np.full(count, p.reciprocal),
+        }
         for name, value in values.items():
             setattr(m, name, wp.array(np.ascontiguousarray(value), dtype=real, device=where))
-        rows = self.material, self.material[self._side_group]
-        m.row, m.side_row = (wp.array(own, dtype=wp.int32, device=where) for own in rows)
-        m.exponent, m.scale = _lobes(p.lobes, p.reciprocal, real, where)
-        m.reciprocal = int(p.reciprocal)
+        for name, value in indices.items():
+            setattr(m, name, wp.array(value, dtype=wp.int32, device=where))
+        m.exponent, m.scale = _lobes(p.lobes, (p.reciprocal,) * len(p.lobes), real, where, COSINES)
+        return m
+
+
+class SlabEvaluation(Evaluation):
+    """A scene's materials as kernels take them: slabs, and lobes of either kind beside each other.
+
+    Args:
+        table: radio properties at a carrier.
+        wavelength_m: of that.
+        material: of each group, shape ``(G,)``.
+        device: where powers are computed.
+    """
+
+    def __init__(
+        self, table: SurfaceTable, wavelength_m: float, material: np.ndarray, device: DeviceLike
+    ) -> None:
+        count = len(table.scattering)
+        super().__init__(Parameters.prior(count), material, device=device)
+        self._slabs = table, wavelength_m
+
+    def _upload(self, real: Any) -> Any:
+        (table, wavelength_m), where = self._slabs, self.device
+        m, scattering = super()._upload(real), table.scattering**2
+        kinds = list(zip(table.alpha_r.tolist(), table.reciprocal.tolist(), strict=True))
+        lobes = sorted(set(kinds))
+        weight = np.array([[kind == lobe for lobe in lobes] for kind in kinds]) * scattering[:, None]
+        eta = np.column_stack([table.permittivity.real, table.permittivity.imag])
+        m.slab, m.permittivity = 1, wp.array(eta, dtype=wp.types.vector(2, real), device=where)
+        values = {"weight": weight, "mirror": 1.0 - scattering, "thickness": table.thickness_m / wavelength_m}
+        for name, value in values.items():
+            setattr(m, name, wp.array(value, dtype=real, device=where))
+        m.reciprocal = wp.array(table.reciprocal, dtype=wp.int32, device=where)
+        m.exponent, m.scale = _lobes(*zip(*lobes, strict=True), real, where, FINE_COSINES)
         return m
 
 
 @lru_cache(maxsize=8)
-def _lobes(exponents: tuple[int, ...], reciprocal: bool, real: Any, device: str) -> tuple[wp.array, wp.array]:
+def _lobes(
+    exponents: tuple[int, ...], reciprocal: tuple[bool, ...], real: Any, device: str, count: int
+) -> tuple[wp.array, wp.array]:
     """Exponents of lobes, and a table over the cosine of each: 1 / norm, or the factor of a reciprocal one."""
-    cosine = np.linspace(0.0, 1.0, COSINES)
-    scale = [reciprocal_factor(n, cosine) if reciprocal else 1.0 / lobe_norm(n, cosine) for n in exponents]
+    cosine, each = np.linspace(0.0, 1.0, count), zip(exponents, reciprocal, strict=True)
+    scale = [
+        reciprocal_factor(n, cosine) if symmetric else 1.0 / lobe_norm(n, cosine) for n, symmetric in each
+    ]
     return wp.array(exponents, dtype=wp.int32, device=device), wp.array(
         np.stack(scale), dtype=real, device=device
     )

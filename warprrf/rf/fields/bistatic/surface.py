@@ -8,7 +8,9 @@ what differs within a group is told apart at both scales.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -197,20 +199,33 @@ class Surface:
             two_sided=sides, **_elements(mesh, patch, group, element_m),
         )  # fmt: skip
 
+    @classmethod
+    def of_materials(cls, patches: PlanarPatches, material: np.ndarray, names: Sequence[str]) -> Surface:
+        """That of faces of known materials (F,) on exact patches, all one element: nothing of it is learned."""
+        mesh, groups = patches.mesh, len(names)
+        none, faces = np.zeros(len(mesh.faces), np.int32), patches.group
+        return cls(
+            mesh=mesh, normal=mesh.face_normals, patch=patches.face_patch, plane_normal=patches.normal,
+            plane_offset=patches.offset, group=material, material=np.arange(groups, dtype=np.int32),
+            look=np.full((groups, 4), np.nan), patch_group=faces, element=none, cell=none, cell_element=none[:1],
+            element_centre=mesh.center[None], element_area=np.array([mesh.areas.sum()]), element_group=none[:1],
+            thickness_m=np.full(groups, np.nan), group_names=tuple(names), skin_m=TRUE_SKIN_M, two_sided=True,
+        )  # fmt: skip
+
     @cached_property
     def side_group(self) -> np.ndarray:
         """Group of each element's side."""
         return np.tile(self.element_group, 1 + self.two_sided)
 
-    def on_device(self, device: DeviceLike) -> tuple[wp.array, wp.array]:
-        """Normals of the faces, and those that scattering uses, as kernels take them."""
+    def on_device(self, device: DeviceLike, real: Any) -> tuple[wp.array, wp.array]:
+        """Normals of the faces, and those that scattering uses in precision ``real``, as kernels take them."""
         where = _device.resolve(device)
 
         def upload() -> tuple[wp.array, wp.array]:
             flat = wp.array(self.mesh.face_normals, dtype=wp.vec3d, device=where)
-            return flat, wp.array(self.normal, dtype=wp.vec3, device=where)
+            return flat, wp.array(self.normal, dtype=wp.types.vector(3, real), device=where)
 
-        return self._uploaded.get(str(where), upload)
+        return self._uploaded.get((str(where), real), upload)
 
     @cached_property
     def patches(self) -> PlanarPatches:

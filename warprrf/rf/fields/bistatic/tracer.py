@@ -34,7 +34,7 @@ MIRROR_SLACK_M = 0.1
 """How far beside its faces a patch may still mirror [m]: outlines of a reconstructed mesh are torn."""
 LIFT_M = 0.02  # rays that start on a surface start so far off it
 THROUGH_MIRRORS = 3  # rays of a pixel that look for light by way of mirrors
-INTO_MIRRORS = 5  # that go on at mirrors: what these show is seen a second time already
+INTO_MIRRORS = 2  # square root of the rays of a pixel that go on at mirrors: what these show is seen a second time already
 SHARP = "sharp"
 """Name of the table of line of sight and mirrors."""
 SENT_ON = ("E", "EM")
@@ -102,7 +102,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class _Rays:
+class Rays:
     """Rays and what they hit: ``ray`` of the receiver's grid that each belongs to, and the interaction between the hit and
     the receiver, if any: group ``(N,)`` and cosine ``(N,)`` of a mirror."""
 
@@ -220,12 +220,12 @@ class Tracer:
 
     def trace(self, view: View, names: Sequence[str]) -> dict[str, Records]:
         """Tables of sequences that a receiver sees, by name."""
-        first, turned = _Rays(view.hits, np.arange(len(view.hits.face))), None
+        first, turned = Rays(view.hits, np.arange(len(view.hits.face))), None
         if any(name.endswith("M") for name in names):
             turned = self._turned(view)
         return {name: self._trace(name, turned if name.endswith("M") and turned else first) for name in names}
 
-    def _trace(self, name: str, rays: _Rays) -> Records:
+    def _trace(self, name: str, rays: Rays) -> Records:
         """Records of one sequence."""
         if name.startswith("E"):
             return self.seen(rays)
@@ -241,21 +241,20 @@ class Tracer:
             power, np.arange(len(p), dtype=np.int32), group.astype(np.int32), angle, group.shape[1]
         )
 
-    def lit(self, rays: _Rays) -> Records:
+    def lit(self, rays: Rays) -> Records:
         """What rays see of surfaces that the transmitter lights."""
         light = self.grid.light(rays.hits, self.transmitter)
         row = np.flatnonzero(light.strength > 0)
-        return self._scattered(rays, row, light.strength[row], light.angle[row])
+        return self.scattered(rays, row, light.strength[row], light.angle[row])
 
-    def lit_by_mirrors(self, rays: _Rays) -> Records:
+    def lit_by_mirrors(self, rays: Rays) -> Records:
         """What some rays of each pixel see of surfaces that images of the transmitter light."""
-        places = places_of_rays(self.grid.per_pixel, INTO_MIRRORS)[::2]
+        chosen, times = np.flatnonzero(rays.hits.face >= 0), 1.0
         if rays.group is None:
-            places = places_of_rays(self.grid.per_pixel, THROUGH_MIRRORS)
-        chosen = np.flatnonzero(np.isin(rays.ray % self.grid.per_pixel, places) & (rays.hits.face >= 0))
-        times = (self.grid.per_pixel if rays.group is None else min(INTO_MIRRORS, self.grid.per_pixel)) / len(
-            places
-        )
+            places = ((np.arange(THROUGH_MIRRORS) + 0.5) * self.grid.per_pixel / THROUGH_MIRRORS).astype(int)
+            places = np.unique(places)
+            times = self.grid.per_pixel / len(places)
+            chosen = chosen[np.isin(chosen % self.grid.per_pixel, places)]
         row, image = self.mirrored.pairs(rays.hits.face[chosen])
         row, m = chosen[row], self.mirrored
         light = self.grid.light_through(rays.hits, m.image[image], row)
@@ -265,9 +264,11 @@ class Tracer:
         way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
         cosine = np.abs(np.einsum("ni,ni->n", way, self.surface.plane_normal[patch]))
         before = self.surface.patch_group[patch], cosine
-        return self._scattered(rays, row[k], light.strength[k] * np.float32(times), light.angle[k], before)
+        return self.scattered(
+            rays, row[k], light.strength[k] * self.grid.dtype.type(times), light.angle[k], before
+        )
 
-    def seen(self, rays: _Rays) -> Records:
+    def seen(self, rays: Rays) -> Records:
         """What rays see of elements."""
         hits, s = rays.hits, self.surface
         row = np.flatnonzero(hits.face >= 0)
@@ -279,11 +280,11 @@ class Tracer:
             * solid_angle
             * self.grid.transmittance(hits.range_m[row])
         )
-        return self._records(rays, row, power, side, np.zeros((len(row), 3), np.float32), SOURCE)
+        return self._records(rays, row, power, side, np.zeros((len(row), 3)), SOURCE)
 
-    def _scattered(
+    def scattered(
         self,
-        rays: _Rays,
+        rays: Rays,
         row: np.ndarray,
         strength: np.ndarray,
         angle: np.ndarray,
@@ -295,7 +296,7 @@ class Tracer:
 
     def _records(
         self,
-        rays: _Rays,
+        rays: Rays,
         row: np.ndarray,
         power: np.ndarray,
         index: np.ndarray,
@@ -304,45 +305,43 @@ class Tracer:
         before: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> Records:
         after = None if rays.group is None or rays.cosine is None else (rays.group[row], rays.cosine[row])
-        columns, angles = [index], [angle]
+        columns, angles, dtype = [index], [angle], self.grid.dtype
         for mirror, where in ((before, 0), (after, len(columns) + (before is not None))):
             if mirror is not None:
                 columns.insert(where, mirror[0])
                 angles.insert(where, np.column_stack([mirror[1], 0.0 * mirror[1], 0.0 * mirror[1]]))
         gain = -1 if after is not None else int(kind == SOURCE or before is not None)
         return Records(
-            np.asarray(power, np.float32), rays.ray[row].astype(np.int32), np.stack(columns, axis=1).astype(np.int32),
-            np.stack(angles, axis=1).astype(np.float32), int(before is not None), kind, gain, self.grid.half_width,
+            np.asarray(power, dtype), rays.ray[row].astype(np.int32), np.stack(columns, axis=1).astype(np.int32),
+            np.stack(angles, axis=1).astype(dtype), int(before is not None), kind, gain, self.grid.half_width,
         )  # fmt: skip
 
-    def _turned(self, view: View) -> _Rays:
-        """Some rays of each pixel turned at the mirrors that they hit, and what they hit there."""
-        s, grid, hits = self.surface, self.grid, view.hits
-        places = places_of_rays(grid.per_pixel, INTO_MIRRORS)
-        times = grid.per_pixel / len(places)
-        ray = np.flatnonzero(np.isin(np.arange(len(hits.face)) % grid.per_pixel, places))
-        face = hits.face[ray]
-        own = (face >= 0) & (s.patch.take(face, mode="wrap") >= 0)
-        ray, face = ray[own], face[own]
-        each = ray % len(grid.directions)
+    def _turned(self, view: View) -> Rays:
+        """Rays of a coarser lattice turned at the mirrors that they hit, and what they hit there. Of the receiver's grid each
+        belongs to a ray of the same pixel that hits something, if one does."""
+        s, per_pixel = self.surface, self.grid.per_pixel
+        shape, sub_pixels = self.grid.shape, min(INTO_MIRRORS, self.grid.sub_pixels)
+        grid = self.kept.get((shape, sub_pixels), lambda: self.on_grid(shape, sub_pixels).grid)
+        hits = grid.hit(view.receivers)
+        ray = np.flatnonzero(hits.face >= 0)
+        ray = ray[s.patch[hits.face[ray]] >= 0]
+        face, each = hits.face[ray], ray % len(grid.directions)
         direction, normal = grid.directions[each], s.plane_normal[s.patch[face]]
         normal = np.where((direction * normal).sum(axis=1, keepdims=True) > 0, -normal, normal)
         cosine = -(direction * normal).sum(axis=1)
         turned = direction + 2.0 * cosine[:, None] * normal
-        solid_angle = grid.solid_angle[each] * times * grid.transmittance(hits.range_m[ray])
+        solid_angle = grid.solid_angle[each] * grid.transmittance(hits.range_m[ray])
         found = grid.hit_along(hits.points(ray) + LIFT_M * normal, turned, solid_angle)
-        return _Rays(found, ray, s.group[face], cosine)
+        pixel, place = np.divmod(ray, grid.per_pixel)
+        place = ((place + 0.5) * per_pixel / grid.per_pixel).astype(int)
+        met = view.hits.face.reshape(-1, per_pixel) >= 0
+        place = np.where(met[pixel, place], place, met.argmax(axis=1)[pixel])
+        return Rays(found, pixel * per_pixel + place, s.group[face], cosine)
 
     def adopted(self, view: View) -> View:
         """What :func:`traced` found, as a view of this tracer."""
         own: dict[str, Any] = {"directions": self.grid.directions, "solid_angle": self.grid.solid_angle}
         return replace(view, tracer=self, hits=replace(view.hits, **own))
-
-
-def places_of_rays(per_pixel: int, count: int) -> np.ndarray:
-    """Which ``count`` of the rays of a pixel stand for all of them, shape ``(count,)``, or all if they are fewer."""
-    count = min(count, per_pixel)
-    return ((np.arange(count) + 0.5) * per_pixel / count).astype(int)
 
 
 def traced(again: Callable[[], Tracer], effects: Effects, part: tuple[np.ndarray, MirrorPaths]) -> View:
