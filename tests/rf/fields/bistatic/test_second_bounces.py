@@ -41,8 +41,10 @@ def plane(z: float, up: bool) -> tuple[np.ndarray, np.ndarray]:
     return corners, faces if up else faces[:, ::-1]
 
 
-def test_light_that_a_mirror_throws_on_a_floor_comes_from_the_image() -> None:
-    """A rough floor under a mirror: besides the transmitter's own light, that of its image behind the mirror."""
+@pytest.mark.parametrize("name", ["MS", "SM"])
+def test_what_a_mirror_throws_on_a_floor_or_shows_of_it_comes_from_the_image(name: str) -> None:
+    """A rough floor under a mirror: besides the transmitter's own light, that of its image behind the mirror; and the
+    floor as the receiver's image sees it."""
     mesh, part = joined(plane(0.0, True), plane(3.0, False))
     both = Surface.of(RadioScene(mesh, part, [SlabMaterial("floor"), SlabMaterial("mirror")]))
     mesh, part = joined(
@@ -50,32 +52,36 @@ def test_light_that_a_mirror_throws_on_a_floor_comes_from_the_image() -> None:
     )  # a black lid far above, to have room for the image
     alone = Surface.of(RadioScene(mesh, part, [SlabMaterial("floor"), SlabMaterial("lid")]))
     receiver, transmitter = np.array([1.0, -0.5, 1.2]), np.array([-0.7, 0.4, 1.6])
-    image = np.array([-0.7, 0.4, 4.4])
     nothing = -60.0
     lobes = (0, 5)
     weight = np.array([[np.log(0.2), np.log(0.3)], [nothing, nothing]])
 
-    def field(surface: Surface, source: np.ndarray, mirror_scatter: bool = False) -> BistaticField:
+    def field(surface: Surface, source: np.ndarray, name: str = "") -> BistaticField:
         return BistaticField(
             surface=surface, transmitter=source, frequency_hz=F, shape=SHAPE, floor=1e-20, range_db=(-200.0, -80.0),
-            beam_sigma_rad=np.radians(5.0), effects=Effects(False, 0, 1, mirror_scatter, False),
+            beam_sigma_rad=np.radians(5.0), effects=Effects(False, 0, 1, name == "MS", name == "SM"),
             parameters=Parameters(weight, np.log([4.0, 199.0]), np.array([nothing, 0.0]), lobes),
             material=np.arange(2), residual=np.zeros((2, surface.cells)),
         )  # fmt: skip
 
-    lit = field(both, transmitter, mirror_scatter=True)
-    dark = field(both, transmitter)
+    lit, dark = (field(both, transmitter, on) for on in (name, ""))
     extra = lit.spectrum(receiver).path_gain - dark.spectrum(receiver).path_gain
-    wanted = field(alone, image).spectrum(receiver).path_gain
+    behind = [0.0, 0.0, 6.0]
+    if name == "MS":
+        wanted = field(alone, behind + transmitter * [1, 1, -1]).spectrum(receiver).path_gain
+    else:  # upside down
+        wanted = field(alone, transmitter).spectrum(behind + receiver * [1, 1, -1]).path_gain[::-1]
     # The mirror keeps what its Fresnel curve says, which hardly depends on the angle up to 60 degrees.
     reflected = fresnel_curves().value(np.full(2, np.log(199.0)), np.array([0.5, 1.0]))[0]
-    below = slice(17, None)  # rows that look down steeply: their pixels' four rays meet the floor well inside
-    ratio = extra[below] / wanted[below]
+    steep = (
+        slice(17, None) if name == "MS" else slice(7)
+    )  # rows whose pixels' rays meet the floor well inside
+    ratio = extra[steep] / wanted[steep]
     assert 0.97 * reflected.min() < np.median(ratio) < 1.03 * reflected.max()
     assert 0.9 * reflected.min() < ratio.min() and ratio.max() < 1.1 * reflected.max()
     assert 0.97 * reflected.min() < extra.sum() / wanted.sum() < 1.03 * reflected.max()
     gains = lit.path_gains(lit.view(receiver))
-    assert gains.by_ray(["MS"]).sum() == pytest.approx(extra.sum(), rel=1e-6)
+    assert gains.by_ray([name]).sum() == pytest.approx(extra.sum(), rel=1e-6)
 
 
 @pytest.mark.usefixtures("device")
