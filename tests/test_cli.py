@@ -12,7 +12,6 @@ import pytest
 from golden import make
 from places import ROOT
 from radio_scenes import box_mesh
-from warprrf.rf.fields.bistatic.training import FitOptions
 
 import warprrf as wr
 from warprrf import cli

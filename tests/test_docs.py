@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 from fuzz.calls import public
 from places import ROOT
-from warprrf.rf.fields.bistatic.training import FitOptions
 
 import warprrf as wr
 import warprrf.viewer
