@@ -20,7 +20,7 @@ from warprrf.checks import check_array
 from warprrf.files import read_json
 from warprrf.geometry.mesh_files import METRES, READERS, is_mesh_file
 from warprrf.geometry.ply_files import ply_columns
-from warprrf.rf.fields.bistatic.materials import SETS
+from warprrf.rf.tracing.model import SETS
 from warprrf.tensor_files import named
 
 Add = Callable[..., argparse.ArgumentParser]

@@ -42,7 +42,7 @@ from warprrf.cli.output import Output
 from warprrf.cli.tables import table
 from warprrf.files import write_json, write_text
 from warprrf.geometry.photos.config import LENSES, ReconstructionConfig
-from warprrf.rf.fields.bistatic.materials import SETS
+from warprrf.rf.tracing.model import SETS
 
 
 def add_reconstruct(add: Add) -> None:

@@ -25,8 +25,8 @@ from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.scans import is_scan, scanned_patches
 from warprrf.geometry.splats.gaussians import gaussians_of
 from warprrf.rf.em.materials import is_name_alone
-from warprrf.rf.fields.bistatic.colours import Colours, colour_groups
-from warprrf.rf.fields.bistatic.shapes import SHAPES, shape_groups
+from warprrf.rf.tracing.colours import Colours, colour_groups
+from warprrf.rf.tracing.shapes import SHAPES, shape_groups
 
 ELEMENT_M = 0.5  # least width of an element
 LARGEST_ELEMENT_M = 25.0
