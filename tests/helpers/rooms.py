@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from unittest import mock
 
 import numpy as np
-import warp as wp
 from golden import make
 from places import LOBBY
 from radio_scenes import joined
@@ -23,6 +22,7 @@ import warprrf as wr
 from warprrf.geometry.splats.gaussians import discs_on_mesh
 from warprrf.rf import exact
 from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.tracing import rays
 from warprrf.rf.tracing.model import Effects
 
 SHAPE = (18, 36)
@@ -317,15 +317,17 @@ def rays_turned(rotation: Rotation) -> Iterator[None]:
 
     A desk top 14 cm below a receiver is 0.1 degrees high and gives 3 % of all power in one of a pixel's 64 rays, or in none.
     """
-    grid = exact._sub_pixel_grid
+    known = rays.sub_pixel_directions
 
-    def turned(shape: tuple[int, int], sub_pixels: int, device: str) -> exact._SubPixels:
-        known = grid(shape, sub_pixels, device)
-        toward = rotation.apply(known.directions)
-        return replace(known, directions=toward, on_device=wp.array(toward, dtype=wp.vec3d, device=device))
+    def turned(shape: tuple[int, int], sub_pixels: int) -> tuple[np.ndarray, np.ndarray]:
+        directions, solid_angle = known(shape, sub_pixels)
+        return rotation.apply(directions), solid_angle
 
     beams = exact._lattice_beams.__wrapped__  # kept ones are of the lattice as it was
-    with mock.patch.multiple(exact, _sub_pixel_grid=turned, _lattice_beams=beams):
+    with (
+        mock.patch.object(rays, "sub_pixel_directions", turned),
+        mock.patch.multiple(exact, sub_pixel_directions=turned, _lattice_beams=beams),
+    ):
         yield
 
 
