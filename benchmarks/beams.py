@@ -113,7 +113,9 @@ class Links:
         specular, rays = self.tracer.trace(receiver, 1), self.engine.diffuse(receiver)
         weakest = np.argsort(rays.power)
         kept = weakest[np.cumsum(rays.power[weakest]) > NEGLIGIBLE * rays.power.sum()]
-        (theta_r, phi_r), (theta_t, phi_t) = map(angles_from_directions, (rays.direction[kept], rays.departure[kept]))
+        (theta_r, phi_r), (theta_t, phi_t) = map(
+            angles_from_directions, (rays.direction[kept], rays.departure[kept])
+        )
         count = len(kept)
         scattered = replace(
             specular, gain=np.sqrt(rays.power[kept]).astype(complex), tau=rays.length_m[kept] / SPEED_OF_LIGHT,

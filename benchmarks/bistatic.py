@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
 
@@ -26,16 +27,16 @@ examples:
 """
 
 ABLATION: dict[str, dict[str, Any]] = {
-    "no line of sight": {"line_of_sight": False},
-    "no mirrors": {"mirror_order": 0, "mirror_scatter": False, "scatter_mirror": False},
-    "no scattering": {"diffuse": False},
+    "no line of sight": {"effects": {"line_of_sight": False}},
+    "no mirrors": {"effects": {"mirrors": 0, "mirror_scatter": False, "scatter_mirror": False}},
+    "no scattering": {"effects": {"scatterings": 0}},
     "Lambertian lobe alone": {"lobes": (0,)},
-    "nothing after the first bounce": {
-        "mirror_scatter": False, "scatter_mirror": False, "diffuse_order": 1, "indirect": False
+    "nothing after the first scattering": {
+        "effects": {"mirror_scatter": False, "scatter_mirror": False, "scatterings": 1}
     },
-    "no residual per element": {"residual": False},
+    "no residual": {"effects": {"residual": False}},
 }  # fmt: skip
-"""Options of the fit that leave a part of the model out."""
+"""Options of the fit that leave a part of the model out; of the effects that the whole field chose, what is changed."""
 MATCH_DEG = 3.0  # a path of ours within this angle of a true one is that path
 AWAY_SIGMA = 5.0  # a pixel further than this from every sharp path holds scattering: its beam is 54 dB down
 COLUMNS = {
@@ -66,13 +67,17 @@ def rows(options: FitOptions, fits: Fits) -> Iterator[Row]:
             yield own | {"part": "calibration", **row["calibration"]}
             yield own | {"part": "delays", **row["delays"]}
             if count == truth.few:
+                whole = wr.Effects(**row["effects"])
                 yield own | {"part": "ablation", "model": "everything", **row["scores"]}
         train = truth.train(truth.few)
-        others: dict[str, tuple[Any, Any]] = {name: (place.reconstruction, o) for name, o in ABLATION.items()}
+        others: dict[str, tuple[Any, dict[str, Any]]] = {}
+        for name, left_out in ABLATION.items():
+            effects = replace(whole, **left_out.get("effects", {}))
+            others[name] = place.reconstruction, left_out | {"effects": effects}
         others["true mesh, its materials as groups"] = place.scene, {}
-        for name, (geometry, left_out) in others.items():
-            make = partial(fits.scored, geometry, train, truth.test, **left_out)
-            row = fits.row(f"{truth.name} {truth.few} {name}", make, left_out)
+        for name, (geometry, given) in others.items():
+            make = partial(fits.scored, geometry, train, truth.test, **given)
+            row = fits.row(f"{truth.name} {truth.few} {name}", make, given)
             yield about | {"part": "ablation", "model": name, **row}
         make = partial(fits.scored, place.reconstruction, truth.data.subset([]), truth.test)
         row = fits.row(f"{truth.name} zero", make)
@@ -82,6 +87,7 @@ def rows(options: FitOptions, fits: Fits) -> Iterator[Row]:
 def _whole(fits: Fits, place: Geometry, truth: Truth, count: int) -> Row:
     field = fits.fit(place.reconstruction, truth.train(count))
     return {
+        "effects": asdict(field.effects),
         "scores": fits.score(field, truth.test),
         "calibration": calibration(field, truth.test),
         "delays": delays(field, place.scene, truth.test),

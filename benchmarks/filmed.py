@@ -19,9 +19,9 @@ from benchmarks.report import Report, table
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.device import Progress, require
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos.config import SurfaceConfig
 from warprrf.geometry.photos.fusion import fuse_depth
 from warprrf.geometry.photos.sparse import fit_similarity
+from warprrf.geometry.scans import SurfaceConfig
 
 HELP = """\
 Reconstructs every eighth frame of a film from its colours, lays the cameras on the reference ones by a similarity, and

@@ -96,7 +96,10 @@ class Fits:
 
         row = wr.evaluate(test, predict, progress=self.job.progress)
         row = {name: value for name, value in row.items() if name not in LEFT_OUT}
-        error = 10.0 * np.log10(np.array(total) / test.path_gain.sum(axis=(1, 2), dtype=np.float64))
+        total_gain = np.maximum(
+            total, test.floor
+        )  # a part of the model alone may reach a receiver by no path
+        error = 10.0 * np.log10(total_gain / test.path_gain.sum(axis=(1, 2), dtype=np.float64))
         blocked = ~np.asarray(test.line_of_sight, bool)
         row |= {"test": len(test), "total_rms_db": rms(error)}
         return row | {"total_rms_db_blocked": rms(error[blocked]) if blocked.any() else None}

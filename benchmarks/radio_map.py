@@ -109,7 +109,7 @@ def rows(options: Options, fits: Fits) -> Iterator[Row]:
     low, high = np.floor(room.bounds[0] / options.cell), np.ceil(room.bounds[1] / options.cell)
     asked = {"bounds": options.cell * np.concatenate([low[:2], high[:2]])}
     field.radio_map(options.height, 8.0 * options.cell)  # kernels are loaded, the transmitter's part is made
-    orders = sorted({field.terms.mirror_order, min(field.terms.mirror_order, 2)})
+    orders = sorted({field.effects.mirrors, min(field.effects.mirrors, 2)})
     ours: list[tuple[Row, RadioMap]] = []
     for order in orders:
         for n in options.rows_of_rays:

@@ -12,13 +12,13 @@ import pytest
 from golden import make
 from places import ROOT
 from radio_scenes import box_mesh
-from warprrf.rf.fields.bistatic.training import FitOptions
 
 import warprrf as wr
 from warprrf import cli
 from warprrf.cli.inputs import read_positions, read_receivers
 from warprrf.cli.views import _look_at
 from warprrf.geometry.mesh_files import write_mesh
+from warprrf.rf.fields.bistatic.fit import FitOptions
 from warprrf.rf.fields.harmonic.options import FieldOptions
 from warprrf.rf.maps.radio_map import RadioMap
 from warprrf.rf.spectra.spectrum import pixel_directions
@@ -124,6 +124,8 @@ BAD = {
     "horn that looks through its own foot": (f"{HORN} receive-pattern=10", "zenith of -1.91986"),
     "pattern of three numbers": (f"{HORN} --receive-pattern 10,-25,3", "'10,-25,3'"),
     "option of no model": (f"{FIT} {{spectra}} --option colour=red", "colour"),
+    "effects by a wrong name": (f'{FIT} {{spectra}} --effects {{{{"mirror":2}}}}', "got mirror, expected among line_of_sight"),
+    "effects of Sionna": (f"{SIMULATE} 7,4,1.5 --engine sionna --effects room", "--effects: got 'room'"),
     "pointings without a direction": (f"{SUGGEST} --frequency 3e11 --receive-pattern 10", "azimuth"),
     "camera looks straight up": (f"{RENDER} {{tmp}}/one.ply --position 0 0 1 --look-at 0 0 2", "--look-at"),
     "field without receiver": (f"{RENDER} {{tmp}}/bad.safetensors", "--receiver"),
@@ -222,7 +224,8 @@ def test_each_file_of_measurements_has_its_own_settings(tmp_path, monkeypatch, c
     run(
         "fit {scene} {spectra} s.npz horn.csv receive-pattern=10,-25 azimuth=unknown name=corner position-std=0.03 "
         "power.csv samples=1 noise-floor-db=-140 taps.csv window=hann receive-pattern=gains.csv transmit-pattern=20 "
-        "bandwidth=2e9 -o f.safetensors --frequency 300e9 --noise-floor-db -120 --option mirror_order=2 --option lobes=[0,12]",
+        "bandwidth=2e9 -o f.safetensors --frequency 300e9 --noise-floor-db -120 --option lobes=[0,12] "
+        '--effects {{"mirrors":2,"residual":false}}',
         tmp_path,
     )  # fmt: skip
     said = capsys.readouterr().out
@@ -238,7 +241,11 @@ def test_each_file_of_measurements_has_its_own_settings(tmp_path, monkeypatch, c
     np.testing.assert_allclose(taps.transmit_pattern(angle), wr.horn(np.radians(20))(angle))
     whole = wr.SpectrumDataset.load(SPECTRA)  # whose receivers for training alone are taken
     assert (seen[(whole.role == "train").sum()].role == "train").all()
-    assert seen[1].shape == (4, 8) and (seen["mirror_order"], seen["lobes"]) == (2, (0, 12))
+    assert seen[1].shape == (4, 8) and seen["lobes"] == (0, 12)
+    assert seen["effects"] == wr.Effects(mirrors=2, residual=False)
+    for words in ("--effects room", '--option effects="room"'):
+        run(f"fit {{scene}} {{spectra}} s.npz -o f.safetensors {words}", tmp_path)
+        assert seen["effects"] == "room"
 
 
 def test_materials_that_are_given_are_those_of_a_mesh_whatever_lies_beside_it(tmp_path, monkeypatch, capsys):

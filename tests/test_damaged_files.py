@@ -24,7 +24,8 @@ def spoilt(path: Path, out: Path, changes: dict[str, object]) -> Path:
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"terms": {"lobes": [10**9, 4, 12]}}, "lobes"),
+        ({"lobes": [10**9, 4, 12]}, "lobes"),
+        ({"effects": {"mirrors": 9}}, "mirrors"),
         ({"range_db": [None, 0.0]}, "range_db"),
         ({"floor": 0.0}, "floor"),
         ({"air_temperature_k": -1.0}, "temperature_k"),

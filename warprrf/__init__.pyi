@@ -61,7 +61,7 @@ from warprrf.rf.spectra.readings import Readings as Readings
 from warprrf.rf.fields.base import RadioField as RadioField
 
 # which paths a field or a simulation models
-from warprrf.rf.fields.bistatic.materials import Effects as Effects
+from warprrf.rf.tracing.model import Effects as Effects
 
 # propagation paths, and the channels, taps and spreads that follow
 from warprrf.rf.paths.path_set import Paths as Paths

@@ -8,7 +8,6 @@ from sionna_room import sionna_or_skip
 import warprrf as wr
 from benchmarks.radio_map import errors, solver
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Terms
 
 
 def test_errors_of_a_map_that_is_two_decibels_too_strong_where_blocked():
@@ -29,7 +28,7 @@ def test_both_maps_of_the_lobby_agree_where_the_transmitter_is_seen():
     sionna_or_skip()
     scene = wr.Scene.load(LOBBY / "scene.xml")
     ds = wr.SpectrumDataset.load(LOBBY / "spectra_sionna.nc")
-    field = BistaticField.prior(scene, ds, terms=Terms(mirror_order=1))
+    field = BistaticField.prior(scene, ds)
     ours = field.radio_map(1.5, 1.5, bounds=[0.0, 0.0, 15.0, 12.0], shape=(10, 20))
     gain = solver(scene, ours, field.frequency_hz)
     few, many, reference = (gain(samples, k) for k, samples in enumerate((1_000, 100_000, 400_000)))

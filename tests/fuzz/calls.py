@@ -156,6 +156,7 @@ BAND = wr.em.Band(1e9, 1e12, 5.0, 0.0, 0.01, 0.9)
 CLASSES: dict[str, Callable[[Place], Any]] = {
     "Material": lambda p: p.scene.materials[0],
     "Air": lambda p: wr.Air(),
+    "Effects": lambda p: wr.Effects(),
     "Spectrum": lambda p: p.spectra[0],
     "SpectrumDataset": lambda p: p.spectra.subset([0, 1, 2]),
     **{f"{kind}Field": lambda p: p.field for kind in ("Radio", "Bistatic")},
@@ -262,8 +263,8 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "BistaticField.array_spectrum": lambda p: {"receivers": POINTS[0], "transmitter": p.transmitter + 0.1},
     "BistaticField.at_frequency": lambda p: {"frequency_hz": 140e9},
     "RadioField.fit": lambda p: {
-        "mirror_order": 1, "lobes": (0, 4), "diffuse": True, "indirect": False, "residual": False, "sub_pixels": 1,
-        "device": "cpu", "relevance": p.relevance,
+        "effects": wr.Effects(mirrors=1, residual=False), "lobes": (0, 4), "sub_pixels": 1, "device": "cpu",
+        "relevance": p.relevance,
     },
     "BistaticField.view": lambda p: {"receivers": POINTS[0]},
     "HarmonicField.load": lambda p: {"path": p.folder / "harmonic.safetensors"},

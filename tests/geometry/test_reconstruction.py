@@ -16,11 +16,12 @@ from warprrf import tensor_files
 from warprrf.geometry import pipeline as from_photos
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.cells import plane_mesh, seen_cells, visible_from
-from warprrf.geometry.photos.config import PlaneConfig, ReconstructionConfig, RefineConfig, SurfaceConfig
-from warprrf.geometry.photos.planes import plane_axes
+from warprrf.geometry.photos.config import ReconstructionConfig, RefineConfig
 from warprrf.geometry.pipeline import reconstruct
 from warprrf.geometry.planar_patches import planar_patches
+from warprrf.geometry.planes import PlaneConfig, plane_axes
 from warprrf.geometry.reconstruction import Reconstruction, of_patches, to_patches
+from warprrf.geometry.scans import SurfaceConfig
 from warprrf.geometry.splats.gaussians import discs_on_mesh
 
 pytest.importorskip("open3d")

@@ -15,8 +15,8 @@ from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussian_rays import GaussianRays
 from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
 from warprrf.kernels.radio import records
-from warprrf.rf.fields.bistatic.materials import Parameters
-from warprrf.rf.fields.bistatic.records import Evaluation, Records
+from warprrf.rf.tracing.model import Parameters
+from warprrf.rf.tracing.records import Evaluation, Records
 
 CHANNELS = 5  # take two launches
 RAYS, PLACES = 40, 3

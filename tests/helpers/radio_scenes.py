@@ -10,10 +10,10 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.bistatic.gauss_newton import Problem
 from warprrf.rf.fields.bistatic.observations import Observation, Place, Target
-from warprrf.rf.fields.bistatic.tracer import MIRROR_SLACK_M
 from warprrf.rf.paths.images import MirrorImages
 from warprrf.rf.paths.mirror_paths import zone_paths
 from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.tracing.tracer import MIRROR_SLACK_M
 
 EPSILON_0 = 8.8541878128e-12
 

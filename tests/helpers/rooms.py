@@ -23,7 +23,7 @@ import warprrf as wr
 from warprrf.geometry.splats.gaussians import discs_on_mesh
 from warprrf.rf import exact
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Effects
+from warprrf.rf.tracing.model import Effects
 
 SHAPE = (18, 36)
 EVERY_EFFECT = Effects(mirrors=2, residual=False)

@@ -7,8 +7,8 @@ from furnished import RECEIVERS, TX, furnished
 from radio_scenes import RadioScene, SlabMaterial
 
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import SETS, Parameters
-from warprrf.rf.fields.bistatic.surface import Surface
+from warprrf.rf.tracing.model import SETS, Parameters
+from warprrf.rf.tracing.surface import Surface
 
 F, SHAPE, SIGMA = 300e9, (30, 60), np.radians(5.0)
 SEES, BLOCKED = RECEIVERS[0], np.array([3.6, 3.3, 0.9])

@@ -6,8 +6,7 @@ import numpy as np
 from places import LOBBY
 
 from warprrf.geometry.photos.cells import occupancy
-from warprrf.geometry.photos.config import PlaneConfig
-from warprrf.geometry.photos.planes import Plane
+from warprrf.geometry.planes import Plane, PlaneConfig
 from warprrf.geometry.splats.camera import Camera
 
 

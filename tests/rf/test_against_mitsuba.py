@@ -23,10 +23,10 @@ from sionna_room import sionna_or_skip
 import warprrf as wr
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Effects, Parameters
 from warprrf.rf.fields.bistatic.observations import Frame
-from warprrf.rf.fields.bistatic.render import PathGains
 from warprrf.rf.spectra.beam import beam_operator
+from warprrf.rf.tracing.model import Effects, Parameters
+from warprrf.rf.tracing.render import PathGains
 
 BEAM_RAD = np.radians(2.0)
 

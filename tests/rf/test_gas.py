@@ -19,17 +19,17 @@ from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.fit import trace
-from warprrf.rf.fields.bistatic.materials import SETS, Effects, Parameters
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
-from warprrf.rf.fields.bistatic.records import Evaluation
-from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.tracer import View
 from warprrf.rf.relevance.model import full_field
 from warprrf.rf.simulate import simulate
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.spectrum import to_db
+from warprrf.rf.tracing.model import SETS, Effects, Parameters
+from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.surface import Surface
+from warprrf.rf.tracing.tracer import View
 
 F = 380.2e9
 WAVELENGTH = SPEED_OF_LIGHT / F

@@ -10,9 +10,9 @@ from radio_scenes import box_mesh, joined
 import warprrf as wr
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.materials import Material
-from warprrf.rf.fields.bistatic.surface import ELEMENT_M, ELEMENTS, Surface
 from warprrf.rf.positions import check_positions, ground_height, is_open_air, under_a_roof
 from warprrf.rf.scene import Scene
+from warprrf.rf.tracing.surface import ELEMENT_M, ELEMENTS, Surface
 
 F = 3.5e9
 WAVELENGTH = 299_792_458.0 / F

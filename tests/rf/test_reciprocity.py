@@ -14,8 +14,8 @@ from warprrf.rf.em.materials import NARROWEST_LOBE
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
-from warprrf.rf.fields.bistatic.materials import Parameters
-from warprrf.rf.fields.bistatic.records import Evaluation, Records
+from warprrf.rf.tracing.model import Parameters
+from warprrf.rf.tracing.records import Evaluation, Records
 
 WAVELENGTH = SPEED_OF_LIGHT / F
 RX = RECEIVERS[0]

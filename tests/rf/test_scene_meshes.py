@@ -73,7 +73,7 @@ def painted_room(folder: Path, named: bool) -> Path:
 
 @pytest.mark.parametrize("named", [True, False])
 def test_a_field_is_fitted_to_what_a_mesh_file_tells_apart(named: bool, tmp_path: Path) -> None:
-    from warprrf.rf.fields.bistatic.surface import Surface
+    from warprrf.rf.tracing.surface import Surface
 
     path = painted_room(tmp_path, named)
     up = "z"

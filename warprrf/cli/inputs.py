@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import csv
+import json
 import os
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -18,6 +20,7 @@ from warprrf.checks import check_array
 from warprrf.files import read_json
 from warprrf.geometry.mesh_files import METRES, READERS, is_mesh_file
 from warprrf.geometry.ply_files import ply_columns
+from warprrf.rf.tracing.model import SETS
 from warprrf.tensor_files import named
 
 Add = Callable[..., argparse.ArgumentParser]
@@ -232,6 +235,35 @@ def read_pattern(text: str) -> Any:
     if len(level) > 1:
         raise ValueError(f"pattern: got {text!r}, expected WIDTH or WIDTH,LEVEL in degrees and dB")
     return wr.horn(np.radians(width), *level)
+
+
+def add_effects(parser: argparse.ArgumentParser, text: str) -> None:
+    """Define the option that says which paths are modelled."""
+    parser.add_argument(
+        "--effects", metavar="NAME",
+        help=f"{text}: {', '.join(SETS)}; or fields of wr.Effects in JSON, such as {{\"mirrors\": 2, \"residual\": false}}: "
+        "all others are on",
+    )  # fmt: skip
+
+
+def read_effects(value: object) -> Any:
+    """Effects by a mapping of fields, or the name of a set as it is."""
+    if not isinstance(value, dict):
+        return value
+    known = [f.name for f in fields(wr.Effects)]
+    unknown = sorted(set(value) - set(known))
+    if unknown:
+        raise ValueError(f"--effects: got {', '.join(unknown)}, expected among {', '.join(known)}")
+    return wr.Effects(**value)
+
+
+def read_json_or_text(text: str) -> Any:
+    """What is written in JSON, or else the text; lists as tuples."""
+    try:
+        found = json.loads(text)
+    except ValueError:
+        found = text
+    return tuple(found) if isinstance(found, list) else found
 
 
 def read_scale(words: Sequence[str]) -> float | tuple[str, str, float]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import shutil
 import warnings
 from collections.abc import Iterable
@@ -16,6 +15,7 @@ import warprrf as wr
 from warprrf.checks import check_count
 from warprrf.cli.inputs import (
     Add,
+    add_effects,
     add_frequency,
     add_measured_options,
     add_mesh_options,
@@ -28,6 +28,8 @@ from warprrf.cli.inputs import (
     load_geometry,
     load_scene,
     load_spectra,
+    read_effects,
+    read_json_or_text,
     read_measured,
     read_pattern,
     read_pointings,
@@ -40,6 +42,7 @@ from warprrf.cli.output import Output
 from warprrf.cli.tables import table
 from warprrf.files import write_json, write_text
 from warprrf.geometry.photos.config import LENSES, ReconstructionConfig
+from warprrf.rf.tracing.model import SETS
 
 
 def add_reconstruct(add: Add) -> None:
@@ -182,9 +185,8 @@ def add_simulate(add: Add) -> None:
         "--shape", nargs=2, type=int, default=(90, 180), metavar=("H", "W"), help="pixels (90 180)"
     )
     sim.add_argument("--engine", choices=("exact", "sionna"), default="exact", help="default exact")
-    sim.add_argument(
-        "--depth", type=int, default=3, help="most interactions (sionna; exact has one; default 3)"
-    )
+    add_effects(sim, "what exact models, by default single bounces, without noise")
+    sim.add_argument("--depth", type=int, default=3, help="most interactions (sionna; default 3)")
     sim.add_argument(
         "--samples", type=int, default=1_000_000, help="rays per transmitter (sionna; default 1e6)"
     )
@@ -196,7 +198,8 @@ def add_simulate(add: Add) -> None:
 def _simulate(args: argparse.Namespace, out: Output) -> None:
     """Radio spectra of a scene at given receivers.
 
-    `exact` evaluates line of sight, mirror reflections and one diffuse bounce without sampling noise, on Warp's mesh rays.
+    `exact` evaluates line of sight, mirror reflections and scattering on Warp's mesh rays: single bounces without sampling
+    noise; with --effects also what comes over more surfaces, sampled.
     `sionna` asks Sionna RT's PathSolver (extra: sionna) for line of sight, mirror and diffuse paths up to --depth.
     A killed run continues: finished receivers wait in OUT.receivers/. An eighth of the receivers is marked for test.
     A spectrum is path gain per pixel over the full sphere, spread by the receiver beam; its sum is the total path gain.
@@ -205,7 +208,14 @@ def _simulate(args: argparse.Namespace, out: Output) -> None:
       warprrf simulate data/lobby/scene.xml -o one.nc --transmitter 2 3 3.2 --receivers 7,4,1.5 9,5,1.5
       warprrf simulate room.glb -o one.nc --transmitter 2 3 3.2 --receivers 7,4,1.5 --materials materials.json
       warprrf simulate data/lobby/scene.xml -o many.nc --transmitter 2 3 3.2 --receivers receivers.csv --engine sionna
+      warprrf simulate data/lobby/scene.xml -o all.nc --transmitter 2 3 3.2 --receivers 7,4,1.5 --effects everything
     """
+    how: dict[str, Any] = {}
+    if args.effects is not None:
+        if args.engine != "exact":
+            refuse(args, ["effects"], f"engine {args.engine} has its own: --depth, --refraction")
+        effects = read_effects(read_json_or_text(args.effects))
+        how["effects"] = SETS.get(effects, effects)
     unfinished = Path(f"{args.out}.receivers")
     out.resumes(unfinished)
     dataset = wr.simulate(
@@ -224,6 +234,7 @@ def _simulate(args: argparse.Namespace, out: Output) -> None:
         workspace=unfinished,
         progress=out,
         device=args.device,
+        **how,
     )
     dataset.save(args.out)
     shutil.rmtree(unfinished)  # the finished receivers of a killed run are not needed any more
@@ -258,13 +269,14 @@ def add_fit(add: Add) -> None:
     add_mesh_options(fit)
     add_scene_options(fit)
     fit.add_argument(
-        "--relevance", metavar="FILE", help="what `warprrf relevance -o` wrote: terms ruled out are off"
+        "--relevance", metavar="FILE", help="what `warprrf relevance -o` wrote: effects ruled out are off"
     )
+    add_effects(fit, "bistatic: what is modelled, auto (default, what receivers held out say)")
     fit.add_argument("--iterations", type=int, help="optimiser steps (default: the model's)")
     fit.add_argument(
         "--quick",
         action="store_true",
-        help="bistatic: no term is tried, one ray a pixel; two or three dB less, in seconds",
+        help="bistatic: one ray a pixel, nothing held out to decide by; two or three dB less, in seconds",
     )
     fit.add_argument(
         "--reciprocal",
@@ -294,12 +306,13 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
       warprrf fit room.glb spectra.nc -o field.safetensors
       warprrf fit scan.stl spectra.nc -o field.safetensors --unit mm --simplify 200000
       warprrf fit splats.ply spectra.nc --mesh mesh.ply -o field.safetensors --model rf3dgs --train 50
+      warprrf fit room spectra.nc -o field.safetensors --effects room
+      warprrf fit room spectra.nc -o field.safetensors --effects '{"scatterings":1,"mirrors":1}'
       warprrf fit room.glb horn.csv -o field.safetensors --frequency 300e9 --noise-floor-db -120 --receive-pattern 10
       warprrf fit room horn.csv receive-pattern=10 power.csv samples=1 -o f.safetensors --frequency 300e9 --noise-floor-db -120
 
-    options of a model, as of RadioField.fit in Python (--option mirror_order=2 --option lobes=[0,12]):
-      bistatic       line_of_sight, diffuse, mirror_order, lobes, reciprocal, mirror_scatter, scatter_mirror, diffuse_order,
-                     indirect, residual, sub_pixels, quick, gain_offset, iterations
+    options of a model, as of RadioField.fit in Python (--option lobes=[0,12] --option sub_pixels=2):
+      bistatic       effects, lobes, reciprocal, sub_pixels, quick, gain_offset, iterations
       rf3dgs(+)      transmittance, interaction_point, gain, sh_degree, top_k, line_of_sight, iterations, batch,
                      train_opacity, checkpoint
     """
@@ -309,11 +322,15 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
     if args.relevance is not None:
         options["relevance"] = wr.Relevance.load(existing(args.relevance))
     options |= {name: True for name in ("quick", "reciprocal") if getattr(args, name)}
-    for option in ("relevance", "quick", "reciprocal"):
+    if args.effects is not None:
+        options["effects"] = read_json_or_text(args.effects)
+    for option in ("relevance", "quick", "reciprocal", "effects"):
         if option in options and args.model != "bistatic":
             raise ValueError(f"--{option}: only the bistatic model takes it, got --model {args.model}")
     if args.iterations is not None:
         options["iterations"] = args.iterations
+    if "effects" in options:
+        options["effects"] = read_effects(options["effects"])
     field = wr.RadioField.fit(
         geometry,
         data[0] if len(data) == 1 else data,
@@ -344,13 +361,9 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
 
 
 def _option(text: str) -> tuple[str, Any]:
-    """Name and value of an option; a value is JSON, or else text."""
+    """Name and value of an option."""
     name, _, value = text.partition("=")
-    try:
-        found = json.loads(value)
-    except ValueError:
-        found = value
-    return name, tuple(found) if isinstance(found, list) else found
+    return name, read_json_or_text(value)
 
 
 def add_suggest(add: Add) -> None:

@@ -33,11 +33,6 @@ from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
 from warprrf.kernels.radio.records import SCATTER
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.fields.bistatic.materials import Effects
-from warprrf.rf.fields.bistatic.rays import Hits, RayGrid
-from warprrf.rf.fields.bistatic.records import Records, SlabEvaluation
-from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.tracer import Rays, Tracer
 from warprrf.rf.paths.mirror_paths import unobstructed
 from warprrf.rf.paths.trace import MirrorTracer
 from warprrf.rf.scene import Scene
@@ -49,6 +44,11 @@ from warprrf.rf.spectra.spectrum import (
     spread_paths,
     sub_pixel_directions,
 )
+from warprrf.rf.tracing.model import Effects
+from warprrf.rf.tracing.rays import Hits, RayGrid
+from warprrf.rf.tracing.records import Records, SlabEvaluation
+from warprrf.rf.tracing.surface import Surface
+from warprrf.rf.tracing.tracer import Rays, Tracer
 
 SUB_PIXELS = 8
 """Default square root of the directions per pixel.

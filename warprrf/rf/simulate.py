@@ -21,7 +21,6 @@ from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.fresnel import surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.exact import REVISION, SINGLE, SUB_PIXELS, ExactEngine, ReceivedPaths
-from warprrf.rf.fields.bistatic.materials import Effects
 from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
 from warprrf.rf.positions import (
     check_positions,
@@ -33,6 +32,7 @@ from warprrf.rf.positions import (
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, DEFAULT_SHAPE, check_beam, check_shape
+from warprrf.rf.tracing.model import Effects
 from warprrf.steps import Steps, digest
 
 ENGINES = ("exact", "sionna")
@@ -133,7 +133,7 @@ def simulate(
     tell = progress or (lambda *_: None)
     tell("simulate", len(results), len(points))
     missing = [k for k in range(len(points)) if k not in results]
-    receiver = _Receiver(engine, scene, common, effects if engine == "exact" else sampling, seed, air, device)
+    receiver = _Receiver(scene, common, effects if engine == "exact" else sampling, seed, air, device)
     for at, found in each(receiver, [points[k] for k in missing], client):
         k = missing[at]
         results[k] = found if workspace is None else _kept(workspace, inputs, points[k], found)
@@ -234,7 +234,6 @@ def _versions(engine: str, solver_only: bool = False) -> dict[str, str]:
 class _Receiver:
     """What a receiver (3,) gets; a pickle holds how the engine is built."""
 
-    engine: str
     scene: Scene
     common: dict[str, Any]
     how: Effects | Sampling
@@ -244,18 +243,14 @@ class _Receiver:
     _running: Cache = field(default_factory=lambda: Cache(1))
 
     def __call__(self, point: np.ndarray) -> ReceivedPaths:
-        if isinstance(self.how, Effects):
-            return self._running.get("engine", self._exact).receive(point)
+        how, common = self.how, {**self.common, "gas": self.air, "device": self.device}
+        if isinstance(how, Effects):
+            ours = partial(ExactEngine, self.scene, **common, effects=how, seed=self.seed)
+            return self._running.get("engine", ours).receive(point)
         with making:  # Sionna RT's scene holds the receiver: one thread at a time
-            return self._running.get("engine", self._sionna).receive(point)
-
-    def _exact(self) -> ExactEngine:
-        return ExactEngine(
-            self.scene, **self.common, effects=self.how, seed=self.seed, gas=self.air, device=self.device
-        )  # type: ignore[arg-type]
-
-    def _sionna(self) -> SionnaEngine:
-        return SionnaEngine(self.scene, **self.common, sampling=self.how, gas=self.air, device=self.device)
+            return self._running.get(
+                "engine", partial(SionnaEngine, self.scene, **common, sampling=how)
+            ).receive(point)
 
 
 def _kept(

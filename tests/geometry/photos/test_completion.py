@@ -10,7 +10,8 @@ from trimesh.remesh import subdivide_to_size
 from views import look
 
 import warprrf as wr
-from warprrf.geometry.photos.config import ReconstructionConfig, SurfaceConfig
+from warprrf.geometry.photos.config import ReconstructionConfig
+from warprrf.geometry.scans import SurfaceConfig
 from warprrf.geometry.splats.gaussians import discs_on_mesh
 
 pytest.importorskip("open3d")

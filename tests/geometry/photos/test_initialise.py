@@ -10,8 +10,8 @@ from warprrf.geometry.photos import sweep
 from warprrf.geometry.photos.cells import meeting
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.initialise import initialise
-from warprrf.geometry.photos.planes import Plane, aligned
 from warprrf.geometry.photos.sparse import SparseModel
+from warprrf.geometry.planes import Plane, aligned
 
 pytest.importorskip("open3d")
 look, flat = partial(views.look, width=240, height=180, f=170.0), views.flat

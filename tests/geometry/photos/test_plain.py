@@ -7,7 +7,7 @@ from helpers.views import look
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.plain import plain_surfaces, with_plain
-from warprrf.geometry.photos.planes import Plane
+from warprrf.geometry.planes import Plane
 
 SIZE = np.array([6.0, 5.0, 3.0])  # of the room [m]
 PILLAR = np.array([[3.4, 2.2, 0.0], [4.0, 2.8, 3.0]])

@@ -12,9 +12,10 @@ from views import lobby_cameras
 
 import warprrf as wr
 from warprrf.geometry.photos import sfm
-from warprrf.geometry.photos.config import ReconstructionConfig, RefineConfig, SurfaceConfig
+from warprrf.geometry.photos.config import ReconstructionConfig, RefineConfig
 from warprrf.geometry.photos.photo_files import find_photos
 from warprrf.geometry.photos.poses import KnownPoses, find_depth, match_photos, read_depth, read_poses
+from warprrf.geometry.scans import SurfaceConfig
 
 image = pytest.importorskip("PIL.Image")
 pycolmap = pytest.importorskip("pycolmap")

@@ -10,12 +10,12 @@ from views import look
 
 from warprrf.geometry.photos.config import RefineConfig
 from warprrf.geometry.photos.densify import filled
-from warprrf.geometry.photos.photo_loss import PhotoLoss
-from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.photos.refine import refine
 from warprrf.geometry.photos.targets import Exposures, PosedPhotos, Targets
+from warprrf.geometry.planes import Plane
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.photo_loss import PhotoLoss
 from warprrf.geometry.splats.render import render
 
 

@@ -7,8 +7,8 @@ from trimesh.remesh import subdivide_to_size
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.cells import occupancy
-from warprrf.geometry.photos.planes import Plane, detect_planes, plane_axes
-from warprrf.geometry.photos.snapping import find_patches
+from warprrf.geometry.planes import Plane, detect_planes, plane_axes
+from warprrf.geometry.scans import find_patches
 
 
 def grid_on(plane_normal, offset, size=1.0, step=0.05):

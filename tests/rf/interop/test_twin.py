@@ -13,9 +13,9 @@ import warprrf as wr
 from warprrf import cli
 from warprrf.rf.em.fresnel import lobe, slab_reflection
 from warprrf.rf.exact import ExactEngine
-from warprrf.rf.fields.bistatic.materials import Effects
 from warprrf.rf.interop import twin as twins
 from warprrf.rf.spectra.spectrum import to_db
+from warprrf.rf.tracing.model import Effects
 
 
 @pytest.fixture(scope="module")

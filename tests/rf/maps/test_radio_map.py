@@ -13,11 +13,11 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Effects
-from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.maps.links import BeamSearch, directivity, links_of
 from warprrf.rf.maps.radio_map import QUANTITIES, RadioMap, is_free
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_solid_angles
+from warprrf.rf.tracing.model import Effects
+from warprrf.rf.tracing.surface import Surface
 
 WAVELENGTH = SPEED_OF_LIGHT / F
 EVERYTHING = Effects(mirrors=2, scatterings=2, residual=False)

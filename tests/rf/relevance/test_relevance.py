@@ -12,10 +12,10 @@ from warprrf.rf.em.absorption import gas_attenuation_db_per_m
 from warprrf.rf.em.materials import Material, roughness_scattering
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import SETS, Effects
 from warprrf.rf.relevance.model import full_field, material_parameters, with_lobes
 from warprrf.rf.relevance.search import Relevance, relevance, relevances
 from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.tracing.model import SETS, Effects
 
 RECEIVERS = RECEIVERS[:4]
 NOTHING = SlabMaterial("nothing", 1.0, 0.0, np.inf)  # reflects nothing: as good as empty space

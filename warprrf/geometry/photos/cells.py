@@ -10,8 +10,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos.config import PlaneConfig
-from warprrf.geometry.photos.planes import Plane, dilate
+from warprrf.geometry.planes import Plane, PlaneConfig, dilate
 from warprrf.geometry.splats.camera import Camera
 
 BEHIND_M = 0.1  # a line of sight empties a cell when its target is more than this behind the plane

@@ -7,42 +7,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import numpy as np
-
-from warprrf.checks import check_count, check_positive, check_seed
+from warprrf.checks import check_count, check_seed
+from warprrf.geometry.planes import PlaneConfig
+from warprrf.geometry.scans import SurfaceConfig
 from warprrf.kernels.raster.sh import COEFFICIENTS
 
 LENSES = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 """COLMAP's lens models that photos can be taken through; "auto": the simplest that explains them."""
-
-
-@dataclass(frozen=True)
-class PlaneConfig:
-    """How planes are found among points, and how large their cells are.
-
-    Attributes:
-        distance_m: a point this close is on the plane; three times the noise of sparse points in a room.
-        angle_deg: and its normal differs by no more than this: normals of sparse points are good to 10 degrees or so.
-        min_points: fewest points of a plane (or the least weight, where points are weighted).
-        max_planes: stop after so many.
-        cell_m: side of a plane's cells.
-        margin_m: cells reach so far beyond the hull of a plane's points.
-    """
-
-    distance_m: float = 0.015
-    angle_deg: float = 30.0
-    min_points: float = 40
-    max_planes: int = 80
-    cell_m: float = 0.1
-    margin_m: float = 0.12
-
-    def __post_init__(self) -> None:
-        check_positive("distance_m", self.distance_m, "length in metres")
-
-    @property
-    def cosine(self) -> float:
-        """Of ``angle_deg``."""
-        return float(np.cos(np.radians(self.angle_deg)))
 
 
 @dataclass(frozen=True)
@@ -98,30 +69,6 @@ class RefineConfig:
         check_seed(self.seed)
         if self.sh_degree not in COEFFICIENTS:
             raise ValueError(f"sh_degree: got {self.sh_degree!r}, expected 0, 1, 2 or 3")
-
-
-@dataclass(frozen=True)
-class SurfaceConfig:
-    """How Gaussians become a mesh with planar patches.
-
-    Attributes:
-        downscale: depth maps are rendered at the photos' size divided by this.
-        voxel_m: largest side of a voxel of the fusion.
-        truncation_voxels: the distance field is truncated at so many voxels.
-        max_range_m: depths beyond this are left out.
-        min_component_faces: connected pieces with fewer faces are dropped as floating debris.
-        patch_distance_m: a face this close to a plane can belong to its patch: a depth map's error.
-    """
-
-    downscale: int = 2
-    voxel_m: float = 0.05
-    truncation_voxels: float = 4.0
-    max_range_m: float = 12.0
-    min_component_faces: int = 200
-    patch_distance_m: float = 0.06
-
-    def __post_init__(self) -> None:
-        check_positive("voxel_m", self.voxel_m, "length in metres")
 
 
 @dataclass(frozen=True)

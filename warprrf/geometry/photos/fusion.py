@@ -17,14 +17,21 @@ from warprrf.checks import check_array
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.completion import complete
-from warprrf.geometry.photos.config import ReconstructionConfig, SurfaceConfig
+from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.photo_files import spread
-from warprrf.geometry.photos.planes import Plane
-from warprrf.geometry.photos.snapping import MIN_PATCH_M2, find_patches, flattened, largest_first, simplified
 from warprrf.geometry.photos.stereo import mended
 from warprrf.geometry.photos.targets import PosedPhotos
 from warprrf.geometry.planar_patches import PlanarPatches
+from warprrf.geometry.planes import Plane
 from warprrf.geometry.rays import open3d
+from warprrf.geometry.scans import (
+    MIN_PATCH_M2,
+    SurfaceConfig,
+    find_patches,
+    flattened,
+    largest_first,
+    simplified,
+)
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.render import render

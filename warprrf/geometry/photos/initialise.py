@@ -21,10 +21,10 @@ from warprrf.geometry.photos.cells import meeting, occupancy, plane_mesh, seen_c
 from warprrf.geometry.photos.completion.room_planes import directions
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.plain import plain_surfaces, with_plain
-from warprrf.geometry.photos.planes import Plane, aligned, plane_axes
 from warprrf.geometry.photos.points import clean_points, detect_room_planes, estimate_normals
 from warprrf.geometry.photos.sparse import SparseModel
 from warprrf.geometry.photos.sweep import GreyPhotos, choose_views, joined, level_planes, proven_cells
+from warprrf.geometry.planes import Plane, aligned, plane_axes
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians, quaternions_of
 

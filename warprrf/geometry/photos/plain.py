@@ -30,7 +30,7 @@ from warprrf.geometry.photos.edges import (
     find_lines,
     lines_through,
 )
-from warprrf.geometry.photos.planes import Plane, dilate
+from warprrf.geometry.planes import Plane, dilate
 from warprrf.geometry.splats.camera import Camera
 
 SURE_VIEWS, LINE_M = 4, 0.4  # photos and length from which on an edge counts

@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from warprrf.checks import check_array
-from warprrf.geometry.photos.config import PlaneConfig
-from warprrf.geometry.photos.planes import Plane, detect_planes
+from warprrf.geometry.planes import Plane, PlaneConfig, detect_planes
 
 MAX_REPROJECTION_ERROR = 1.0  # of a sparse point that is kept [pixels]
 SMALL_POINTS = 16  # fewest points of a small plane, looked for among those that the large ones leave

@@ -28,10 +28,10 @@ from warprrf.geometry.photos.densify import (
     filled,
     opacity_and_scales,
 )
-from warprrf.geometry.photos.photo_loss import PhotoLoss
-from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.photos.targets import Exposures, PosedPhotos, Target, Targets
+from warprrf.geometry.planes import Plane
 from warprrf.geometry.splats.gaussians import Gaussians, quaternions_of, rotations_of
+from warprrf.geometry.splats.photo_loss import PhotoLoss
 from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
 from warprrf.kernels import adam as optimize
 from warprrf.kernels.raster.sh import COEFFICIENTS

@@ -15,8 +15,8 @@ import warp as wp
 
 from warprrf.checks import check_array
 from warprrf.device import launch
-from warprrf.geometry.photos.photo_loss import PhotoLoss
 from warprrf.geometry.splats.camera import Camera
+from warprrf.geometry.splats.photo_loss import PhotoLoss
 from warprrf.kernels import exposure as kernels
 from warprrf.kernels.ssim import stride_of
 

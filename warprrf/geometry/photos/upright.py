@@ -16,11 +16,10 @@ from scipy import ndimage
 
 from warprrf.device import require
 from warprrf.geometry.mesh_files import UP
-from warprrf.geometry.photos.config import PlaneConfig
 from warprrf.geometry.photos.photo_files import spread
-from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.photos.points import clean_points, detect_room_planes, estimate_normals
 from warprrf.geometry.photos.sparse import SparseModel, transformed
+from warprrf.geometry.planes import Plane, PlaneConfig
 from warprrf.geometry.splats.camera import Camera
 
 PHOTOS = 40  # looked at for edges, spread over all

@@ -19,14 +19,14 @@ from warprrf.rf.em.absorption import gas_attenuation_db_per_m
 from warprrf.rf.em.fresnel import fresnel_curves, lobe, slab_reflection, surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Effects, Parameters
 from warprrf.rf.fields.bistatic.observations import Frame
-from warprrf.rf.fields.bistatic.render import images
-from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.tracer import View
 from warprrf.rf.paths.blockage import LIFT_M, SidePaths, diffracted, transmitted
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.spectrum import default_floor, pixel_solid_angles, spread, to_db
+from warprrf.rf.tracing.model import Effects, Parameters
+from warprrf.rf.tracing.render import images
+from warprrf.rf.tracing.surface import Surface
+from warprrf.rf.tracing.tracer import View
 
 ASSUMED_PERMITTIVITY = 4.0 * (1.0 - 0.06j)
 """Of walls whose material is not known; loss as of plasterboard and wood at 300 GHz in ITU-R P.2040-4, table 3."""

@@ -25,10 +25,10 @@ from warprrf.geometry.mesh import as_mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Effects
 from warprrf.rf.positions import check_positions, check_receivers, question_unit
 from warprrf.rf.relevance.model import FullModel, effects_of, full_field, lobe_name, with_lobes
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape
+from warprrf.rf.tracing.model import Effects
 
 SAME_BAND = 0.05  # relative difference of carriers up to which a choice holds
 TITLES = {

@@ -12,13 +12,13 @@ from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import SETS, Effects
 from warprrf.rf.fields.bistatic.measured import ArrayImage, read
 from warprrf.rf.fields.bistatic.observations import Frame
-from warprrf.rf.fields.bistatic.tracer import SHARP
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.trace import trace_paths
 from warprrf.rf.spectra.spectrum import directions_from_angles
+from warprrf.rf.tracing.model import SETS, Effects
+from warprrf.rf.tracing.tracer import SHARP
 
 F = 28e9  # of whose zones mirrors hold the whole, so that exact paths are the truth
 RECEIVERS = RECEIVERS[:8]

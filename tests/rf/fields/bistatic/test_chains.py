@@ -9,11 +9,11 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_path
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Effects, Parameters
-from warprrf.rf.fields.bistatic.records import Evaluation, Records
-from warprrf.rf.fields.bistatic.surface import SKIN_M, Surface
 from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.paths.trace import MirrorTracer
+from warprrf.rf.tracing.model import Effects, Parameters
+from warprrf.rf.tracing.records import Evaluation, Records
+from warprrf.rf.tracing.surface import SKIN_M, Surface
 
 RX = RECEIVERS[0]
 

@@ -17,15 +17,15 @@ from warprrf.rf.fields.bistatic import fit as fitting
 from warprrf.rf.fields.bistatic import gauss_newton as newton
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.fit import trace
-from warprrf.rf.fields.bistatic.materials import SETS, Effects, Parameters
 from warprrf.rf.fields.bistatic.measured import WeighedPaths
 from warprrf.rf.fields.bistatic.observations import NEPER, Columns
-from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.lookups import nearest
 from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.spectrum import spread, sub_pixel_directions, to_db
+from warprrf.rf.tracing.model import SETS, Effects, Parameters
+from warprrf.rf.tracing.surface import Surface
 
 WAVELENGTH = SPEED_OF_LIGHT / F
 

@@ -17,14 +17,14 @@ from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.gauss_newton import Problem
-from warprrf.rf.fields.bistatic.interreflection import irradiance
-from warprrf.rf.fields.bistatic.materials import SETS, Effects, Layout
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, WeighedPaths, read
 from warprrf.rf.fields.bistatic.observations import OWN_GAIN, observe, places_of
-from warprrf.rf.fields.bistatic.records import Bins, Evaluation, Records
-from warprrf.rf.fields.bistatic.tracer import SHARP, View
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.readings import Readings, horn, path_weights
+from warprrf.rf.tracing.interreflection import irradiance
+from warprrf.rf.tracing.model import SETS, Effects, Layout
+from warprrf.rf.tracing.records import Bins, Evaluation, Records
+from warprrf.rf.tracing.tracer import SHARP, View
 
 RX = RECEIVERS[0]
 SINGLE, EVERYTHING = replace(SETS["single"], residual=False), Effects(residual=False)

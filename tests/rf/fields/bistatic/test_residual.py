@@ -12,13 +12,13 @@ from trimesh.remesh import subdivide_to_size
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.links import LinkTracer
-from warprrf.rf.fields.bistatic.materials import Effects
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
 from warprrf.rf.fields.bistatic.observations import NEPER
 from warprrf.rf.fields.bistatic.residual import Shares, fit_residual, shares_of
-from warprrf.rf.fields.bistatic.surface import CELLS, ELEMENT_M, Surface
 from warprrf.rf.maps.links import LinkOptions
 from warprrf.rf.spectra.beam import BeamOperator
+from warprrf.rf.tracing.model import Effects
+from warprrf.rf.tracing.surface import CELLS, ELEMENT_M, Surface
 
 RECEIVERS = RECEIVERS[:5]
 MEASURED = SpectrumPixels(BeamOperator(SHAPE, SIGMA))

@@ -13,15 +13,15 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.fit import trace
 from warprrf.rf.fields.bistatic.gauss_newton import Problem, gauss_newton
-from warprrf.rf.fields.bistatic.materials import SETS, Effects, Parameters
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
 from warprrf.rf.fields.bistatic.merging import Merging, merge
 from warprrf.rf.fields.bistatic.observations import columns_of
-from warprrf.rf.fields.bistatic.records import Evaluation
-from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.tracer import Tracer
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.spectrum import to_db
+from warprrf.rf.tracing.model import SETS, Effects, Parameters
+from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.surface import Surface
+from warprrf.rf.tracing.tracer import Tracer
 
 WAVELENGTH = SPEED_OF_LIGHT / F
 RECEIVERS = RECEIVERS[:6]

@@ -6,12 +6,12 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, join
 from trimesh.remesh import subdivide_to_size
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos.snapping import is_scan, scanned_patches
 from warprrf.geometry.planar_patches import planar_patches
+from warprrf.geometry.scans import is_scan, scanned_patches
 from warprrf.rf.fields.base import RadioField
-from warprrf.rf.fields.bistatic.shapes import shape_groups
-from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.spectra.metrics import evaluate
+from warprrf.rf.tracing.shapes import shape_groups
+from warprrf.rf.tracing.surface import Surface
 
 ROOM = box_mesh([0, 0, 0], [5, 4, 3], inward=True)
 CUPBOARD = box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.2])

@@ -25,8 +25,8 @@ from warprrf.geometry.photos.completion.room_planes import (
     known_levels,
     proven_levels,
 )
-from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.planar_patches import PlanarPatches
+from warprrf.geometry.planes import Plane
 from warprrf.geometry.splats.camera import Camera
 
 LEAST_SEEN = 0.7  # of the surface must be seen; else the photos cover too little for the rest to be inferred

@@ -9,8 +9,8 @@ import numpy as np
 from warprrf.geometry.mesh import Mesh, connected_pieces
 from warprrf.geometry.photos.completion.boxes import Grid
 from warprrf.geometry.photos.completion.room_planes import FaceLevels, Level
-from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.planar_patches import PlanarPatches
+from warprrf.geometry.planes import Plane
 from warprrf.geometry.splats.camera import Camera
 
 STRIDE = 5  # every so many-th row and column of the depth maps is used

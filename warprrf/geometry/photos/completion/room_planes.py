@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from warprrf.geometry.mesh import Mesh, smoothed_normals
-from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.planar_patches import PlanarPatches
+from warprrf.geometry.planes import Plane
 
 ALIGNED_DEG = 4.0  # a plane this parallel to one of three perpendicular directions counts as parallel
 EXACT_DEG, STRONG_M2 = 0.1, 2.0

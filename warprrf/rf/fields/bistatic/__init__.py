@@ -1,11 +1,7 @@
-"""The bistatic radio field: line of sight, mirrors, scattering lobes and what they light further, on frozen geometry.
+"""The bistatic radio field: parameters of materials fitted to the path table of :mod:`warprrf.rf.tracing`.
 
-It is three things. ``transport`` is what receivers see of a ``surface`` (its groups by ``colours``), whatever the
-materials: ``rays``, mirror paths (:mod:`warprrf.rf.paths`, ``mirror_light``), and how ``elements`` illuminate each
-other. ``materials`` are the parameters of the ``terms`` that are modelled, and the residual. ``render`` makes path
-powers and spectra of the two, with ``scattering``; ``response`` predicts any measurement that is linear in path powers,
-with its Jacobian.
-
-``field`` holds them, with ``paths``, ``links`` and ``files``. ``training`` fits it: groups of surfaces (``fit``), which
-of them are of one material (``grouping``), what differs within a group (``residuals``), its error (``uncertainty``).
+``field`` holds a surface, effects, parameters and a residual, and answers with ``paths``, ``links``, ``suggest`` and
+``files``. ``fit`` reads as the list of steps that make it: ``observations`` of data sets of any kind (``measured`` says how
+readings come from paths), ``gauss_newton`` on parameters, ``merging`` of materials, ``residual``, ``uncertainty``; ``placing``
+finds where a receiver stood.
 """

@@ -5,7 +5,7 @@ A pixel holds the power of every path of a scattering surface, spread by the rec
 - line of sight (Friis) and mirror reflections by the image method, blocking softened;
 - diffuse scattering of surfaces that the transmitter illuminates, directly or by a mirror, a non-negative mix of normalised
   lobes, which changes when the ends are swapped unless fitted as ``reciprocal``; it may be seen in a mirror;
-- what those illuminate in turn (:mod:`warprrf.rf.fields.bistatic.interreflection`).
+- what those illuminate in turn (:mod:`warprrf.rf.tracing.interreflection`).
 
 Where the data hold absorption by the air, every leg of a path has its own.
 
@@ -45,8 +45,6 @@ from warprrf.rf.fields.base import Data, Measured, RadioField
 from warprrf.rf.fields.bistatic import files
 from warprrf.rf.fields.bistatic.fit import SUB_PIXELS, FitOptions, TrainingViews, fit
 from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
-from warprrf.rf.fields.bistatic.materials import ARRAYS as PARAMETER_ARRAYS
-from warprrf.rf.fields.bistatic.materials import MOST_NEPERS, SETS, Effects, Layout, Model, Parameters
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, read
 from warprrf.rf.fields.bistatic.observations import (
     NEPER,
@@ -60,12 +58,8 @@ from warprrf.rf.fields.bistatic.observations import (
     places_of,
 )
 from warprrf.rf.fields.bistatic.paths import paths_of, strongest
-from warprrf.rf.fields.bistatic.records import Evaluation
-from warprrf.rf.fields.bistatic.render import PathGains, evaluation, images, path_gains
 from warprrf.rf.fields.bistatic.suggest import SHAPE as SUGGEST_SHAPE
 from warprrf.rf.fields.bistatic.suggest import Pointings, Sensitivity, Unknowns, suggest
-from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.tracer import Tracer, View
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
 from warprrf.rf.maps.links import LinkOptions, Links
 from warprrf.rf.paths.path_set import Paths
@@ -74,6 +68,12 @@ from warprrf.rf.spectra.beam import BeamOperator, beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import check_gains, check_turned
 from warprrf.rf.spectra.spectrum import Spectrum, default_floor, directions_from_angles, to_db
+from warprrf.rf.tracing.model import ARRAYS as PARAMETER_ARRAYS
+from warprrf.rf.tracing.model import MOST_NEPERS, SETS, Effects, Layout, Model, Parameters
+from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.render import PathGains, evaluation, images, path_gains
+from warprrf.rf.tracing.surface import Surface
+from warprrf.rf.tracing.tracer import Tracer, View
 
 
 @checked

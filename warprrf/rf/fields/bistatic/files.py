@@ -9,10 +9,10 @@ import numpy as np
 
 from warprrf.checks import check_type
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.fields.bistatic.materials import Effects, Parameters
-from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.uncertainty import ARRAYS as ERROR_ARRAYS
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
+from warprrf.rf.tracing.model import Effects, Parameters
+from warprrf.rf.tracing.surface import Surface
 
 _SURFACE = {
     name: name
@@ -73,8 +73,7 @@ def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict
         "effects": Effects(**header["effects"]),
         "sub_pixels": header["sub_pixels"],
         "parameters": Parameters(
-            **{name: tensors[f"parameters/{name}"] for name in _PARAMETERS},
-            **{name: header[name] for name in _SINGLE},
+            *(tensors[f"parameters/{n}"] for n in _PARAMETERS), *(header[n] for n in _SINGLE)
         ),
         "material": tensors["material"],
         "residual": tensors["residual"],

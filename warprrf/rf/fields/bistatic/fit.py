@@ -23,7 +23,6 @@ from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.fields.base import Data, Measured
 from warprrf.rf.fields.bistatic.gauss_newton import Fitted, Problem, gauss_newton
-from warprrf.rf.fields.bistatic.materials import LOBES, SETS, Effects, Model, Parameters
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, WeighedPaths, read
 from warprrf.rf.fields.bistatic.merging import BY_SHAPE, Merging, merge
 from warprrf.rf.fields.bistatic.observations import (
@@ -38,14 +37,15 @@ from warprrf.rf.fields.bistatic.observations import (
     places_of,
 )
 from warprrf.rf.fields.bistatic.placing import moved, position_offset, with_azimuths
-from warprrf.rf.fields.bistatic.records import Evaluation
-from warprrf.rf.fields.bistatic.render import evaluation, path_gains
 from warprrf.rf.fields.bistatic.residual import fit_residual, shares_of
-from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.tracer import Tracer, View, traced
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings
+from warprrf.rf.tracing.model import LOBES, SETS, Effects, Model, Parameters
+from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.render import evaluation, path_gains
+from warprrf.rf.tracing.surface import Surface
+from warprrf.rf.tracing.tracer import Tracer, View, traced
 
 LEAST_HELD_OUT = 2
 """Receivers held out below which they choose no effects: one alone likes what others do not."""

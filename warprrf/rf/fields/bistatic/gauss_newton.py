@@ -17,7 +17,6 @@ from scipy.linalg import solve
 from scipy.linalg.blas import ssyrk
 
 from warprrf.cache import cached_property
-from warprrf.rf.fields.bistatic.materials import ROUGHNESS, Effects, Layout, Model, Parameters
 from warprrf.rf.fields.bistatic.observations import (
     NEPER,
     NOISE_DB,
@@ -27,8 +26,9 @@ from warprrf.rf.fields.bistatic.observations import (
     columns_of,
     huber,
 )
-from warprrf.rf.fields.bistatic.records import Evaluation
-from warprrf.rf.fields.bistatic.render import evaluation
+from warprrf.rf.tracing.model import ROUGHNESS, Effects, Layout, Model, Parameters
+from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.render import evaluation
 
 WEIGHT, EXCESS, MIRROR = 2.0, 0.8, 1.5
 """Standard deviations a priori of lobe weights, permittivity less one and mirrored share from where a fit starts [nepers]."""

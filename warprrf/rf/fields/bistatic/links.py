@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.fields.bistatic.materials import Model
-from warprrf.rf.fields.bistatic.records import Evaluation
-from warprrf.rf.fields.bistatic.render import path_gains
-from warprrf.rf.fields.bistatic.tracer import Tracer
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links
 from warprrf.rf.spectra.spectrum import check_shape
+from warprrf.rf.tracing.model import Model
+from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.render import path_gains
+from warprrf.rf.tracing.tracer import Tracer
 
 SHAPE = (20, 40)
 """Default grid of a link's rays."""

@@ -16,14 +16,14 @@ from scipy.sparse import csr_matrix
 from warprrf.cache import cached_property
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.fields.bistatic.materials import Parameters
-from warprrf.rf.fields.bistatic.rays import RayGrid
-from warprrf.rf.fields.bistatic.records import Records
-from warprrf.rf.fields.bistatic.render import PathGains
-from warprrf.rf.fields.bistatic.tracer import SHARP, View
 from warprrf.rf.paths.mirror_paths import stops_of
 from warprrf.rf.paths.polarisation import chain_amplitude, vertical_ends
 from warprrf.rf.spectra.beam import BeamOperator
+from warprrf.rf.tracing.model import Parameters
+from warprrf.rf.tracing.rays import RayGrid
+from warprrf.rf.tracing.records import Records
+from warprrf.rf.tracing.render import PathGains
+from warprrf.rf.tracing.tracer import SHARP, View
 
 DEPARTURES = (60, 120)
 """Rows and columns of the grid of departures that rays are told apart in, where a transmitter's pattern counts."""
@@ -85,9 +85,9 @@ class SpectrumPixels:
     together: None = None
 
     @cached_property
-    def _matrix(self) -> csr_matrix:
+    def _matrix(self) -> csr_matrix | None:
         """The beam at the pixels."""
-        return self.beam.at(self.pixels)
+        return None if self.pixels is None else self.beam.at(self.pixels)
 
     @property
     def alike(self) -> object:
@@ -101,8 +101,8 @@ class SpectrumPixels:
 
     def of_bins(self, power: np.ndarray, *, quick: bool = False) -> np.ndarray:
         """Seen through the beam."""
-        if self.pixels is not None:
-            return self._matrix @ power.astype(np.float32, copy=False)
+        if self._matrix is not None:
+            return np.asarray(self._matrix @ power.astype(np.float32, copy=False))
         return self.beam(power.reshape(*self.beam.shape, -1), quick=quick).reshape(power.shape)
 
     def to_bins(self, readings: np.ndarray) -> np.ndarray:

@@ -14,10 +14,10 @@ import numpy as np
 
 from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.fields.bistatic.gauss_newton import Problem
-from warprrf.rf.fields.bistatic.materials import Parameters
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, Observation, huber
-from warprrf.rf.fields.bistatic.records import Evaluation
-from warprrf.rf.fields.bistatic.tracer import SHARP
+from warprrf.rf.tracing.model import Parameters
+from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.tracer import SHARP
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def merge(
     Args:
         problem: observations, and the material of each group now.
         p: parameters of the materials.
-        look: of each group, shape ``(G, K)``; see :class:`warprrf.rf.fields.bistatic.surface.Surface`.
+        look: of each group, shape ``(G, K)``; see :class:`warprrf.rf.tracing.surface.Surface`.
         area: of each group [m^2].
         options: what it takes.
     """

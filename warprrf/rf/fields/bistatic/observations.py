@@ -22,7 +22,6 @@ from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import Data, Measured
-from warprrf.rf.fields.bistatic.materials import SETS, Effects, Layout, Model, Parameters
 from warprrf.rf.fields.bistatic.measured import (
     ArrayImage,
     Measurement,
@@ -31,14 +30,15 @@ from warprrf.rf.fields.bistatic.measured import (
     pixel_means,
     read,
 )
-from warprrf.rf.fields.bistatic.records import Bins, Evaluation, Records
-from warprrf.rf.fields.bistatic.render import path_gains
-from warprrf.rf.fields.bistatic.tracer import SHARP, View
 from warprrf.rf.positions import check_dataset, check_positions, question_unit, warn_of_unmodelled
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings, path_weights, question_readings
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, to_db
+from warprrf.rf.tracing.model import SETS, Effects, Layout, Model, Parameters
+from warprrf.rf.tracing.records import Bins, Evaluation, Records
+from warprrf.rf.tracing.render import path_gains
+from warprrf.rf.tracing.tracer import SHARP, View
 
 NEPER = 10.0 / np.log(10.0)
 """Decibels of a neper of power."""
@@ -459,7 +459,7 @@ class _Tables:
 
     number: int
     one: Readings
-    _pointings: tuple[np.ndarray, np.ndarray] | None | bool = False
+    _pointings: list[tuple[np.ndarray, np.ndarray] | None] = field(default_factory=list)
 
     def ends(self) -> tuple[np.ndarray, np.ndarray]:
         return self.one.transmitters, self.one.receivers
@@ -494,10 +494,9 @@ class _Tables:
         above = NEPER * np.log1p(10.0 ** (expected / 10.0))
         step = None if one.bandwidth_hz is None else 1.0 / (TAP_STEPS * one.bandwidth_hz)
         weigh = partial(path_weights, one, rows, dtype=np.float32)
-        if self._pointings is False:
-            self._pointings = _pointings(one, view)
-        if self._pointings:
-            measured = WeighedPaths.turned(view, weigh, self._pointings[0], self._pointings[1][rows])
+        self._pointings[:] = self._pointings or [_pointings(one, view)]
+        if (known := self._pointings[0]) is not None:
+            measured = WeighedPaths.turned(view, weigh, known[0], known[1][rows])
         else:
             told_apart = {"arrival": one.arrival is not None, "departure": one.departure is not None}
             measured = WeighedPaths.of(view, weigh, **told_apart, delay_step_s=step)

@@ -8,10 +8,10 @@ import numpy as np
 
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.fields.bistatic.render import PathGains
-from warprrf.rf.fields.bistatic.tracer import View
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.spectrum import angles_from_directions, strongest_rays
+from warprrf.rf.tracing.render import PathGains
+from warprrf.rf.tracing.tracer import View
 
 PATH_SHARE = 1.0 / 200.0
 """A ray's part of the power that scattering brings to a pixel, at 64 rays a pixel and a beam of 3."""

@@ -17,12 +17,12 @@ from scipy.optimize import least_squares
 
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import Measured
-from warprrf.rf.fields.bistatic.materials import Parameters
 from warprrf.rf.fields.bistatic.measured import direct_paths
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, Observation, Place
-from warprrf.rf.fields.bistatic.records import Evaluation
-from warprrf.rf.fields.bistatic.tracer import SHARP, View
 from warprrf.rf.spectra.readings import Readings, path_weights
+from warprrf.rf.tracing.model import Parameters
+from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.tracer import SHARP, View
 
 STRONGEST = 20  # paths that count
 STEPS = 360

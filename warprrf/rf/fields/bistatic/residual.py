@@ -18,13 +18,13 @@ import numpy as np
 from scipy.sparse import block_diag, csr_matrix, hstack, identity, vstack
 from scipy.sparse.linalg import LinearOperator, cg
 
-from warprrf.rf.fields.bistatic.materials import Model
 from warprrf.rf.fields.bistatic.measured import Measurement, read
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, Observation, Target, huber
-from warprrf.rf.fields.bistatic.records import Evaluation
-from warprrf.rf.fields.bistatic.render import path_gains
-from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.tracer import SHARP
+from warprrf.rf.tracing.model import Model
+from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.render import path_gains
+from warprrf.rf.tracing.surface import Surface
+from warprrf.rf.tracing.tracer import SHARP
 
 DEVIATIONS = ((0.5, 0.5), (1.0, 2.0))
 """A priori of the gains of elements and of cells from 1 [nepers]: for single bounces, and for light that is sent on."""

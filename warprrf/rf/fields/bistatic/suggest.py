@@ -15,13 +15,13 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from warprrf.device import Progress
-from warprrf.rf.fields.bistatic.materials import Model
 from warprrf.rf.fields.bistatic.observations import NEPER, NOISE_DB, READING_ERROR_DB
-from warprrf.rf.fields.bistatic.records import Evaluation
-from warprrf.rf.fields.bistatic.render import path_gains
-from warprrf.rf.fields.bistatic.tracer import SHARP, Tracer
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_of
+from warprrf.rf.tracing.model import Model
+from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.render import path_gains
+from warprrf.rf.tracing.tracer import SHARP, Tracer
 
 SHAPE = (40, 80)
 """Pixels that are told apart around a receiver: as wide as a usual beam."""
@@ -107,7 +107,8 @@ class Sensitivity:
                 rest.append((ray, power))  # what mirrors show is taken for known, as line of sight is
         row, unknown, power = (np.concatenate(column) for column in zip(*parts, strict=True))
         table = csr_matrix((power, (row, unknown)), shape=(count, 2 * elements + s.groups))
-        known = np.bincount(*map(np.concatenate, zip(*rest, strict=True)), minlength=count)
+        ray, power = (np.concatenate(column) for column in zip(*rest, strict=True))
+        known = np.bincount(ray, power, minlength=count)
         return table, np.asarray(table.sum(axis=1)).ravel() + known
 
     def of(self, place: np.ndarray, pointings: Pointings | None) -> tuple[np.ndarray, csr_matrix]:

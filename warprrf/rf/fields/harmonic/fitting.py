@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 
 from warprrf import tensor_files
-from warprrf.geometry.photos.photo_loss import WRAPPED, PhotoLoss
+from warprrf.geometry.splats.photo_loss import WRAPPED, PhotoLoss
 from warprrf.kernels.adam import build_adam, corrections
 from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.kernels.raster.sh import COEFFICIENTS as DEGREE_TO_COUNT

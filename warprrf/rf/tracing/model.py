@@ -83,8 +83,8 @@ class Parameters:
         reciprocal: whether lobes scatter alike when transmitter and receiver change places. Those of Degli-Esposti et al.
             (2007), Sionna RT's, do not.
         log_gain: ln of a gain common to all paths (an uncalibrated receiver).
-        log_gains: ln of the unknown gains of measuring chains, shape ``(C,)``; only while a fit lasts.
         roughness: power of the carrier with which roughness counts; 2 by Ament (1953).
+        log_gains: ln of the unknown gains of measuring chains, shape ``(C,)``; only while a fit lasts.
 
     Raises:
         TypeError, ValueError: for arrays that do not fit each other, or are out of range.
@@ -96,8 +96,8 @@ class Parameters:
     lobes: tuple[int, ...] = LOBES
     reciprocal: bool = False
     log_gain: float = 0.0
-    log_gains: np.ndarray = field(default_factory=lambda: np.zeros(0))
     roughness: float = ROUGHNESS
+    log_gains: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         lobes = check_array("lobes", self.lobes, (None,), dtype=np.int64).tolist()

@@ -21,12 +21,12 @@ from warprrf.cache import Cache, cached_property
 from warprrf.checks import LARGEST_M, Expected, check_arrays, check_number, index_to, lengths
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh, components, smoothed_normals
-from warprrf.geometry.photos.snapping import is_scan, scanned_patches
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
+from warprrf.geometry.scans import is_scan, scanned_patches
 from warprrf.geometry.splats.gaussians import gaussians_of
 from warprrf.rf.em.materials import is_name_alone
-from warprrf.rf.fields.bistatic.colours import Colours, colour_groups
-from warprrf.rf.fields.bistatic.shapes import SHAPES, shape_groups
+from warprrf.rf.tracing.colours import Colours, colour_groups
+from warprrf.rf.tracing.shapes import SHAPES, shape_groups
 
 ELEMENT_M = 0.5  # least width of an element
 LARGEST_ELEMENT_M = 25.0

@@ -8,7 +8,7 @@ of one direction each, are the table ``"sharp"``. All kinds are evaluated by :mo
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -19,8 +19,8 @@ from warprrf.cache import Cache
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import records as kernels
 from warprrf.rf.em.fresnel import COSINES, SurfaceTable, fresnel_curves, lobe_norm, reciprocal_factor
-from warprrf.rf.fields.bistatic.materials import Parameters
-from warprrf.rf.fields.bistatic.rays import REALS
+from warprrf.rf.tracing.model import Parameters
+from warprrf.rf.tracing.rays import REALS
 
 FINE_COSINES = 4097
 """Entries of a lobe's table for a truth: interpolation errs by 1e-6 at most up to an exponent of 100."""
@@ -129,7 +129,7 @@ class Records:
             return table
 
         table = self._uploaded.get(where, upload)
-        return table, materials.on_device(real), lambda *given: _device.launch(*given, device=where)
+        return table, materials.on_device(real), partial(_device.launch, device=where)
 
 
 @dataclass(frozen=True, eq=False)

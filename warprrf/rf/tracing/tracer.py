@@ -2,7 +2,7 @@
 
 Rays fill the sphere around a receiver. What they hit is connected to the transmitter (``S``) and to its images in mirrors
 (``MS``); some go on turned at a mirror and are connected there (``SM``, ``MSM``). Elements of the surface send on what they
-got of others (:mod:`warprrf.rf.fields.bistatic.interreflection`), and are seen directly (``E``) or in a mirror (``EM``). Line
+got of others (:mod:`warprrf.rf.tracing.interreflection`), and are seen directly (``E``) or in a mirror (``EM``). Line
 of sight and mirrors alone come from the image method (:mod:`warprrf.rf.paths.mirror_paths`).
 
 A :class:`Tracer` belongs to a surface, a transmitter and a grid of rays; what it traced gives the :class:`View` of a receiver.
@@ -22,13 +22,13 @@ from warprrf.cache import Cache, making
 from warprrf.device import DeviceLike, Progress, resolve
 from warprrf.kernels.radio.records import SCATTER, SOURCE
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.fields.bistatic.materials import Effects
-from warprrf.rf.fields.bistatic.rays import NEAREST_M, Hits, RayGrid
-from warprrf.rf.fields.bistatic.records import Records
-from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.paths.images import MirrorImages
 from warprrf.rf.paths.mirror_paths import MirrorPaths, ZoneRays, zone_paths
 from warprrf.rf.spectra.spectrum import unit_beams
+from warprrf.rf.tracing.model import Effects
+from warprrf.rf.tracing.rays import NEAREST_M, Hits, RayGrid
+from warprrf.rf.tracing.records import Records
+from warprrf.rf.tracing.surface import Surface
 
 MIRROR_SLACK_M = 0.1
 """How far beside its faces a patch may still mirror [m]: outlines of a reconstructed mesh are torn."""

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warprrf.rf.fields.bistatic.interreflection import irradiance
-from warprrf.rf.fields.bistatic.materials import Model, Parameters
-from warprrf.rf.fields.bistatic.records import Evaluation
-from warprrf.rf.fields.bistatic.tracer import SHARP, Tracer, View
 from warprrf.rf.spectra.beam import BeamOperator
+from warprrf.rf.tracing.interreflection import irradiance
+from warprrf.rf.tracing.model import Model, Parameters
+from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.tracer import SHARP, Tracer, View
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from warprrf.geometry.mesh import vectors_across
-from warprrf.rf.fields.bistatic.materials import Effects, Parameters
-from warprrf.rf.fields.bistatic.records import Evaluation, Records
-from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.tracer import LIFT_M, Rays, Tracer
+from warprrf.rf.tracing.model import Effects, Parameters
+from warprrf.rf.tracing.records import Evaluation, Records
+from warprrf.rf.tracing.surface import Surface
+from warprrf.rf.tracing.tracer import LIFT_M, Rays, Tracer
 
 RAYS = 128  # from each element, over its hemisphere
 

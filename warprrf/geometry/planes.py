@@ -16,8 +16,37 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from warprrf.cache import cached_property
-from warprrf.checks import check_array
-from warprrf.geometry.photos.config import PlaneConfig
+from warprrf.checks import check_array, check_positive
+
+
+@dataclass(frozen=True)
+class PlaneConfig:
+    """How planes are found among points, and how large their cells are.
+
+    Attributes:
+        distance_m: a point this close is on the plane; three times the noise of sparse points in a room.
+        angle_deg: and its normal differs by no more than this: normals of sparse points are good to 10 degrees or so.
+        min_points: fewest points of a plane (or the least weight, where points are weighted).
+        max_planes: stop after so many.
+        cell_m: side of a plane's cells.
+        margin_m: cells reach so far beyond the hull of a plane's points.
+    """
+
+    distance_m: float = 0.015
+    angle_deg: float = 30.0
+    min_points: float = 40
+    max_planes: int = 80
+    cell_m: float = 0.1
+    margin_m: float = 0.12
+
+    def __post_init__(self) -> None:
+        check_positive("distance_m", self.distance_m, "length in metres")
+
+    @property
+    def cosine(self) -> float:
+        """Of ``angle_deg``."""
+        return float(np.cos(np.radians(self.angle_deg)))
+
 
 HYPOTHESES = 192  # points tried as centres of planes in each round
 SCORED_POINTS = 6000  # that a hypothesis is scored on

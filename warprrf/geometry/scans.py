@@ -7,15 +7,40 @@ out where two planes meet. Lengths in metres.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
 
+from warprrf.checks import check_positive
 from warprrf.geometry.mesh import Mesh, connected_pieces, edge_pairs, face_neighbours, smoothed_normals
-from warprrf.geometry.photos.config import PlaneConfig, SurfaceConfig
-from warprrf.geometry.photos.planes import Plane, detect_planes, drawn_by_place
 from warprrf.geometry.planar_patches import PlanarPatches, vertex_noise
+from warprrf.geometry.planes import Plane, PlaneConfig, detect_planes, drawn_by_place
+
+
+@dataclass(frozen=True)
+class SurfaceConfig:
+    """How Gaussians become a mesh with planar patches.
+
+    Attributes:
+        downscale: depth maps are rendered at the photos' size divided by this.
+        voxel_m: largest side of a voxel of the fusion.
+        truncation_voxels: the distance field is truncated at so many voxels.
+        max_range_m: depths beyond this are left out.
+        min_component_faces: connected pieces with fewer faces are dropped as floating debris.
+        patch_distance_m: a face this close to a plane can belong to its patch: a depth map's error.
+    """
+
+    downscale: int = 2
+    voxel_m: float = 0.05
+    truncation_voxels: float = 4.0
+    max_range_m: float = 12.0
+    min_component_faces: int = 200
+    patch_distance_m: float = 0.06
+
+    def __post_init__(self) -> None:
+        check_positive("voxel_m", self.voxel_m, "length in metres")
+
 
 PATCH_ANGLE_DEG = 35.0  # most between the smoothed normal of a face and that of its patch
 MIN_PATCH_M2 = 0.15  # smallest planar patch

@@ -18,8 +18,8 @@ from warprrf.cache import cached_property
 from warprrf.device import DeviceLike
 from warprrf.geometry import rays as mesh_rays
 from warprrf.kernels.radio import illumination
-from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.spectra.spectrum import sub_pixel_directions
+from warprrf.rf.tracing.surface import Surface
 
 LEAST_M = 1e-6  # range of what is hit at the ray's very start
 REALS = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
