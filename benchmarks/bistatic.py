@@ -31,10 +31,10 @@ ABLATION: dict[str, dict[str, Any]] = {
     "no mirrors": {"effects": {"mirrors": 0, "mirror_scatter": False, "scatter_mirror": False}},
     "no scattering": {"effects": {"scatterings": 0}},
     "Lambertian lobe alone": {"lobes": (0,)},
-    "nothing after the first scattering": {
+    "nothing after the first bounce": {
         "effects": {"mirror_scatter": False, "scatter_mirror": False, "scatterings": 1}
     },
-    "no residual": {"effects": {"residual": False}},
+    "no residual per element": {"effects": {"residual": False}},
 }  # fmt: skip
 """Options of the fit that leave a part of the model out; of the effects that the whole field chose, what is changed."""
 MATCH_DEG = 3.0  # a path of ours within this angle of a true one is that path

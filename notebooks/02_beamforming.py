@@ -61,16 +61,8 @@ dataset = wr.SpectrumDataset.load(DATA / "spectra.nc")
 scene = wr.Scene.load(DATA / "scene.xml")
 train, test = dataset.split(10)
 start = time.perf_counter()
-field = wr.RadioField.fit(
-    scene,
-    train,
-    mirror_order=1,
-    diffuse_order=1,
-    mirror_scatter=False,
-    scatter_mirror=False,
-    indirect=False,
-    residual=False,
-)
+single = wr.Effects(mirrors=1, scatterings=1, mirror_scatter=False, scatter_mirror=False, residual=False)
+field = wr.RadioField.fit(scene, train, effects=single)
 print(f"fitted to {len(train)} receivers in {time.perf_counter() - start:.1f} s")
 
 # %% [markdown]

@@ -153,7 +153,7 @@ plt.show()
 # falls faster than one over the square root of their number.
 #
 # A field knows its materials and its mesh less well than that, so few rays do: a fit takes 9, `sub_pixels=3`, and
-# `RadioField.fit(..., quick=True)`, as here, takes one, and tries no terms.
+# `RadioField.fit(..., quick=True)`, as here, takes one, and holds no receiver out to choose effects by.
 
 # %%
 scene = wr.Scene.load(DATA / "scene.xml")
@@ -162,17 +162,17 @@ seen, blocked = (dataset.receivers[dataset.line_of_sight == flag] for flag in (T
 places = np.concatenate([seen[:2], blocked[:2]])
 start = time.perf_counter()
 field = wr.RadioField.fit(scene, dataset.split(10)[0], quick=True)
-print(f"fitted to ten spectra in {time.perf_counter() - start:.1f} s: {field.terms}")
+print(f"fitted to ten spectra in {time.perf_counter() - start:.1f} s: {field.effects}")
 
 
-def with_terms(**changed):
-    """The same field with other terms."""
-    return replace(field, terms=replace(field.terms, **changed))
+def with_effects(**changed):
+    """The same field with other effects."""
+    return replace(field, effects=replace(field.effects, **changed))
 
 
 def images(sub_pixels):
     """Time of a query, and the dB images at all places."""
-    finer = with_terms(sub_pixels=sub_pixels)
+    finer = replace(field, sub_pixels=sub_pixels)
     seconds, found = seconds_of(lambda: [finer.spectrum(p).path_gain_db for p in places])
     return seconds / len(places), np.array(found)
 
@@ -236,22 +236,20 @@ for row in rows:
 # `warprrf.relevance` asks the same question of a scene and answers with the smallest model within a tolerance.)
 
 # %%
-alone = {"mirror_scatter": False, "scatter_mirror": False, "diffuse_order": 1, "indirect": False}
+alone = {"mirror_scatter": False, "scatter_mirror": False}
 steps = {
-    "line of sight": {**alone, "mirror_order": 0, "diffuse": False},
-    "+ one mirror": {**alone, "mirror_order": 1, "diffuse": False},
-    "+ two mirrors": {**alone, "mirror_order": 2, "diffuse": False},
-    "+ three mirrors": {**alone, "mirror_order": 3, "diffuse": False},
-    "+ scattering": {**alone, "mirror_order": 3, "diffuse": True},
-    "+ mirrors light surfaces": {**alone, "mirror_order": 3, "diffuse": True, "mirror_scatter": True},
-    "+ second diffuse bounce": {
-        **alone, "mirror_order": 3, "diffuse": True, "mirror_scatter": True, "diffuse_order": 2,
-    },
+    "line of sight": {**alone, "mirrors": 0, "scatterings": 0},
+    "+ one mirror": {**alone, "mirrors": 1, "scatterings": 0},
+    "+ two mirrors": {**alone, "mirrors": 2, "scatterings": 0},
+    "+ three mirrors": {**alone, "mirrors": 3, "scatterings": 0},
+    "+ scattering": {**alone, "mirrors": 3, "scatterings": 1},
+    "+ mirrors light surfaces": {"scatter_mirror": False, "mirrors": 3, "scatterings": 1, "mirror_scatter": True},
+    "+ scattering twice": {"scatter_mirror": False, "mirrors": 3, "scatterings": 2, "mirror_scatter": True},
 }  # fmt: skip
 groups = {"seen": seen[:6], "blocked": blocked[:6]}
 gains, times = [], []
-for terms in steps.values():
-    model = with_terms(**terms)
+for effects in steps.values():
+    model = with_effects(**effects)
     model.links(places[:1])  # what belongs to the transmitter is traced once
     totals = {}
     start = time.perf_counter()
@@ -280,7 +278,7 @@ plt.show()
 # error is that against the finest grid, over the cells without line of sight, where it matters.
 
 # %%
-model = with_terms(mirror_order=2, mirror_scatter=True, diffuse_order=2)
+model = with_effects(mirrors=2, scatterings=2, mirror_scatter=True, scatter_mirror=False)
 shapes = ((5, 10), (10, 20), (20, 40), (40, 80))
 model.radio_map(1.5, 3.0)
 maps, rows = [], []

@@ -117,8 +117,8 @@ first
 # ## 2 A field from no measurement, and from a few
 #
 # An empty data set says where the transmitter is and at which frequency. Surfaces are then taken for what ITU-R P.2040 says of
-# building materials. The same call with readings fits materials, and the gain of the chain beside them. `quick=True` tries no
-# terms: leave it out for two decibels more.
+# building materials. The same call with readings fits materials, and the gain of the chain beside them. `quick=True` takes
+# one ray a pixel: leave it out for two decibels more.
 
 # %%
 nothing = wr.SpectrumDataset.empty(
