@@ -11,8 +11,6 @@ import pytest
 import warp as wp
 from furnished import RECEIVERS, SHAPE, SIGMA, TX, F, spectra
 from radio_scenes import RadioScene
-from warprrf.rf.fields.bistatic.response import Response, jacobian, predict, respond
-from warprrf.rf.fields.bistatic.transport import ReceiverView
 
 from warprrf.rf.channel.array_spectra import UP, hemisphere
 from warprrf.rf.channel.arrays import PlanarArray
@@ -23,6 +21,8 @@ from warprrf.rf.fields.bistatic.materials import Layout, Parameters, Terms
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, WeighedPaths, read
 from warprrf.rf.fields.bistatic.observations import observe, places_of
 from warprrf.rf.fields.bistatic.render import path_powers
+from warprrf.rf.fields.bistatic.response import Response, jacobian, predict, respond
+from warprrf.rf.fields.bistatic.transport import ReceiverView
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.readings import Readings, horn, path_weights
 

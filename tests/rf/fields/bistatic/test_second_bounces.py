@@ -5,25 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from furnished import RECEIVERS, ROOM, SHAPE, TX, F, spectra
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths
-from warprrf.rf.fields.bistatic.grouping import regroup
-from warprrf.rf.fields.bistatic.response import (
-    predict,
-    respond,
-    with_further_bounces,
-)
-from warprrf.rf.fields.bistatic.scattering import send
-from warprrf.rf.fields.bistatic.training import trace
-from warprrf.rf.fields.bistatic.transport import Transport
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths, observation
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.fit import Reading, Target, fit_groups
-from warprrf.rf.fields.bistatic.materials import Parameters, Terms
+from warprrf.rf.fields.bistatic.fit import trace
+from warprrf.rf.fields.bistatic.gauss_newton import Problem, gauss_newton
+from warprrf.rf.fields.bistatic.materials import SETS, Effects, Parameters
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
+from warprrf.rf.fields.bistatic.merging import Merging, merge
+from warprrf.rf.fields.bistatic.observations import columns_of
+from warprrf.rf.fields.bistatic.records import Evaluation
 from warprrf.rf.fields.bistatic.surface import Surface
+from warprrf.rf.fields.bistatic.tracer import Tracer
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.spectrum import to_db
 
@@ -59,20 +55,17 @@ def test_light_that_a_mirror_throws_on_a_floor_comes_from_the_image() -> None:
     lobes = (0, 5)
     weight = np.array([[np.log(0.2), np.log(0.3)], [nothing, nothing]])
 
-    def field(surface: Surface, source: np.ndarray, **terms: object) -> BistaticField:
+    def field(surface: Surface, source: np.ndarray, mirror_scatter: bool = False) -> BistaticField:
         return BistaticField(
             surface=surface, transmitter=source, frequency_hz=F, shape=SHAPE, floor=1e-20, range_db=(-200.0, -80.0),
-            beam_sigma_rad=np.radians(5.0), terms=Terms(mirror_order=0, line_of_sight=False, lobes=lobes, **terms),
-            parameters=Parameters(
-                weight, np.array([np.log(4.0), np.log(199.0)]), np.array([nothing, 0.0]), np.full(2, -np.inf)
-            ),
+            beam_sigma_rad=np.radians(5.0), effects=Effects(False, 0, 1, mirror_scatter, False),
+            parameters=Parameters(weight, np.log([4.0, 199.0]), np.array([nothing, 0.0]), lobes),
             material=np.arange(2), residual=np.zeros((2, surface.cells)),
         )  # fmt: skip
 
     lit = field(both, transmitter, mirror_scatter=True)
     dark = field(both, transmitter)
-    seen = lit.view(receiver)
-    extra = lit.render(seen).image - dark.render(seen).image
+    extra = lit.spectrum(receiver).path_gain - dark.spectrum(receiver).path_gain
     wanted = field(alone, image).spectrum(receiver).path_gain
     # The mirror keeps what its Fresnel curve says, which hardly depends on the angle up to 60 degrees.
     reflected = fresnel_curves().value(np.full(2, np.log(199.0)), np.array([0.5, 1.0]))[0]
@@ -81,29 +74,41 @@ def test_light_that_a_mirror_throws_on_a_floor_comes_from_the_image() -> None:
     assert 0.97 * reflected.min() < np.median(ratio) < 1.03 * reflected.max()
     assert 0.9 * reflected.min() < ratio.min() and ratio.max() < 1.1 * reflected.max()
     assert 0.97 * reflected.min() < extra.sum() / wanted.sum() < 1.03 * reflected.max()
-    assert lit.render(seen).further.sum() == pytest.approx(extra.sum(), rel=1e-6)
+    gains = lit.path_gains(lit.view(receiver))
+    assert gains.by_ray(["MS"]).sum() == pytest.approx(extra.sum(), rel=1e-6)
 
 
 @pytest.mark.usefixtures("device")
-def test_what_groups_send_on_adds_up(scene: RadioScene) -> None:
-    surface = Surface.of(scene)
-    ds = spectra(scene, RECEIVERS[:1])
-    terms = Terms(mirror_scatter=True, diffuse_order=3)
-    field = BistaticField.prior(surface, ds, terms=terms)
-    view, beam = field.view(RECEIVERS[0]), BeamOperator(SHAPE, np.radians(5.0))
-    measured = SpectrumPixels(beam, np.arange(SHAPE[0] * SHAPE[1]))
-    bare, sent = respond(view, measured, terms, ds.floor), field.sent_radiance(view.transport)
-    follows, held = (
-        with_further_bounces(bare, view, measured, field.materials, sent, ds.floor, follow=follow)
-        for follow in (True, False)
+@pytest.mark.parametrize("reciprocal", [False, True])
+def test_columns_are_the_sums_of_their_records(scene: RadioScene, reciprocal: bool) -> None:
+    """What a fit is made on: light over several surfaces exactly, single scattering with Fresnel curves of three components."""
+    field = BistaticField.prior(
+        scene, spectra(scene, RECEIVERS[:1]), effects=EVERYTHING, reciprocal=reciprocal
     )
-    whole = beam(field.render(view).further).ravel() / ds.floor
-    assert not follows.offset.any()
-    share = field.parameters.scattered_share[follows.sender]
-    assert np.allclose(share @ follows.sent, whole, rtol=1e-4, atol=1e-7 * whole.max())
-    assert np.allclose(held.offset, whole, rtol=1e-4, atol=1e-7 * whole.max())
+    view, beam, p = field.view(RECEIVERS[0]), BeamOperator(SHAPE, np.radians(5.0)), field.parameters
+    gains, o = field.path_gains(view), observation(view, SpectrumPixels(beam), field.floor)
+    columns = columns_of(o, EVERYTHING, field.evaluation(view.tracer))
+    single = replace(columns, senders=columns.senders[:0], further=columns.further[:0]).power(p)
+
+    def image(by_ray: np.ndarray) -> np.ndarray:
+        return beam(by_ray.reshape(*SHAPE, -1).sum(axis=-1, keepdims=True)).ravel() / field.floor
+
+    further = image(gains.by_ray([name for name in gains.tables if name not in ("sharp", "S")]))
+    np.testing.assert_allclose(columns.power(p) - single, further, rtol=1e-3, atol=1e-6 * single.max())
+    curves, records = fresnel_curves(), view.records["S"]
+    components = curves.at(curves.coordinates, p.log_excess[:1])[0][0] @ curves.moments  # groups are alike
+    cosine = records.angle[:, 0, : 1 + reciprocal].astype(float)
+    root = np.sqrt(p.excess[0] + cosine**2)
+    exact = sum(0.5 * ((a - root) / (a + root)) ** 2 for a in (cosine, (1.0 + p.excess[0]) * cosine))
+    share = np.interp(cosine, np.linspace(0.0, 1.0, len(components)), components).mean(axis=1) / exact.mean(
+        axis=1
+    )
+    assert np.abs(share - 1.0).max() < 0.13
+    weighed = image(np.bincount(records.ray, gains.tables["S"] * share, minlength=len(view.hits.face)))
+    np.testing.assert_allclose(single, weighed, rtol=1e-3, atol=1e-5 * single.max())
 
 
+SINGLE, EVERYTHING = SETS["single"], Effects(residual=False)
 MATERIALS = [
     SlabMaterial("walls", 3.0, 0.5, np.inf, 0.4, "directive", 5),
     SlabMaterial("one", 6.0, 0.5, np.inf, 0.8),
@@ -122,66 +127,62 @@ def scene() -> RadioScene:
 
 
 @pytest.fixture(scope="module")
-def readings(scene: RadioScene) -> list[Reading]:
+def problem(scene: RadioScene) -> Problem:
     ds = spectra(scene, RECEIVERS)
     target = to_db(ds.path_gain, ds.floor) - 10 * np.log10(ds.floor)
-    measured = SpectrumPixels(BeamOperator(SHAPE, np.radians(5.0)), np.arange(SHAPE[0] * SHAPE[1]))
-    return [
-        Reading(respond(view, measured, Terms(), ds.floor), Target(t.ravel()))
+    measured = SpectrumPixels(BeamOperator(SHAPE, np.radians(5.0)))
+    observations = [
+        observation(view, measured, ds.floor, t.ravel())
         for view, t in zip(trace(scene, ds).views, target, strict=True)
     ]
+    return Problem.of(observations, SINGLE, np.arange(3), Parameters.prior(3))
 
 
-def test_spectra_join_groups_of_one_material_and_no_others(
-    readings: list[Reading], scene: RadioScene
-) -> None:
+def test_spectra_join_groups_of_one_material_and_no_others(problem: Problem, scene: RadioScene) -> None:
     area = np.bincount(scene.face_material, scene.mesh.areas)
-    separate = fit_groups(readings, Parameters.prior(3, 5), area)
+    separate = gauss_newton(problem, Parameters.prior(3), 40)
     alike = np.zeros((3, 4))  # all look the same
-    material, parameters = regroup(readings, separate.parameters, np.arange(3), alike, area)
+    material, parameters = merge(problem, separate.parameters, alike, area, Merging())
     assert material[1] == material[2] != material[0]
     assert len(parameters.log_excess) == 2
     # and a group that was put with the wrong material goes over
-    mixed = np.array([0, 1, 0])
-    again = fit_groups([r.tied(mixed) for r in readings], parameters, np.bincount(mixed, area))
-    moved, _ = regroup(readings, again.parameters, mixed, alike, area)
+    mixed = replace(problem, material=np.array([0, 1, 0]))
+    again = gauss_newton(mixed, parameters, 40)
+    moved, _ = merge(mixed, again.parameters, alike, area, Merging())
     assert moved[2] == moved[1] != moved[0]
 
 
-def test_looks_that_differ_keep_apart_what_spectra_cannot_tell(
-    readings: list[Reading], scene: RadioScene
-) -> None:
-    dark = [
-        Reading(replace(r.response, bounce=0 * r.response.bounce), Target(np.zeros_like(r.target.db)))
-        for r in readings
-    ]
+def test_looks_that_differ_keep_apart_what_spectra_cannot_tell(problem: Problem, scene: RadioScene) -> None:
+    dark = replace(
+        problem, columns=[replace(c, single=0 * c.single) for c in problem.columns],
+        observations=[observation(o.view, o.measured, o.floor) for o in problem.observations],
+    )  # fmt: skip
     area = np.bincount(scene.face_material, scene.mesh.areas)
     look = np.array([[0.0, 0, 0, 0], [0.1, 0, 0, 0], [9.0, 0, 0, 0]])
-    material, _ = regroup(dark, Parameters.prior(3, 5), np.arange(3), look, area)
+    material, _ = merge(dark, Parameters.prior(3), look, area, Merging())
     assert material[0] == material[1]  # nothing speaks against it
 
 
-def test_tied_responses_predict_the_same(readings: list[Reading]) -> None:
+def test_columns_of_materials_predict_what_those_of_their_groups_do(problem: Problem) -> None:
     rng = np.random.default_rng(0)
     owner = np.array([0, 1, 1])
-    p = Parameters(
-        rng.normal(-2, 0.5, (2, 5)), rng.normal(1, 0.3, 2), rng.normal(-1, 0.3, 2), rng.normal(-3, 0.2, 2)
-    )
-    for reading in readings:
-        light = rng.uniform(0, 5, (2, len(reading.response.offset))).astype(np.float32)
-        response = replace(reading.response, sender=np.array([0, 2]), sent=light)
-        assert np.allclose(predict(response, p.take(owner)), predict(response.tied(owner), p), rtol=1e-5)
+    p = Parameters(rng.normal(-2, 0.5, (2, 5)), rng.normal(1, 0.3, 2), rng.normal(-1, 0.3, 2))
+    for columns in problem.columns:
+        light = rng.uniform(0, 5, (2, columns.single.shape[-1])).astype(np.float32)
+        groups = replace(columns, senders=np.array([0, 2]), further=light)
+        assert np.allclose(groups.power(p.take(owner)), groups.by_materials(owner).power(p), rtol=1e-5)
 
 
 def test_an_even_radiance_all_around_arrives_from_the_whole_sphere() -> None:
     """In a closed room whose surfaces send L evenly, the sum over pixels is (lambda / 4 pi)^2 4 pi L."""
     surface, shape = Surface.of(Mesh(*ROOM)), (12, 24)
     radiance = 0.7
+    sides = surface.side_group
+    materials = Evaluation(Parameters.prior(surface.groups), None, sides, np.full(len(sides), radiance))
     for sub_pixels in (1, 3):
-        transport = Transport.of(surface, TX, F, shape, sub_pixels)
-        view = transport.view(RECEIVERS[0], Terms(mirror_order=0))
-        power = send(transport, view.hits, np.full(surface.element_sides, radiance))
-        assert power.sum() == pytest.approx(
-            (WAVELENGTH / (4.0 * np.pi)) ** 2 * 4.0 * np.pi * radiance, rel=1e-6
-        )
+        view = Tracer.of(surface, TX, F, shape, sub_pixels).view(RECEIVERS[0], 0)
+        seen = view.tables(Effects())["E"]
+        power = np.bincount(seen.ray, seen.powers(materials), minlength=len(view.hits.face))
+        expected = (WAVELENGTH / (4.0 * np.pi)) ** 2 * 4.0 * np.pi * radiance
+        assert power.sum() == pytest.approx(expected, rel=1e-6)
         assert (power.reshape(-1, sub_pixels**2).sum(axis=1) > 0).all()

@@ -605,7 +605,10 @@ def _choose_of_few(t: Training, trials: list[Choice]) -> Choice:
         return t.fitted(trials[0], t.kept, t.options.iterations, rounds=2)
     single, room = (t.fitted(trial, t.kept, t.options.iterations, rounds=2) for trial in trials[:2])
     everywhere = np.arange(len(t.observations))
-    losses = [t.loss(t.model(trial), everywhere) for trial in (single, room)]
+    models = [t.model(trial) for trial in (single, room)]
+    wrong = zip(*(unexplained(t, model).rows for model in models), strict=True)
+    counted = left_out(t, [np.intersect1d(*rows) for rows in wrong])  # without what neither explains
+    losses = [counted.loss(model, everywhere) for model in models]
     fewer = losses[0] < MUCH_BETTER * losses[1]
     t.note(_name(single.effects), fewer, losses[0])
     t.note(_name(room.effects), not fewer, losses[1])
