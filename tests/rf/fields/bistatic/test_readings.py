@@ -13,7 +13,9 @@ from radio_scenes import RadioScene
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import fit as fitting
+from warprrf.rf.fields.bistatic.materials import SETS
 from warprrf.rf.fields.bistatic.observations import Target
+from warprrf.rf.positions import is_free
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.readings import COLUMNS, Readings, horn, path_weights
@@ -105,6 +107,24 @@ def test_the_noise_of_readings_is_estimated(scene: RadioScene, turned: Readings)
     )
     assert clean < 1.0
     assert found == pytest.approx(np.hypot(3.0, clean), rel=0.2)
+
+
+def test_fading_is_as_deep_as_paths_make_it(scene: RadioScene) -> None:
+    """Waves of random phases: in line of sight power fades less than Rayleigh's does, and no chain's gain is moved."""
+    effects, rng = replace(SETS["single"], residual=False), np.random.default_rng(0)
+    places = rng.uniform([0.3, 0.3, 0.3], [4.7, 3.7, 1.5], (60, 3))
+    seen, free = scene.mesh.visible(places, TX[None]), is_free(scene.mesh, places, clearance_m=0.2)
+    spectrum = spectra(scene, RECEIVERS[:4])
+    truth = RadioField.fit(scene, spectrum, quick=True, effects=effects)
+    known = replace(spectrum, path_gain=truth.spectra(spectrum.receivers).path_gain)
+    for own, bound in ((seen, 0.3), (~seen, 0.5)):
+        at = np.repeat(places[own & free][:12], 200, axis=0)
+        wave = [np.abs(truth.paths(place).gain) for place in at[::200]]
+        phased = [np.exp(2j * np.pi * rng.random((200, len(w)))) @ w for w in wave]
+        power = np.abs(np.concatenate(phased)) ** 2 * 10 ** (CHAIN_DB / 10)
+        faded = Readings(TX, at, power, F, 1e-15, chain=["meter"] * len(at), samples=1)
+        found = RadioField.fit(scene, [known, faded], quick=True, effects=effects).report["chains"]["meter"]
+        assert found["gain_db"] == pytest.approx(CHAIN_DB, abs=bound)
 
 
 def test_several_transmitters_are_fitted_together_and_remembered(scene: RadioScene, tmp_path: Path) -> None:

@@ -32,7 +32,6 @@ from warprrf.rf.fields.bistatic.observations import (
     Observation,
     Place,
     as_list,
-    columns_of,
     frame_of,
     observe,
     places_of,
@@ -412,17 +411,14 @@ class Training:
             order = rng.permutation(count)
             held = np.sort(order[~np.isin(order, always)][: min(int(count * HELD_OUT), MOST_HELD_OUT)])
         lobes = options.exponents(frequency_hz)
-        single = replace(SETS["single"], mirrors=1)
-        prior = Parameters.prior(seen.tracer.surface.groups, lobes, reciprocal=options.reciprocal)
         parts = []
         for o in observations:
             trust, db = o.target.trust, o.target.db
             known = np.arange(len(db)) if trust is None else np.flatnonzero(trust)
             size = min(len(known), max(LEAST_READINGS, READINGS // count))
             part = o.part(known[np.sort(rng.choice(len(known), size, replace=False))])
-            if o.prefers_direct:
-                share = _line_of_sight_share(part, single, prior)
-                part = replace(part, target=part.target.trusted(1.0 + KNOWN_BETTER * share))
+            if part.sight is not None:
+                part = replace(part, target=part.target.trusted(1.0 + KNOWN_BETTER * part.sight))
             parts.append(part)
         steps = _Steps(progress, count, 4 + len(candidates) + MERGES + (2 * count if count <= FEW else 3))
         return cls(
@@ -460,13 +456,8 @@ class Training:
         """What is fitted to readings of ``places``, lit as under parameters ``p`` of materials."""
         return Problem.of(
             [self.parts[k] for k in places], effects, material, p, chains=len(self.chains),
-            gain_offset=self.options.gain_offset, huber_db=self.huber_db, **({"energy": 1.0} if self.totals else {}),
+            gain_offset=self.options.gain_offset, **({"energy": 1.0} if self.totals else {}),
         )  # fmt: skip
-
-    @property
-    def huber_db(self) -> float:
-        """Larger errors count linearly; totals may miss a mirror of metal, which priors have weaker."""
-        return 10.0 if self.totals else 3.0
 
     def model(self, choice: Choice, *, residual: bool = False) -> Model:
         """That of groups, without a residual yet."""
@@ -505,10 +496,7 @@ class Training:
     def loss(self, model: Model, places: Sequence[int] | np.ndarray) -> float:
         """Mean loss of all readings at ``places`` [dB^2]."""
         predicted = self.predicted(model, places)
-        own = [
-            self.observations[k].losses(x, self.huber_db).mean()
-            for k, x in zip(places, predicted, strict=True)
-        ]
+        own = [self.observations[k].losses(x).mean() for k, x in zip(places, predicted, strict=True)]
         return float(np.mean(own))
 
     def held_loss(self, choice: Choice) -> float:
@@ -518,20 +506,12 @@ class Training:
             return self.loss(self.model(choice), self.held)
         problem = self.problem(choice.effects, choice.material, self.held, choice.parameters)
         p = choice.parameters
-        losses = [o.losses(o.gain(p, x) * x, self.huber_db) for o, _, _, x in problem.evaluated(p)]
+        losses = [o.losses(o.gain(p, x) * x) for o, _, _, x in problem.evaluated(p)]
         return float(np.mean(np.concatenate(losses)))
 
     def note(self, what: str, kept: bool, loss: float) -> None:
         """Log a choice."""
         self.log.append({"term": what, "kept": bool(kept), "held_out_rmse_db": float(np.sqrt(loss))})
-
-
-def _line_of_sight_share(o: Observation, effects: Effects, p: Parameters) -> np.ndarray:
-    """Share of readings (N,) that comes straight from the transmitter."""
-    materials = Evaluation(p, device=o.view.tracer.grid.device)
-    power = o.direct(replace(effects, mirrors=0), materials)
-    total = columns_of(o, effects, materials).power(p) + o.direct(effects, materials)
-    return np.asarray(power / np.maximum(total, np.maximum(power, 1e-300)))
 
 
 @dataclass
@@ -661,7 +641,7 @@ def cross_validate(t: Training, choice: Choice) -> tuple[bool, ErrorModel | None
             found += t.predicted(with_residual(t, model, kept) if residual else model, held)
     loss = {
         residual: float(
-            np.mean([t.observations[k].losses(x, t.huber_db).mean() for k, x in zip(order, own, strict=True)])
+            np.mean([t.observations[k].losses(x).mean() for k, x in zip(order, own, strict=True)])
         )
         for residual, own in power.items()
     }
@@ -755,7 +735,7 @@ def _offsets(t: Training, found: Fit) -> dict[int, list[tuple[Place, np.ndarray]
         direct = gains.sharp / o.floor
         gain = o.gain(model.parameters, total)
         other = np.maximum(total - direct @ o.measured.of_paths(o.view), 0.0)
-        offset = position_offset(one, o, gain * other, gain * direct, t.huber_db)  # type: ignore[arg-type]
+        offset = position_offset(one, o, gain * other, gain * direct)  # type: ignore[arg-type]
         offsets.setdefault(o.place.data, []).append((o.place, offset))
     return offsets
 
