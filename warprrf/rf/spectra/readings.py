@@ -224,6 +224,12 @@ class Readings:
         """Whether each holds all power of its place: no directions, no delays."""
         return self.arrival is None and self.departure is None and self.delay_s is None
 
+    def without_side_lobes(self) -> Readings:
+        """The same of antennas with nothing but their main lobes; see :func:`main_lobe`."""
+        names = ("receive_pattern", "transmit_pattern")
+        cut: dict[str, Any] = {name: main_lobe(p) for name in names if (p := getattr(self, name)) is not None}
+        return replace(self, **cut)
+
     @classmethod
     def from_table(cls, table: Table, **settings: Any) -> Readings:
         """Readings of a table by the names of its columns: a pandas data frame, an xarray data set, a dictionary.
@@ -468,6 +474,19 @@ def horn(width_rad: float, floor_db: float = -60.0) -> Pattern:
     angle = np.linspace(0.0, np.pi, 20_001)
     mean = 0.5 * np.trapezoid(_horn_gain(width, low, 1.0, angle) * np.sin(angle), angle)
     return partial(_horn_gain, width, low, mean)
+
+
+def main_lobe(pattern: Pattern) -> Pattern:
+    """``pattern`` without side lobes: nothing beyond where it first stops falling below half of its peak."""
+    angle = np.linspace(0.0, np.pi, 3601)
+    gain = sample_pattern(pattern, angle)
+    flank = np.arange(len(gain) - 1) >= gain.argmax()
+    past = np.flatnonzero(flank & (gain[:-1] < 0.5 * gain.max()) & (np.diff(gain) >= 0))
+    return partial(_up_to, pattern, float(angle[past[0]]) if len(past) else np.pi)
+
+
+def _up_to(pattern: Pattern, end: float, angle: np.ndarray) -> np.ndarray:
+    return np.where(angle <= end, sample_pattern(pattern, angle), 0.0)
 
 
 def _horn_gain(width: float, floor_db: float, mean: float, angle: ArrayLike) -> np.ndarray:
