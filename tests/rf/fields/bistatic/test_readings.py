@@ -13,13 +13,13 @@ from radio_scenes import RadioScene
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import fit as fitting
-from warprrf.rf.tracing.model import SETS
 from warprrf.rf.fields.bistatic.observations import Target
 from warprrf.rf.positions import is_free
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.readings import COLUMNS, Readings, horn, path_weights
 from warprrf.rf.spectra.spectrum import directions_from_angles
+from warprrf.rf.tracing.model import SETS
 
 CHAIN_DB = -23.7
 WIDTH = np.radians(20.0)
