@@ -115,6 +115,7 @@ metrics.psnr: truth=empty, prediction=no list; metrics.unit_image: floor=minus o
 Spectrum.stack: spectra=nested; Paths.stack: length=2^31; em.Band.widened: low_hz=numpy integer
 lookups.Lookup.spectrum: receivers=no rows; lookups.mean: train=readings
 em.slab_transmission: cos_incidence=zeros, thickness_m=tiny; em.slab_transmission: cos_incidence=zero, permittivity=list
+channel.coherence_bandwidth: tau=no list, power=no rows
 """
 """Findings of earlier hours, one of each cause."""
 
@@ -132,11 +133,12 @@ def test_what_was_found_once_is_right_now(attempt, case):
         ("file: arrays, plain", [("double", 269, 44445), ("double", 1974, 16233)], "unfit"),
         ("file: compact spectra", [("rename", 78, 0), ("blank", 23, 0)], "answered"),
         ("law: rooms", [("turned by a quarter", 12321, 380152463)], "answered"),
+        ("file: STL mesh", [("cut", 34, 0)], "refused"),
     ],
 )
-def test_what_was_wrongly_found_is_no_finding(attempt, target, edits, kind):
+def test_what_was_found_once_of_files_and_rooms(attempt, target, edits, kind):
     """Bytes alone have no contents; a fill value of zero makes pixels of zero not measured; a lattice of rays is none of
-    the room's."""
+    the room's; 34 bytes are no STL file of -1 triangles."""
     assert attempt(Case(target, tuple(edits))).kind == kind
 
 

@@ -226,7 +226,7 @@ def _from_stl(folder: Folder) -> MeshContent:
     """Binary or ASCII; three vertices a face, as they stand."""
     path = folder.path
     data = path.read_bytes()
-    count = int(np.frombuffer(data[80:84], "<u4")[0]) if len(data) >= 84 else -1
+    count = int(np.frombuffer(data[80:84], "<u4")[0]) if len(data) >= 84 else 0
     if len(data) == 84 + 50 * count:
         rows = np.frombuffer(data, np.uint8, offset=84).reshape(count, 50)[:, 12:48]
         corners = np.ascontiguousarray(rows).view("<f4").astype(np.float64)

@@ -19,7 +19,7 @@ from warprrf.rf.paths.trace import trace_paths
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import angle_deg, psnr, strongest_direction, unit_image
-from warprrf.rf.spectra.readings import Readings, path_weights
+from warprrf.rf.spectra.readings import Readings, fading_db, path_weights
 from warprrf.rf.spectra.spectrum import Spectrum, directions_from_angles
 
 Source = RadioField | Scene | Mesh
@@ -187,18 +187,24 @@ def reading_errors(field: RadioField, readings: Readings, progress: Progress | N
     """
     if not readings.azimuth_known:
         raise ValueError("readings: their azimuths count from an unknown zero, expected azimuth_known=True")
-    power, ends = np.empty(len(readings)), np.column_stack([readings.transmitters, readings.receivers])
+    power, steady = np.empty((2, len(readings)))
+    ends = np.column_stack([readings.transmitters, readings.receivers])
     links, own = np.unique(ends, axis=0, return_inverse=True)
     for k, link in enumerate(links):
         rows, paths = np.flatnonzero(own.reshape(-1) == k), field.paths(link[3:], link[:3])
         arrival = directions_from_angles(paths.theta_r, paths.phi_r)
         departure = directions_from_angles(paths.theta_t, paths.phi_t)
-        power[rows] = path_weights(readings, rows, arrival, departure, paths.tau) @ paths.power
+        weight = path_weights(readings, rows, arrival, departure, paths.tau) * paths.power
+        power[rows] = weight.sum(axis=1)
+        single = weight[:, paths.kind != "diffuse"] / np.maximum(power[rows], 1e-300)[:, None]
+        steady[rows] = (single**2).sum(axis=1)
         if progress is not None:
             progress("readings", k + 1, len(links))
     floor = 10.0 * np.log10(np.asarray(readings.floor))
     predicted = 10.0 * np.log10(np.maximum(power, 1e-300))
-    error = np.maximum(predicted, floor) - np.maximum(readings.expected_db, floor)
+    with np.errstate(divide="ignore"):
+        read = 10.0 * np.log10(readings.power) - fading_db(readings.samples, steady)[0]
+    error = np.maximum(predicted, floor) - np.maximum(read, floor)
     error[np.isnan(readings.power) | (predicted <= floor) & (readings.power <= readings.floor)] = np.nan
     chain = np.asarray(readings.chain)
     for name in np.unique(chain[chain != ""]):

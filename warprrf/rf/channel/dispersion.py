@@ -108,12 +108,10 @@ def coherence_bandwidth(power: ArrayLike, tau: ArrayLike, level: float = COHEREN
     if not 0.0 < level < 1.0:
         raise ValueError(f"level: got {level!r}, expected a share between 0 and 1")
     weight, delay = _weights(power, tau, "tau")
-    shape = weight.shape[:-1]
-    found = [
-        _first_fall(w, t, level)
-        for w, t in zip(weight.reshape(-1, weight.shape[-1]), delay.reshape(-1, delay.shape[-1]), strict=True)
-    ]
-    return np.array(found).reshape(shape)
+    found = np.zeros(weight.shape[:-1])
+    for k in np.ndindex(found.shape):
+        found[k] = _first_fall(weight[k], delay[k], level)
+    return found
 
 
 def _angular(power: ArrayLike, angle: ArrayLike, name: str) -> np.ndarray:

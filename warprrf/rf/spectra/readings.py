@@ -55,6 +55,7 @@ WIDEST_HORN_RAD = 2.0 * np.pi / 3.0
 WEIGHTS_AT_ONCE = 1_000_000  # of readings and paths: some MB of temporary arrays
 ALIKE = 0.7  # of two names' letters: one is misspelt for the other
 WINDOWS = ("rectangular", "hann")
+STEADIEST = 1e-6  # relative variance of the power of a single wave
 
 
 @runtime_checkable
@@ -88,7 +89,7 @@ class Readings:
         chain: name of the measuring chain of each reading whose gain is not known, "" where it is known, shape ``(N,)``.
         std_db: standard deviation of the noise of each reading [dB], shape ``(N,)`` or one number.
         samples: independent samples of fading that each reading is the mean of: 1 for narrowband power at one place,
-            None where fading is averaged out. Fading is taken for Rayleigh's.
+            None where fading is averaged out. A fit knows how far line of sight and mirrors fade less; see :func:`fading_db`.
         air: whose absorption is in the powers; None for none.
         name: by which a report tells these readings from others; several of one name are numbered in the order given.
         azimuth_known: False where azimuths of ``arrival`` count from an unknown zero, one for all: a fit then finds it
@@ -223,18 +224,11 @@ class Readings:
         """Whether each holds all power of its place: no directions, no delays."""
         return self.arrival is None and self.departure is None and self.delay_s is None
 
-    @property
-    def expected_db(self) -> np.ndarray:
-        """Readings less what fading takes off the mean of their decibels [dB], shape ``(N,)``."""
-        bias = 0.0 if self.samples is None else NEPER * (digamma(self.samples) - np.log(self.samples))
-        with np.errstate(divide="ignore"):
-            return np.asarray(10.0 * np.log10(self.power) - bias)
-
-    @property
-    def noise_db(self) -> np.ndarray:
-        """Standard deviation of each reading, fading included [dB], shape ``(N,)``."""
-        fading = 0.0 if self.samples is None else NEPER * np.sqrt(polygamma(1, self.samples))
-        return np.asarray(np.hypot(self.std_db, fading))
+    def without_side_lobes(self) -> Readings:
+        """The same of antennas with nothing but their main lobes; see :func:`main_lobe`."""
+        names = ("receive_pattern", "transmit_pattern")
+        cut: dict[str, Any] = {name: main_lobe(p) for name in names if (p := getattr(self, name)) is not None}
+        return replace(self, **cut)
 
     @classmethod
     def from_table(cls, table: Table, **settings: Any) -> Readings:
@@ -402,6 +396,24 @@ def _number(name: str, cell: str, line: int) -> float:
     return number
 
 
+def fading_db(samples: int | None, steady: ArrayLike = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of what fading adds to a reading's decibels [dB], each of the shape of ``steady``.
+
+    Power is taken for gamma distributed with the shape m that has its variance (Nakagami 1960): that of waves of
+    independent phases is 1 - sum s_i^2 of its mean's square, s_i the share of each. One wave of K-factor K over many weak
+    ones has m = (K + 1)^2 / (2 K + 1), and a mean that is at most 0.25 dB off that of a Rician power; Rayleigh fading is m = 1.
+
+    Args:
+        samples: independent ones that a reading is the mean of; None where fading is averaged out.
+        steady: sum of the squared shares of single waves, 0 to 1.
+    """
+    left = np.maximum(1.0 - np.asarray(steady, float), STEADIEST)
+    if samples is None:
+        return np.zeros_like(left), np.zeros_like(left)
+    shape = samples / left
+    return NEPER * (digamma(shape) - np.log(shape)), NEPER * np.sqrt(polygamma(1, shape))
+
+
 def path_weights(
     readings: Readings,
     rows: np.ndarray,
@@ -462,6 +474,19 @@ def horn(width_rad: float, floor_db: float = -60.0) -> Pattern:
     angle = np.linspace(0.0, np.pi, 20_001)
     mean = 0.5 * np.trapezoid(_horn_gain(width, low, 1.0, angle) * np.sin(angle), angle)
     return partial(_horn_gain, width, low, mean)
+
+
+def main_lobe(pattern: Pattern) -> Pattern:
+    """``pattern`` without side lobes: nothing beyond where it first stops falling below half of its peak."""
+    angle = np.linspace(0.0, np.pi, 3601)
+    gain = sample_pattern(pattern, angle)
+    flank = np.arange(len(gain) - 1) >= gain.argmax()
+    past = np.flatnonzero(flank & (gain[:-1] < 0.5 * gain.max()) & (np.diff(gain) >= 0))
+    return partial(_up_to, pattern, float(angle[past[0]]) if len(past) else np.pi)
+
+
+def _up_to(pattern: Pattern, end: float, angle: np.ndarray) -> np.ndarray:
+    return np.where(angle <= end, sample_pattern(pattern, angle), 0.0)
 
 
 def _horn_gain(width: float, floor_db: float, mean: float, angle: ArrayLike) -> np.ndarray:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.sparse import block_diag, bsr_matrix, csr_matrix, identity
 
-from warprrf.checks import Expected, check_array, check_arrays, check_count, check_number, checked
+from warprrf.checks import Expected, check_array, check_arrays, check_count, check_number, check_type, checked
 from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.em.materials import NARROWEST_LOBE
 
@@ -107,6 +107,8 @@ class Parameters:
             )
         object.__setattr__(self, "lobes", tuple(lobes))
         check_arrays(vars(self), ARRAYS, L=len(lobes))
+        check_type("reciprocal", self.reciprocal, bool)
+        check_number("roughness", self.roughness, -10.0, 10.0)
         check_number("log_gain", self.log_gain, -MOST_NEPERS, MOST_NEPERS)
 
     @property

@@ -196,7 +196,7 @@ class Evaluation:
         rows, count = self.material, len(p.log_excess)
         values = {
             "weight": p.weight, "excess": p.excess, "mirror": np.exp(p.log_mirror), "even_slope": slope / even,
-            "radiance": self._radiance,
+            "radiance": self._radiance, "thickness": np.zeros(0),
         }  # fmt: skip
         indices = {
             "row": rows,
@@ -207,6 +207,9 @@ class Evaluation:
             setattr(m, name, wp.array(np.ascontiguousarray(value), dtype=real, device=where))
         for name, value in indices.items():
             setattr(m, name, wp.array(value, dtype=wp.int32, device=where))
+        m.permittivity = wp.empty(
+            0, dtype=wp.types.vector(2, real), device=where
+        )  # Warp's tape takes no null arrays
         m.exponent, m.scale = _lobes(p.lobes, (p.reciprocal,) * len(p.lobes), real, where, COSINES)
         return m
 

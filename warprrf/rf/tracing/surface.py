@@ -28,11 +28,12 @@ from warprrf.rf.em.materials import is_name_alone
 from warprrf.rf.tracing.colours import Colours, colour_groups
 from warprrf.rf.tracing.shapes import SHAPES, shape_groups
 
-ELEMENT_M = 0.5  # least width of an element
+ELEMENT_M = 0.5  # width of an element in a room
 LARGEST_ELEMENT_M = 25.0
 ELEMENTS = 30_000
 """Larger scenes have wider elements, so that there are about so many: light between them takes up to 50 kB each. The
 least width holds up to 7500 m^2 of surfaces (a hall's), the largest up to 19 km^2 (a town's)."""
+LEAST_ELEMENTS = 300
 CELLS = 3  # along an element
 LARGEST_FACE = 1.2  # elements' widths; longer edges are split, so that elements can be small
 MIN_MIRROR_M2 = 0.05  # smaller patches reflect too little to search for
@@ -331,9 +332,10 @@ def _largest_groups(mesh: Mesh, patch: np.ndarray, group: np.ndarray, patches: i
 
 
 def _element_width(mesh: Mesh) -> float:
-    """Width of elements [m]: as many as :data:`ELEMENTS` at most, pieces of small patches apart."""
+    """Width of elements [m]: as many as :data:`ELEMENTS` at most, pieces of small patches apart; :data:`ELEMENT_M`, or less in
+    scenes so small that there would be fewer than :data:`LEAST_ELEMENTS`."""
     area = float(mesh.areas.sum())
-    width_m = max(ELEMENT_M, float(np.sqrt(area / ELEMENTS)))
+    width_m = max(min(ELEMENT_M, float(np.sqrt(area / LEAST_ELEMENTS))), float(np.sqrt(area / ELEMENTS)))
     if width_m > LARGEST_ELEMENT_M:
         size = " x ".join(f"{e:.4g}" for e in np.ptp(mesh.bounds, axis=0))
         raise ValueError(

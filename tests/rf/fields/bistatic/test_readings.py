@@ -14,10 +14,12 @@ from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import fit as fitting
 from warprrf.rf.fields.bistatic.observations import Target
+from warprrf.rf.positions import is_free
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.readings import COLUMNS, Readings, horn, path_weights
 from warprrf.rf.spectra.spectrum import directions_from_angles
+from warprrf.rf.tracing.model import SETS
 
 CHAIN_DB = -23.7
 WIDTH = np.radians(20.0)
@@ -29,8 +31,7 @@ def test(scene: RadioScene) -> SpectrumDataset:
     return spectra(scene, held)
 
 
-@pytest.fixture(scope="module")
-def turned(scene: RadioScene) -> Readings:
+def horn_readings(scene: RadioScene, side_lobes_db: float) -> Readings:
     """A horn at six receivers, turned through 18 azimuths at two elevations: read off narrow beams of the exact engine."""
     engine = ExactEngine(
         scene, transmitter=TX, frequency_hz=F, shape=(60, 120), beam_sigma_rad=np.radians(1.5), sub_pixels=2
@@ -41,14 +42,19 @@ def turned(scene: RadioScene) -> Readings:
     seen = directions_from_angles(zenith.ravel(), azimuth.ravel())
     pointing = np.array([(z, a) for z in (np.pi / 2, 2.0) for a in np.radians(np.arange(-180, 180, 20))])
     angle = np.arccos(np.clip(directions_from_angles(*pointing.T) @ seen.T, -1.0, 1.0))
-    gain = horn(WIDTH)(angle)
+    gain = horn(WIDTH, side_lobes_db)(angle)
     power = np.stack([gain @ engine.receive(r).path_gain.ravel() for r in RECEIVERS[:6]])
     floor = np.repeat(power.max(axis=1) * 1e-3, len(pointing)) * 10 ** (CHAIN_DB / 10)
     return Readings(
         TX, np.repeat(RECEIVERS[:6], len(pointing), axis=0),
         np.maximum(power.ravel() * 10 ** (CHAIN_DB / 10), floor), F, floor,
-        arrival=np.tile(pointing, (6, 1)), receive_pattern=horn(WIDTH), chain=["horn"] * power.size,
+        arrival=np.tile(pointing, (6, 1)), receive_pattern=horn(WIDTH, side_lobes_db), chain=["horn"] * power.size,
     )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def turned(scene: RadioScene) -> Readings:
+    return horn_readings(scene, -60.0)
 
 
 def score(field: RadioField, test: SpectrumDataset) -> float:
@@ -67,6 +73,21 @@ def test_a_horn_of_unknown_gain_is_fitted_and_its_gain_found(
         for k, r in enumerate(test.receivers)
     ]
     assert np.sqrt(np.mean(np.square(total))) < 1.0
+
+
+def test_a_gain_that_hangs_on_side_lobes_is_said_to(scene: RadioScene, turned: Readings) -> None:
+    """What 3 dB of their level move the gain by is in its error, as two fits with levels so far apart have it."""
+    quick = {"quick": True, "effects": "single"}
+    clear = RadioField.fit(scene, turned, **quick).report["chains"]["horn"]
+    assert clear["side_lobe_share"] < 0.05 and clear["std_db"] < 0.5
+    lobed = horn_readings(scene, -25.0)
+    with pytest.warns(UserWarning, match=r"side lobes, .*'horn' \(8\d % of its readings") as told:
+        found = RadioField.fit(scene, lobed, **quick).report["chains"]["horn"]
+    assert told[0].filename == __file__
+    lower = replace(lobed, receive_pattern=horn(WIDTH, -28.0))
+    other = RadioField.fit(scene, lower, **quick).report["chains"]["horn"]
+    moved = other["gain_db"] - found["gain_db"]
+    assert moved > 2.0 and found["std_db"] == pytest.approx(moved, rel=0.25)
 
 
 def test_wrong_readings_are_named_and_hardly_count(
@@ -105,6 +126,24 @@ def test_the_noise_of_readings_is_estimated(scene: RadioScene, turned: Readings)
     )
     assert clean < 1.0
     assert found == pytest.approx(np.hypot(3.0, clean), rel=0.2)
+
+
+def test_fading_is_as_deep_as_paths_make_it(scene: RadioScene) -> None:
+    """Waves of random phases: in line of sight power fades less than Rayleigh's does, and no chain's gain is moved."""
+    effects, rng = replace(SETS["single"], residual=False), np.random.default_rng(0)
+    places = rng.uniform([0.3, 0.3, 0.3], [4.7, 3.7, 1.5], (60, 3))
+    seen, free = scene.mesh.visible(places, TX[None]), is_free(scene.mesh, places, clearance_m=0.2)
+    spectrum = spectra(scene, RECEIVERS[:4])
+    truth = RadioField.fit(scene, spectrum, quick=True, effects=effects)
+    known = replace(spectrum, path_gain=truth.spectra(spectrum.receivers).path_gain)
+    for own, bound in ((seen, 0.3), (~seen, 0.5)):
+        at = np.repeat(places[own & free][:12], 200, axis=0)
+        wave = [np.abs(truth.paths(place).gain) for place in at[::200]]
+        phased = [np.exp(2j * np.pi * rng.random((200, len(w)))) @ w for w in wave]
+        power = np.abs(np.concatenate(phased)) ** 2 * 10 ** (CHAIN_DB / 10)
+        faded = Readings(TX, at, power, F, 1e-15, chain=["meter"] * len(at), samples=1)
+        found = RadioField.fit(scene, [known, faded], quick=True, effects=effects).report["chains"]["meter"]
+        assert found["gain_db"] == pytest.approx(CHAIN_DB, abs=bound)
 
 
 def test_several_transmitters_are_fitted_together_and_remembered(scene: RadioScene, tmp_path: Path) -> None:

@@ -532,8 +532,8 @@ class BistaticField(RadioField):
         """Standard deviation of the dB image per pixel (H, W); see :mod:`warprrf.rf.fields.bistatic.uncertainty`."""
         if self.errors is None:
             raise ValueError(
-                f"uncertainty: this field was fitted to {self.report.get('receivers', 0)} receivers, too few to hold "
-                "some out and learn its error from; fit to four or more"
+                f"uncertainty: no receiver was held out of this field's fit to {self.report.get('receivers', 0)}, so its "
+                "error is not known; fit whole spectra of four or more, without quick=True"
             )
         rows = np.unique(self.material, return_index=True)[1]
         lit = self.evaluation(view.tracer)

@@ -62,6 +62,8 @@ def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict
     errors = {
         n: t if ERROR_ARRAYS[n].shape else t.squeeze() for n, t in errors.items()
     }  # older: single values as (1,)
+    parameters: dict[str, Any] = {name: tensors[f"parameters/{name}"] for name in _PARAMETERS}
+    parameters |= {name: header[name] for name in _SINGLE}
     return {
         "surface": Surface(
             mesh=Mesh(tensors["mesh/vertices"], tensors["mesh/faces"]),
@@ -72,9 +74,7 @@ def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict
         ),
         "effects": Effects(**header["effects"]),
         "sub_pixels": header["sub_pixels"],
-        "parameters": Parameters(
-            *(tensors[f"parameters/{n}"] for n in _PARAMETERS), *(header[n] for n in _SINGLE)
-        ),
+        "parameters": Parameters(**parameters),
         "material": tensors["material"],
         "residual": tensors["residual"],
         "fitted_under": tensors.get("fitted_under"),

@@ -22,7 +22,7 @@ from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.fields.base import Data, Measured
-from warprrf.rf.fields.bistatic.gauss_newton import Fitted, Problem, gauss_newton
+from warprrf.rf.fields.bistatic.gauss_newton import Fitted, Problem, gauss_newton, layout_of
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, WeighedPaths, read
 from warprrf.rf.fields.bistatic.merging import BY_SHAPE, Merging, merge
 from warprrf.rf.fields.bistatic.observations import (
@@ -31,8 +31,8 @@ from warprrf.rf.fields.bistatic.observations import (
     Observation,
     Place,
     as_list,
-    columns_of,
     frame_of,
+    huber,
     observe,
     places_of,
 )
@@ -68,6 +68,9 @@ READINGS, LEAST_READINGS = 12_000, 200
 """Readings that parameters are fitted to, spread over the training receivers, and of each at least."""
 KNOWN_BETTER = 2.0
 """By how much more readings count that hold line of sight alone: no material is in them. They tell a chain's gain."""
+SIDE_LOBES_DB = 3.0
+"""Standard deviation of the level of an antenna's side lobes, which few measure."""
+HANGING_DB = 1.0  # that this moves a chain's gain by and is worth a warning
 CLEAR_DB = 10.0  # above its floor a reading's decibels err as they are
 NORMAL_MEDIAN = 1.4826  # standard deviation over the median size of normal errors
 MOST_RAYS = 500_000_000
@@ -324,6 +327,7 @@ def fit(
             training = Training.of(trace(geometry, data, **where), data, options, candidates, progress)
             found = _fitted(training)
     _warn_of_left_out(data, found.report["unexplained"])
+    _warn_of_side_lobes(found.report["chains"])
     places_moved = {
         training.names[k]: [(place.receiver.tolist(), offset.tolist()) for place, offset in own]
         for k, own in offsets.items()
@@ -412,17 +416,14 @@ class Training:
             order = rng.permutation(count)
             held = np.sort(order[~np.isin(order, always)][: min(int(count * HELD_OUT), MOST_HELD_OUT)])
         lobes = options.exponents(frequency_hz)
-        single = replace(SETS["single"], mirrors=1)
-        prior = Parameters.prior(seen.tracer.surface.groups, lobes, reciprocal=options.reciprocal)
         parts = []
         for o in observations:
             trust, db = o.target.trust, o.target.db
             known = np.arange(len(db)) if trust is None else np.flatnonzero(trust)
             size = min(len(known), max(LEAST_READINGS, READINGS // count))
             part = o.part(known[np.sort(rng.choice(len(known), size, replace=False))])
-            if o.prefers_direct:
-                share = _line_of_sight_share(part, single, prior)
-                part = replace(part, target=part.target.trusted(1.0 + KNOWN_BETTER * share))
+            if part.sight is not None:
+                part = replace(part, target=part.target.trusted(1.0 + KNOWN_BETTER * part.sight))
             parts.append(part)
         steps = _Steps(progress, count, 4 + len(candidates) + MERGES + (2 * count if count <= FEW else 3))
         return cls(
@@ -460,13 +461,8 @@ class Training:
         """What is fitted to readings of ``places``, lit as under parameters ``p`` of materials."""
         return Problem.of(
             [self.parts[k] for k in places], effects, material, p, chains=len(self.chains),
-            gain_offset=self.options.gain_offset, huber_db=self.huber_db, **({"energy": 1.0} if self.totals else {}),
+            gain_offset=self.options.gain_offset, **({"energy": 1.0} if self.totals else {}),
         )  # fmt: skip
-
-    @property
-    def huber_db(self) -> float:
-        """Larger errors count linearly; totals may miss a mirror of metal, which priors have weaker."""
-        return 10.0 if self.totals else 3.0
 
     def model(self, choice: Choice, *, residual: bool = False) -> Model:
         """That of groups, without a residual yet."""
@@ -505,10 +501,7 @@ class Training:
     def loss(self, model: Model, places: Sequence[int] | np.ndarray) -> float:
         """Mean loss of all readings at ``places`` [dB^2]."""
         predicted = self.predicted(model, places)
-        own = [
-            self.observations[k].losses(x, self.huber_db).mean()
-            for k, x in zip(places, predicted, strict=True)
-        ]
+        own = [self.observations[k].losses(x).mean() for k, x in zip(places, predicted, strict=True)]
         return float(np.mean(own))
 
     def held_loss(self, choice: Choice) -> float:
@@ -518,20 +511,12 @@ class Training:
             return self.loss(self.model(choice), self.held)
         problem = self.problem(choice.effects, choice.material, self.held, choice.parameters)
         p = choice.parameters
-        losses = [o.losses(o.gain(p, x) * x, self.huber_db) for o, _, _, x in problem.evaluated(p)]
+        losses = [o.losses(o.gain(p, x) * x) for o, _, _, x in problem.evaluated(p)]
         return float(np.mean(np.concatenate(losses)))
 
     def note(self, what: str, kept: bool, loss: float) -> None:
         """Log a choice."""
         self.log.append({"term": what, "kept": bool(kept), "held_out_rmse_db": float(np.sqrt(loss))})
-
-
-def _line_of_sight_share(o: Observation, effects: Effects, p: Parameters) -> np.ndarray:
-    """Share of readings (N,) that comes straight from the transmitter."""
-    materials = Evaluation(p, device=o.view.tracer.grid.device)
-    power = o.direct(replace(effects, mirrors=0), materials)
-    total = columns_of(o, effects, materials).power(p) + o.direct(effects, materials)
-    return np.asarray(power / np.maximum(total, np.maximum(power, 1e-300)))
 
 
 @dataclass
@@ -661,7 +646,7 @@ def cross_validate(t: Training, choice: Choice) -> tuple[bool, ErrorModel | None
             found += t.predicted(with_residual(t, model, kept) if residual else model, held)
     loss = {
         residual: float(
-            np.mean([t.observations[k].losses(x, t.huber_db).mean() for k, x in zip(order, own, strict=True)])
+            np.mean([t.observations[k].losses(x).mean() for k, x in zip(order, own, strict=True)])
         )
         for residual, own in power.items()
     }
@@ -755,9 +740,41 @@ def _offsets(t: Training, found: Fit) -> dict[int, list[tuple[Place, np.ndarray]
         direct = gains.sharp / o.floor
         gain = o.gain(model.parameters, total)
         other = np.maximum(total - direct @ o.measured.of_paths(o.view), 0.0)
-        offset = position_offset(one, o, gain * other, gain * direct, t.huber_db)  # type: ignore[arg-type]
+        offset = position_offset(one, o, gain * other, gain * direct)  # type: ignore[arg-type]
         offsets.setdefault(o.place.data, []).append((o.place, offset))
     return offsets
+
+
+def side_lobes(t: Training, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
+    """Of each chain, shape ``(C,)``: the share of its readings that side lobes of its antennas bring, as it counts in dB; and
+    how far :data:`SIDE_LOBES_DB` of their level move its gain [dB], all other parameters with it."""
+    first, p = len(choice.fitted.covariance) - len(t.chains), choice.parameters
+    pull = np.zeros((len(t.chains), len(choice.fitted.covariance)))  # of side lobes' level on the parameters
+    size, parts = np.zeros(len(t.chains)), list(t.parts)
+    turned = [
+        isinstance(one, Readings) and not (one.arrival is None and one.departure is None) for one in t.data
+    ]
+    places = [k for k, o in enumerate(parts) if o.chain >= 0 and turned[o.place.data]]
+    bare = [one.without_side_lobes() if isinstance(one, Readings) else one for one in t.data]
+    seen = [parts[k] for k in places]
+    lobes = observe(bare, [o.place for o in seen], [o.view for o in seen], frame_of(t.data).frequency_hz)[0]
+    for k, lobe in zip(places, lobes, strict=True):
+        parts[k] = replace(lobe.part(np.asarray(parts[k].rows)), ratio=parts[k].ratio)
+    whole, main = (
+        one.problem(choice.effects, choice.material, places, p) for one in (t, replace(t, parts=parts))
+    )
+    linear = whole.linearised(p, layout_of(replace(whole, observations=t.parts), p))
+    for (error, table, index), (o, _, _, power), (*_, own) in zip(
+        linear, whole.evaluated(p), main.evaluated(p), strict=True
+    ):
+        gain, weight = o.gain(p, power), huber(error, o.huber_db)[1] / NOISE_DB**2
+        side = o.target.slope(gain * power) * gain * np.maximum(power - own, 0.0)
+        pull[o.chain, index] += table @ (weight * side)
+        size[o.chain] += weight @ table[-1] ** 2  # its own gain's column stands last
+    own = np.arange(len(t.chains))
+    share = pull[own, first + own] / np.maximum(size, 1e-300)
+    moved = SIDE_LOBES_DB * np.abs((choice.fitted.covariance[first:] * pull).sum(axis=1))
+    return share, moved
 
 
 def _covariance(found: Fitted) -> np.ndarray:
@@ -786,10 +803,16 @@ def _report(t: Training, choice: Choice, wrong: Unexplained, seconds: float) -> 
         place = found.parameters.log_weight.size + 2 * len(found.parameters.log_excess)
         report["gain_offset_db"] = NEPER * found.parameters.log_gain
         report["gain_offset_std_db"] = NEPER * float(deviation[place])
+    known = NEPER * deviation[len(deviation) - len(t.chains) :]
     report["chains"] = {
-        name: {"gain_db": NEPER * float(gain), "std_db": NEPER * float(std)}
-        for name, gain, std in zip(
-            t.chains, found.parameters.log_gains, deviation[len(deviation) - len(t.chains) :], strict=True
+        name: {
+            "gain_db": NEPER * float(gain),
+            "std_db": float(np.hypot(std, moved)),
+            "side_lobe_share": float(share),
+            "side_lobe_std_db": float(moved),
+        }
+        for name, gain, std, share, moved in zip(
+            t.chains, found.parameters.log_gains, known, *side_lobes(t, choice), strict=True
         )
     }
     report["unexplained"] = {}
@@ -797,6 +820,21 @@ def _report(t: Training, choice: Choice, wrong: Unexplained, seconds: float) -> 
         if len(rows):
             report["unexplained"].setdefault(t.names[o.place.data], []).extend(o.place.rows[rows].tolist())
     return report
+
+
+def _warn_of_side_lobes(chains: dict[str, dict[str, float]]) -> None:
+    hanging = {name: one for name, one in chains.items() if one["side_lobe_std_db"] > HANGING_DB}
+    if hanging:
+        listed = ", ".join(
+            f"{name!r} ({100 * one['side_lobe_share']:.0f} % of its readings, {one['side_lobe_std_db']:.1f} dB)"
+            for name, one in hanging.items()
+        )
+        warnings.warn(
+            f"ds: gains of chains hang on the level of side lobes, taken to be known to {SIDE_LOBES_DB:g} dB: {listed}; "
+            "measure the pattern beyond its main lobe, or turn the antenna to what it is to see",
+            UserWarning,
+            stacklevel=users_level(),
+        )
 
 
 def _warn_of_left_out(data: Sequence[Measured], wrong: dict[str, list[int]]) -> None:

@@ -53,7 +53,6 @@ class Problem:
         material: of each group, shape ``(G,)``.
         chains: measuring chains whose gain is unknown.
         gain_offset: whether a gain common to all paths is free.
-        huber_db: larger errors count linearly [dB]: shadows that the geometry puts in the wrong place.
         energy: deviation of scattered and mirrored shares from a sum of one.
     """
 
@@ -63,7 +62,6 @@ class Problem:
     material: np.ndarray
     chains: int = 0
     gain_offset: bool = False
-    huber_db: float = 3.0
     energy: float = ENERGY
 
     @classmethod
@@ -219,10 +217,8 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Fitted:
     def total(x: np.ndarray) -> float:
         p = layout.unpack(x, start)
         prior = priors(p, start, layout, problem.energy)[0]
-        errors = problem.errors_db(p)
-        return weight * sum(float(huber(e, problem.huber_db)[0].sum()) for e in errors) + float(
-            (prior**2).sum()
-        )
+        own = zip(problem.observations, problem.errors_db(p), strict=True)
+        return weight * sum(float(huber(e, o.huber_db)[0].sum()) for o, e in own) + float((prior**2).sum())
 
     current = total(vector)
     for _ in range(steps):
@@ -257,10 +253,10 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Fitted:
 def _normal_equations(problem: Problem, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Newton matrix and gradient of the data term."""
     hessian, gradient = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
-    for error, table, index in problem.linearised(p, layout):
+    for o, (error, table, index) in zip(problem.observations, problem.linearised(p, layout), strict=True):
         if len(index) == 0:  # nothing that it sees is lit
             continue
-        root = np.sqrt(huber(error, problem.huber_db)[1]) / NOISE_DB
+        root = np.sqrt(huber(error, o.huber_db)[1]) / NOISE_DB
         table *= root.astype(np.float32)
         hessian[np.ix_(index, index)] += ssyrk(1.0, table.T, trans=1)  # its upper triangle
         gradient[index] += table @ (root * error).astype(np.float32)

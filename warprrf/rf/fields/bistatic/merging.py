@@ -114,7 +114,7 @@ def _costs(problem: Problem, p: Parameters, unit_of: np.ndarray, owner: np.ndarr
         share = p.scattered_share.astype(np.float32)
         gain = o.gain(p, power)
         power, gain = gain * power, gain * p.gain
-        loss = huber(o.target.error(power), problem.huber_db)[0].sum()
+        loss = huber(o.target.error(power), o.huber_db)[0].sum()
         mirrors = _mirror_changes(o, problem, materials, unit_of)
         for unit in np.unique(
             np.concatenate([unit_of[c.groups], unit_of[c.senders], np.array(list(mirrors), int)])
@@ -125,7 +125,7 @@ def _costs(problem: Problem, p: Parameters, unit_of: np.ndarray, owner: np.ndarr
             for a in np.flatnonzero(unit_of[c.senders] == unit):
                 change += (share - share[owner[unit]])[:, None] * c.further[a]
             error = o.target.error(np.maximum(power + gain * change, 0.0))
-            rise = huber(error, problem.huber_db)[0].sum(axis=1) - loss
+            rise = huber(error, o.huber_db)[0].sum(axis=1) - loss
             out[unit] += rise / NOISE_DB**2
     return out
 

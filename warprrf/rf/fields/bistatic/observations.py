@@ -33,7 +33,7 @@ from warprrf.rf.fields.bistatic.measured import (
 from warprrf.rf.positions import check_dataset, check_positions, question_unit, warn_of_unmodelled
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.readings import Readings, path_weights, question_readings
+from warprrf.rf.spectra.readings import Readings, fading_db, path_weights, question_readings
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, to_db
 from warprrf.rf.tracing.model import SETS, Effects, Layout, Model, Parameters
 from warprrf.rf.tracing.records import Bins, Evaluation, Records
@@ -55,6 +55,7 @@ READING_ERROR_DB = 1.0
 """Standard deviation of what a field cannot explain of a reading without noise [dB]."""
 TOTAL_ERROR_DB = 0.5
 """The same of all power of a place: errors of single directions average out."""
+HUBER_DB, WIDE_HUBER_DB = 3.0, 10.0  # see :class:`Observation`
 TAP_STEPS = 4.0  # that delays are told apart in, per tap
 
 
@@ -187,8 +188,12 @@ class Observation:
         floor: path gain that readings are in units of.
         chain: index of the measuring chain whose gain is unknown, -1 where it is known, or :data:`OWN_GAIN`.
         ratio: carrier of the readings over that of the fit's parameters.
-        robust: whether single readings may be wrong, so that errors count as Huber has them.
-        prefers_direct: whether readings of line of sight alone, which hold no material, count for more.
+        huber_db: larger errors count linearly in a fit [dB]: shadows that the geometry puts in the wrong place. More for
+            readings that fade, whose decibels have a long tail of their own, and for totals, which may miss a mirror of
+            metal: priors have weaker ones.
+        robust: whether single readings may be wrong, so that errors count so among places held out too.
+        sight: share of line of sight in each reading before any measurement, where those of it alone, which hold no
+            material, count for more, shape ``(N,)``; else None.
         rows: which of the place's readings these are, shape ``(N,)``; None for all.
     """
 
@@ -199,19 +204,23 @@ class Observation:
     floor: float
     chain: int = -1
     ratio: float = 1.0
+    huber_db: float = HUBER_DB
     robust: bool = True
-    prefers_direct: bool = False
+    sight: np.ndarray | None = None
     rows: np.ndarray | None = None
     _kept: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)
 
     def part(self, index: np.ndarray) -> Observation:
         """That of some of the readings."""
-        return replace(self, measured=self.measured.part(index), target=self.target.part(index), rows=index)
+        sight = None if self.sight is None else self.sight[index]
+        return replace(
+            self, measured=self.measured.part(index), target=self.target.part(index), rows=index, sight=sight
+        )
 
-    def losses(self, power: np.ndarray, huber_db: float) -> np.ndarray:
+    def losses(self, power: np.ndarray) -> np.ndarray:
         """Squared errors (N,) of predicted readings as they count [dB^2]."""
         error = self.target.error(power)
-        return huber(error, huber_db)[0] if self.robust else error**2
+        return huber(error, self.huber_db)[0] if self.robust else error**2
 
     def gain(self, p: Parameters, power: np.ndarray) -> float:
         """Of the measuring chain, or of these readings, where ``power`` (N,) is predicted in units of the floor."""
@@ -490,8 +499,6 @@ class _Tables:
         one, rows = self.one, place.rows
         floors = np.asarray(one.floor)[rows]
         floor = float(floors.min())
-        expected = one.expected_db[rows] - 10.0 * np.log10(floor)
-        above = NEPER * np.log1p(10.0 ** (expected / 10.0))
         step = None if one.bandwidth_hz is None else 1.0 / (TAP_STEPS * one.bandwidth_hz)
         weigh = partial(path_weights, one, rows, dtype=np.float32)
         self._pointings[:] = self._pointings or [_pointings(one, view)]
@@ -500,10 +507,15 @@ class _Tables:
         else:
             told_apart = {"arrival": one.arrival is not None, "departure": one.departure is not None}
             measured = WeighedPaths.of(view, weigh, **told_apart, delay_step_s=step)
+        bare = Observation(place, view, measured, Target(np.zeros(len(rows))), floor)
+        sight, steady = _shares(bare)
+        bias, fading = fading_db(one.samples, steady)
+        above = NEPER * np.log1p(one.power[rows] / floor * 10.0 ** (-bias / 10.0))
         unexplained = TOTAL_ERROR_DB if one.total else READING_ERROR_DB
-        trust = NOISE_DB / np.hypot(unexplained, one.noise_db[rows])
+        trust = NOISE_DB / np.hypot(np.hypot(unexplained, np.asarray(one.std_db)[rows]), fading)
         target = Target(above, trust, one.power[rows] <= floors)
-        return Observation(place, view, measured, target, floor, prefers_direct=not one.total)
+        huber_db = HUBER_DB if one.samples is None and not one.total else WIDE_HUBER_DB
+        return replace(bare, target=target, sight=None if one.total else sight, huber_db=huber_db)
 
     def frame(self) -> Frame:
         return _frame_of_powers(self.one)
@@ -592,6 +604,18 @@ def observe(
             )
         )
     return found, chains
+
+
+def _shares(o: Observation) -> tuple[np.ndarray, np.ndarray]:
+    """Of each reading before any measurement: the share of line of sight, and the sum of the squared shares of line of sight
+    and mirror paths, shape ``(N,)`` each."""
+    surface = o.view.tracer.surface
+    none = np.zeros((2, surface.cells))
+    model = Model(SETS["single"], Parameters.prior(surface.groups), none, o.place.transmitter)
+    materials = Evaluation(model.parameters, device=o.view.tracer.grid.device)
+    single = o.view.records[SHARP].powers(materials)[:, None] * o.path
+    share = single / np.maximum(o.predicted(model, materials), np.maximum(single.sum(axis=0), 1e-300))
+    return share[o.view.paths.order == 0].sum(axis=0), (share**2).sum(axis=0)
 
 
 def _pointings(one: Readings, view: View) -> tuple[np.ndarray, np.ndarray] | None:

@@ -88,9 +88,7 @@ def moved(one: Readings, offsets: Sequence[tuple[Place, np.ndarray]]) -> Reading
     return replace(one, receivers=receivers, position_std_m=0.0)
 
 
-def position_offset(
-    one: Readings, o: Observation, other: np.ndarray, power: np.ndarray, huber_db: float
-) -> np.ndarray:
+def position_offset(one: Readings, o: Observation, other: np.ndarray, power: np.ndarray) -> np.ndarray:
     """Offset of a receiver from where it is said to be [m], shape ``(3,)``: the one that readings and prior like best.
 
     Args:
@@ -98,7 +96,6 @@ def position_offset(
         o: what was read where it is said to be.
         other: prediction without line of sight and mirrors, shape ``(N,)``.
         power: of those paths, shape ``(L,)``; both in the units of the target, gain of the chain included.
-        huber_db: larger errors count linearly [dB].
     """
     place, paths, std = o.place, o.view.paths, one.position_std_m
     s = o.view.tracer.surface
@@ -118,9 +115,8 @@ def position_offset(
         missed = o.target.error(other + weight @ power) / NOISE_DB
         return np.concatenate([missed, offset / std])
 
-    scale = huber_db / NOISE_DB
     found = least_squares(
-        error, np.zeros(3), bounds=(-MOST_OFFSET * std, MOST_OFFSET * std), loss="huber", f_scale=scale,
+        error, np.zeros(3), bounds=(-MOST_OFFSET * std, MOST_OFFSET * std), loss="huber", f_scale=o.huber_db / NOISE_DB,
         x_scale=std, diff_step=1e-3,
     ).x  # fmt: skip
     # A step and a half of it must be free, or the receiver would end in a wall.
