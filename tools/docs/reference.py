@@ -28,7 +28,7 @@ GROUPS = {
 }
 WITH = {
     "rf.em": "rf.scene", "rf.simulate": "rf.scene", "rf.paths": "rf.scene", "rf.channel": "rf.scene",
-    "rf.maps": "rf.fields", "rf.relevance": "rf.fields",
+    "rf.maps": "rf.fields", "rf.relevance": "rf.fields", "rf.tracing": "rf.fields",
 }  # fmt: skip
 """Packages whose names stand on another's page."""
 
