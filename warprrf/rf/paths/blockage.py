@@ -1,6 +1,6 @@
 """What reaches a receiver behind an obstacle, estimated: round its edges by diffraction, through it by transmission.
 
-Neither is part of a radio field; :func:`warprrf.relevance` tells with these estimates where that matters. They err on
+Neither is part of a radio field; fits and :func:`warprrf.relevance` tell with these estimates where that matters. They err on
 the strong side: an edge is a knife edge seen alone, and of an obstacle only the wall that a ray enters by weakens it.
 What goes over two edges is left out.
 """
@@ -22,6 +22,33 @@ MOST_EDGES = 400  # of a receiver, those of least detour: the others are weaker
 MOST_CROSSINGS = 32  # faces on a ray; one that meets more brings nothing
 LIFT_M = 1e-3  # edges are looked at from this far off
 APART = (90, 180)  # edges that a receiver sees in one cell of such a grid count once, the strongest
+
+
+LOSS_TANGENT = 0.06
+"""Of walls of unknown loss: as of plasterboard and wood at 300 GHz in ITU-R P.2040-4, table 3."""
+ASSUMED_PERMITTIVITY = 4.0
+"""Of walls whose material is not known, real part."""
+ASSUMED_THICKNESS_M = 0.0125  # a plasterboard: thin walls let more through
+
+
+@dataclass(frozen=True)
+class Walls:
+    """What transmission goes through: mesh, and complex permittivity and thickness [m] of each face ``(F,)``; and whether
+    these are assumed."""
+
+    mesh: Mesh
+    permittivity: np.ndarray
+    thickness_m: np.ndarray
+    assumed: bool = False
+
+    @classmethod
+    def of(
+        cls, mesh: Mesh, permittivity: ArrayLike = ASSUMED_PERMITTIVITY, thickness_m: ArrayLike = np.nan
+    ) -> Walls:
+        """Those of which the real part of each face's permittivity is known, or nothing, and the thickness if not NaN."""
+        real, thickness = (np.broadcast_to(a, len(mesh.faces)) for a in (permittivity, thickness_m))
+        known = np.where(np.isnan(thickness), ASSUMED_THICKNESS_M, thickness)
+        return cls(mesh, real * (1.0 - 1j * LOSS_TANGENT), known, True)
 
 
 @dataclass(frozen=True)
@@ -47,6 +74,22 @@ def knife_edge_loss_db(v: ArrayLike) -> np.ndarray:
     v = np.asarray(v, dtype=np.float64)
     x = np.maximum(v, -0.78) - 0.1
     return np.where(v > -0.78, 6.9 + 20.0 * np.log10(np.sqrt(x**2 + 1.0) + x), 0.0)
+
+
+def past_obstacles(
+    walls: Walls,
+    transmitter: np.ndarray,
+    receivers: np.ndarray,
+    wavelength_m: float,
+    *,
+    skin_m: float,
+    device: DeviceLike = None,
+) -> dict[str, SidePaths]:
+    """``"diffraction"`` and ``"transmission"`` to ``receivers`` (R, 3), all without line of sight."""
+    mesh, link = walls.mesh, (transmitter, receivers, wavelength_m)
+    edges = diffracted(mesh, *link, lift_m=max(LIFT_M, skin_m), device=device)
+    through = transmitted(mesh, *link, walls.permittivity, walls.thickness_m, skin_m=skin_m, device=device)
+    return {"diffraction": edges, "transmission": through}
 
 
 def diffracted(

@@ -7,20 +7,19 @@ same field with fewer effects; path gains add up by sequence of interactions, so
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from warprrf.cache import cached_property
 from warprrf.device import Progress
-from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.absorption import gas_attenuation_db_per_m
 from warprrf.rf.em.fresnel import fresnel_curves, lobe, slab_reflection, surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.observations import Frame
-from warprrf.rf.paths.blockage import LIFT_M, SidePaths, diffracted, transmitted
+from warprrf.rf.paths.blockage import Walls, past_obstacles
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.spectrum import default_floor, pixel_solid_angles, spread, to_db
 from warprrf.rf.tracing.model import Effects, Parameters
@@ -28,20 +27,7 @@ from warprrf.rf.tracing.render import images
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import View
 
-ASSUMED_PERMITTIVITY = 4.0 * (1.0 - 0.06j)
-"""Of walls whose material is not known; loss as of plasterboard and wood at 300 GHz in ITU-R P.2040-4, table 3."""
-ASSUMED_THICKNESS_M = 0.0125  # a plasterboard: thin walls let more through
 EVERYTHING = Effects(mirrors=2)
-
-
-@dataclass(frozen=True)
-class Walls:
-    """What transmission goes through: mesh, and complex permittivity and thickness [m] of each face ``(F,)``."""
-
-    mesh: Mesh
-    permittivity: np.ndarray
-    thickness_m: np.ndarray
-    assumed: bool
 
 
 def material_parameters(materials: Sequence[Any], frequency_hz: float) -> Parameters:
@@ -92,20 +78,15 @@ def full_field(
         whole = replace(
             geometry, effects=effects, transmitter=transmitter, air=None
         )  # air is judged by itself
-        return whole, _unknown_walls(geometry.surface.mesh), "fit"
+        return whole, Walls.of(geometry.surface.mesh), "fit"
     surface = Surface.of(geometry)
     frame = Frame(transmitter, frequency_hz, shape, 1.0, (0.0, 1.0), beam_sigma_rad, None)
     field = BistaticField.prior(surface, frame, effects=replace(EVERYTHING, residual=False), device=device)
     if not hasattr(geometry, "materials"):
-        return field, _unknown_walls(surface.mesh), "assumed"
+        return field, Walls.of(surface.mesh), "assumed"
     table, face = surface_table(list(geometry.materials), frequency_hz), np.asarray(geometry.face_material)
-    walls = Walls(geometry.mesh, table.permittivity[face], table.thickness_m[face], False)
+    walls = Walls(geometry.mesh, table.permittivity[face], table.thickness_m[face])
     return replace(field, parameters=material_parameters(geometry.materials, frequency_hz)), walls, "scene"
-
-
-def _unknown_walls(mesh: Mesh) -> Walls:
-    faces = len(mesh.faces)
-    return Walls(mesh, np.full(faces, ASSUMED_PERMITTIVITY), np.full(faces, ASSUMED_THICKNESS_M), True)
 
 
 def with_lobes(p: Parameters, kept: tuple[int, ...]) -> Parameters:
@@ -180,7 +161,11 @@ class FullModel:
             field.path_gains(self.views[-1])
             progress("relevance", r + 1, len(receivers) + 1)
         self.blocked = np.array([not (v.paths.order == 0).any() for v in self.views])
-        self.side = {"diffraction": self._diffracted(), "transmission": self._transmitted()}
+        which = np.flatnonzero(self.blocked)
+        past = past_obstacles(
+            walls, field.transmitter, receivers[which], field.wavelength_m, skin_m=field.surface.skin_m, device=field.device
+        )  # fmt: skip
+        self.side = {name: replace(found, receiver=which[found.receiver]) for name, found in past.items()}
         residual = ("residual",) if field.effects.residual else ()
         self.effects = (*NAMES, *residual, *map(lobe_name, field.parameters.lobes), "gas", *self.side)
         self.all = frozenset(self.effects)
@@ -257,24 +242,6 @@ class FullModel:
         """Length of the longest path [m]."""
         lengths = [v.single_bounce_m()[v.tables(effects_of(self.all))["S"].ray] for v in self.views]
         return max(float(np.max(x, initial=0.0)) for x in (*lengths, *(v.paths.length_m for v in self.views)))
-
-    def _diffracted(self) -> SidePaths:
-        which = np.flatnonzero(self.blocked)
-        f = self.field
-        found = diffracted(
-            self.walls.mesh, f.transmitter, self.receivers[which], f.wavelength_m,
-            lift_m=max(LIFT_M, f.surface.skin_m), device=f.device,
-        )  # fmt: skip
-        return replace(found, receiver=which[found.receiver])
-
-    def _transmitted(self) -> SidePaths:
-        which = np.flatnonzero(self.blocked)
-        f, w = self.field, self.walls
-        found = transmitted(
-            w.mesh, f.transmitter, self.receivers[which], f.wavelength_m, w.permittivity, w.thickness_m,
-            skin_m=f.surface.skin_m, device=f.device,
-        )  # fmt: skip
-        return replace(found, receiver=which[found.receiver])
 
 
 NAMES = (

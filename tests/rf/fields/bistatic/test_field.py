@@ -1,15 +1,16 @@
 """The bistatic field: laws it must obey, a fit to deterministic spectra of a furnished room, and hard cases."""
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from furnished import MATERIALS, RECEIVERS, ROOM, SHAPE, SIGMA, TX, F, spectra
-from radio_scenes import RadioScene, box_mesh, joined, mirror_paths, observation
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths, observation
 from twin_fields import known_field, room
 
-from warprrf.rf.em.fresnel import fresnel_curves
+from warprrf.rf.em.fresnel import fresnel_curves, slab_transmission
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
@@ -204,6 +205,35 @@ def test_an_empty_spectrum_is_refused_and_one_among_others_is_not(
         .spectrum(RECEIVERS[5])
         .path_gain
     ).all()
+
+
+def test_what_glass_lets_through_is_said_to_be_left_out_at_any_carrier() -> None:
+    """Of a pane of 10 mm the estimate is Friis's power less the slab's transmission, over all power that the field has."""
+    corner = [[2.6, y, z] for y, z in ((0, 0), (3, 0), (3, 3), (0, 3))]
+    mesh, part = joined(ROOM, (np.array(corner), np.array([[0, 1, 2], [0, 2, 3]])))
+    glass = SlabMaterial("glass", 6.31, 2.0, 0.01, 0.3)
+    scene, carrier_hz = RadioScene(mesh, part, [MATERIALS[0], glass]), 140e9
+    known = spectra(scene, RECEIVERS[[1, 3, 4, 7]], frequency_hz=carrier_hz)
+    with pytest.warns(UserWarning, match="transmission is not modelled.* 2 of 2 blocked receivers") as told:
+        field = RadioField.fit(scene, known, quick=True)
+    assert told[0].filename == __file__
+    estimate = field.report["left_out"]
+    for k, receiver in enumerate(estimate["receivers"]):
+        way = TX - receiver
+        friis = field.wavelength_m / (4 * np.pi * np.linalg.norm(way))
+        eta = (1 + field.parameters.excess[1]) * (1 - 0.06j)
+        waves = slab_transmission(abs(way[0]) / np.linalg.norm(way), eta, 0.01, field.wavelength_m)
+        more = friis**2 * np.mean(np.abs(waves) ** 2)
+        whole = field.spectrum(receiver).path_gain.sum()
+        assert estimate["transmission"][k] == pytest.approx(10 * np.log10(1 + more / whole), abs=0.02)
+
+
+def test_an_open_room_s_fit_leaves_nothing_out(scene: RadioScene, data: SpectrumDataset) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        field = RadioField.fit(scene, spectra(scene, RECEIVERS, frequency_hz=140e9), quick=True)
+    estimate = field.report["left_out"]
+    assert len(estimate["receivers"]) == 3 and max(estimate["diffraction"] + estimate["transmission"]) < 0.5
 
 
 def test_effects_may_change_after_the_fit(field: BistaticField) -> None:

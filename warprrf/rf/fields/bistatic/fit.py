@@ -39,6 +39,7 @@ from warprrf.rf.fields.bistatic.observations import (
 from warprrf.rf.fields.bistatic.placing import moved, position_offset, with_azimuths
 from warprrf.rf.fields.bistatic.residual import fit_residual, shares_of
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
+from warprrf.rf.paths.blockage import Walls, past_obstacles
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.tracing.model import LOBES, SETS, Effects, Model, Parameters
@@ -71,6 +72,10 @@ KNOWN_BETTER = 2.0
 SIDE_LOBES_DB = 3.0
 """Standard deviation of the level of an antenna's side lobes, which few measure."""
 HANGING_DB = 1.0  # that this moves a chain's gain by and is worth a warning
+MOST_BLOCKED = 12
+"""Blocked places at which effects that are left out are estimated."""
+DARK = 0.01  # share of line of sight below which a place is blocked
+LEFT_OUT_DB = 0.5  # of them is too little for a warning
 CLEAR_DB = 10.0  # above its floor a reading's decibels err as they are
 NORMAL_MEDIAN = 1.4826  # standard deviation over the median size of normal errors
 MOST_RAYS = 500_000_000
@@ -328,6 +333,7 @@ def fit(
             found = _fitted(training)
     _warn_of_left_out(data, found.report["unexplained"])
     _warn_of_side_lobes(found.report["chains"])
+    _warn_of_unmodelled(found.report["left_out"])
     places_moved = {
         training.names[k]: [(place.receiver.tolist(), offset.tolist()) for place, offset in own]
         for k, own in offsets.items()
@@ -542,10 +548,11 @@ def _fitted(t: Training) -> Fit:
     choice, model = everyone(t, choice, residual)
     wrong = unexplained(t, model)
     if any(len(rows) for rows in wrong.rows):
-        t = left_out(t, wrong.rows)
+        t = without(t, wrong.rows)
         choice, model = everyone(t, choice, residual)
     if errors is not None:
         errors = replace(errors, covariance=_covariance(choice.fitted))
+    missed = left_out(t, model)
     t.step(last=True)
     rays = t.observations[0].view.tracer.grid.sub_pixels
     return Fit(
@@ -554,7 +561,7 @@ def _fitted(t: Training) -> Fit:
         choice.material,
         rays,
         errors,
-        _report(t, choice, wrong, time.perf_counter() - started),
+        _report(t, choice, wrong, time.perf_counter() - started) | {"left_out": missed},
     )
 
 
@@ -592,7 +599,7 @@ def _choose_of_few(t: Training, trials: list[Choice]) -> Choice:
     everywhere = np.arange(len(t.observations))
     models = [t.model(trial) for trial in (single, room)]
     wrong = zip(*(unexplained(t, model).rows for model in models), strict=True)
-    counted = left_out(t, [np.intersect1d(*rows) for rows in wrong])  # without what neither explains
+    counted = without(t, [np.intersect1d(*rows) for rows in wrong])  # without what neither explains
     losses = [counted.loss(model, everywhere) for model in models]
     fewer = losses[0] < MUCH_BETTER * losses[1]
     t.note(_name(single.effects), fewer, losses[0])
@@ -715,7 +722,7 @@ def unexplained(t: Training, model: Model) -> Unexplained:
     return Unexplained(rows, noise)
 
 
-def left_out(t: Training, wrong: Sequence[np.ndarray]) -> Training:
+def without(t: Training, wrong: Sequence[np.ndarray]) -> Training:
     """``t`` in which readings ``wrong`` of each place count no longer."""
     observations, parts = list(t.observations), list(t.parts)
     for k, rows in enumerate(wrong):
@@ -743,6 +750,42 @@ def _offsets(t: Training, found: Fit) -> dict[int, list[tuple[Place, np.ndarray]
         offset = position_offset(one, o, gain * other, gain * direct)  # type: ignore[arg-type]
         offsets.setdefault(o.place.data, []).append((o.place, offset))
     return offsets
+
+
+def left_out(t: Training, model: Model) -> dict[str, Any]:
+    """Effects that are not modelled, estimated at a few ``"receivers"`` that are blocked: by how much what goes round edges and
+    through walls would raise all power there [dB], by name; and ``"error_db"``, by how much the fit has more than was read
+    there, rms. What it lacks is no measure of its error: it may be just these effects."""
+    blocked = list({o.place.seen_from: k for k, o in enumerate(t.observations) if _is_dark(o.view)}.values())
+    chosen = np.linspace(0, len(blocked) - 1, min(len(blocked), MOST_BLOCKED)).astype(int)
+    seen, s = list(t.evaluated(model, [blocked[i] for i in chosen])), t.surface
+    walls = Walls.of(s.mesh, 1.0 + model.parameters.excess[s.group], s.thickness_m[s.group])
+    receivers = np.array([o.place.receiver for o, *_ in seen]).reshape(-1, 3)
+    total, over = np.zeros((2, len(seen)))
+    for k, (o, here, materials) in enumerate(seen):
+        gains = path_gains(o.view, here, materials)
+        total[k] = gains.sharp.sum() + gains.by_ray().sum()
+        read_sum, predicted = o.target.sums(o.predicted(here, materials))
+        over[k] = NEPER * max(np.log1p(predicted) - np.log1p(read_sum), 0.0)
+    floor = np.array([o.floor for o, *_ in seen])
+    change = {name: np.zeros(len(seen)) for name in ("diffraction", "transmission")}
+    for tracer in {id(o.view.tracer): o.view.tracer for o, *_ in seen}.values():
+        own = np.array([k for k, (o, *_) in enumerate(seen) if o.view.tracer is tracer])
+        link, grid = (tracer.transmitter, receivers[own], tracer.wavelength_m), tracer.grid
+        for name, paths in past_obstacles(walls, *link, skin_m=s.skin_m, device=grid.device).items():
+            power = model.parameters.gain * paths.power * grid.transmittance(paths.length_m)
+            more = np.bincount(paths.receiver, power, minlength=len(own))
+            change[name][own] = NEPER * np.log1p(more / (total[own] + floor[own]))
+    error_db = float(np.sqrt(np.mean(over**2))) if len(seen) else 0.0
+    return {"receivers": receivers.tolist(), "error_db": error_db} | {
+        n: c.tolist() for n, c in change.items()
+    }
+
+
+def _is_dark(view: View) -> bool:
+    """Whether less than :data:`DARK` of line of sight passes what is in its way."""
+    p = view.paths
+    return bool((p.share[p.order == 0] ** 2).sum() < DARK)
 
 
 def side_lobes(t: Training, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
@@ -835,6 +878,19 @@ def _warn_of_side_lobes(chains: dict[str, dict[str, float]]) -> None:
             UserWarning,
             stacklevel=users_level(),
         )
+
+
+def _warn_of_unmodelled(missed: dict[str, Any]) -> None:
+    for name in ("diffraction", "transmission"):
+        large = [db for db in missed[name] if db > max(missed["error_db"], LEFT_OUT_DB)]
+        if large:
+            warnings.warn(
+                f"{name} is not modelled, but would add {np.median(large):.1f} dB to all power of {len(large)} of "
+                f"{len(missed[name])} blocked receivers, as estimated; where it is in what was read, something else was fitted to "
+                "it: warprrf.relevance tells more",
+                UserWarning,
+                stacklevel=users_level(),
+            )
 
 
 def _warn_of_left_out(data: Sequence[Measured], wrong: dict[str, list[int]]) -> None:

@@ -158,8 +158,13 @@ class Target:
 
     def gain(self, power: np.ndarray) -> float:
         """Under which predicted powers (N,) in units of the floor have the sum of what was read."""
+        read, predicted = self.sums(power)
+        return read / max(predicted, 1e-300)
+
+    def sums(self, power: np.ndarray) -> tuple[float, float]:
+        """All that was read, and what predicted powers (N,) have of it, in units of the floor."""
         known = 1.0 if self.trust is None else self.trust > 0
-        return float((known * np.expm1(self.db / NEPER)).sum() / max((known * power).sum(), 1e-300))
+        return float((known * np.expm1(self.db / NEPER)).sum()), float((known * power).sum())
 
     def error(self, power: np.ndarray) -> np.ndarray:
         """Error of predicted powers ``(..., N)`` in units of the floor, as it counts [dB]."""
