@@ -66,11 +66,6 @@ class MirrorPaths:
         own = self.subset(np.isin(self.receiver, receivers))
         return replace(own, receiver=np.searchsorted(receivers, own.receiver))
 
-    def gain(self, wavelength_m: float) -> np.ndarray:
-        """Complex gain ``(L,)`` of perfect reflectors without a sign change: Friis along the unfolded length."""
-        cycles = np.mod(self.length_m / wavelength_m, 1.0)
-        return self.share * wavelength_m / (4.0 * np.pi * self.length_m) * np.exp(-2j * np.pi * cycles)
-
 
 def exact_paths(
     images: MirrorImages, receivers: np.ndarray, order: int, progress: Progress | None = None

@@ -76,6 +76,10 @@ class Records:
         """Power of each under ``materials``, shape ``(N,)``."""
         if len(self) == 0:
             return np.zeros(0)
+        if self.kind == kernels.SOURCE and not materials.has_sources:
+            raise ValueError(
+                "materials: got none that elements send by, expected an evaluation with their radiance"
+            )
         table, m, launch = self._table(materials)
         out = wp.empty(len(self), dtype=REALS[self.power.dtype], device=materials.device)
         launch(
@@ -88,6 +92,8 @@ class Records:
     def add_slopes(self, materials: Evaluation, bins: Bins, place: np.ndarray, slopes: np.ndarray) -> None:
         """Add to ``slopes`` (B, C) the derivatives of the powers summed in ``bins`` to logarithms of parameters; those of
         material m stand from column ``place[m]`` on: lobe weights, epsilon_r - 1, mirrored share."""
+        if isinstance(materials, SlabEvaluation):
+            raise TypeError("materials: got slabs, expected half-spaces, which have slopes")
         self._add(3, materials, bins, [wp.array(place, dtype=wp.int32, device=materials.device)], slopes)
 
     def components(self, materials: Evaluation, bins: Bins) -> tuple[np.ndarray, np.ndarray]:
@@ -181,6 +187,11 @@ class Evaluation:
         self._side_group = np.zeros(0, int) if side_group is None else side_group
         self._radiance = np.zeros(0) if radiance is None else radiance
         self._made = Cache(2)  # which a pickle leaves behind
+
+    @property
+    def has_sources(self) -> bool:
+        """Whether it knows what elements send."""
+        return len(self._radiance) > 0
 
     def by_materials(self, parameters: Parameters, material: np.ndarray) -> Evaluation:
         """The same with parameters of materials in place of those of groups; ``material`` (G,) is that of each."""

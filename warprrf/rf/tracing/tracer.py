@@ -37,8 +37,6 @@ THROUGH_MIRRORS = 3  # rays of a pixel that look for light by way of mirrors
 INTO_MIRRORS = 2  # square root of the rays of a pixel that go on at mirrors: what these show is seen a second time already
 SHARP = "sharp"
 """Name of the table of line of sight and mirrors."""
-SENT_ON = ("E", "EM")
-"""Sequences that start at an element."""
 _TRACED = Cache(6)  # a lobby's take up to 90 MB each; the bound is the process's, not a surface's
 
 
@@ -140,7 +138,7 @@ class Tracer:
         self.frequency_hz = frequency_hz
         self.wavelength_m = SPEED_OF_LIGHT / frequency_hz
         self._first_grid = grid
-        self.kept = Cache(4)
+        self.kept = Cache(8)
 
     @classmethod
     def of(

@@ -135,10 +135,10 @@ class BistaticField(RadioField):
                 f"material: got {np.unique(self.material)}, expected all of 0 to {materials - 1}"
             )
         known = Layout(materials, sizes["L"]).size
-        if self.errors is not None and not known <= len(self.errors.covariance) <= known + 2:
+        if self.errors is not None and len(self.errors.covariance) not in (known, known + 1):
             raise ValueError(
-                f"errors: got a covariance of {len(self.errors.covariance)} parameters, expected {known}, and one each for "
-                "a common gain and a power of the carrier"
+                f"errors: got a covariance of {len(self.errors.covariance)} parameters, expected {known}, or one more for a "
+                "common gain"
             )
 
     @property
@@ -474,7 +474,8 @@ class BistaticField(RadioField):
 
     def evaluation(self, tracer: Tracer) -> Evaluation:
         """Its parameters under a transmitter as kernels take them, what surfaces get of each other included."""
-        return self._evaluated.get(tracer.transmitter.tobytes(), lambda: evaluation(tracer, self.state))
+        key = tracer.transmitter.tobytes(), tracer.frequency_hz, tracer.grid.loss_per_m
+        return self._evaluated.get(key, lambda: evaluation(tracer, self.state))
 
     def suggest(
         self,
@@ -544,6 +545,7 @@ class BistaticField(RadioField):
         )
         o = Observation(place, view, SpectrumPixels(self._beam), Target(np.zeros(image.size)), self.floor)
         slopes, index = o.slopes(self.effects, materials, layout)
+        slopes = np.float32(self.parameters.gain) * slopes
         power = image.ravel() / self.floor
         if len(self.errors.covariance) > layout.size:  # of a common gain
             slopes, index = (

@@ -551,7 +551,7 @@ def _fitted(t: Training) -> Fit:
         t = without(t, wrong.rows)
         choice, model = everyone(t, choice, residual)
     if errors is not None:
-        errors = replace(errors, covariance=_covariance(choice.fitted))
+        errors = replace(errors, covariance=_covariance(choice.fitted, t.options.gain_offset))
     missed = left_out(t, model)
     t.step(last=True)
     rays = t.observations[0].view.tracer.grid.sub_pixels
@@ -668,7 +668,9 @@ def cross_validate(t: Training, choice: Choice) -> tuple[bool, ErrorModel | None
         t.observations[k].target.error(x).reshape(shape)
         for k, x, shape in zip(order, power[keep], shapes, strict=True)
     ]
-    return keep, learn_errors(images, missed, np.array(gaps), places, _covariance(choice.fitted))
+    return keep, learn_errors(
+        images, missed, np.array(gaps), places, _covariance(choice.fitted, t.options.gain_offset)
+    )
 
 
 def _folds(t: Training) -> list[np.ndarray]:
@@ -820,9 +822,10 @@ def side_lobes(t: Training, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
     return share, moved
 
 
-def _covariance(found: Fitted) -> np.ndarray:
-    """Of what a field keeps: without the gains of chains."""
-    kept = len(found.covariance) - len(found.parameters.log_gains)
+def _covariance(found: Fitted, gain: bool) -> np.ndarray:
+    """Of what a field keeps: parameters of materials and the common gain, if that was free."""
+    p = found.parameters
+    kept = p.log_weight.size + p.log_excess.size + p.log_mirror.size + gain
     return found.covariance[:kept, :kept]
 
 

@@ -213,6 +213,10 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Fitted:
     vector, damping, weight = layout.pack(start), 1e-3, 1.0 / NOISE_DB**2
     count = max(sum(len(o.target.db) for o in problem.observations), 1)
     hessian, losses = np.eye(layout.size), []
+    if steps == 0:
+        hessian = _normal_equations(problem, start, layout)[0]
+        slopes = priors(start, start, layout, problem.energy)[1]
+        hessian += slopes.T @ slopes
 
     def total(x: np.ndarray) -> float:
         p = layout.unpack(x, start)

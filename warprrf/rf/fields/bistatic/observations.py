@@ -59,7 +59,7 @@ HUBER_DB, WIDE_HUBER_DB = 3.0, 10.0  # see :class:`Observation`
 TAP_STEPS = 4.0  # that delays are told apart in, per tap
 
 
-def huber(error: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
+def huber(error: np.ndarray, threshold: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Loss and weight of each error: square up to ``threshold``, linear beyond (Huber 1964)."""
     size = np.abs(error)
     small = size <= threshold

@@ -19,7 +19,7 @@ from scipy.sparse import block_diag, csr_matrix, hstack, identity, vstack
 from scipy.sparse.linalg import LinearOperator, cg
 
 from warprrf.rf.fields.bistatic.measured import Measurement, read
-from warprrf.rf.fields.bistatic.observations import NOISE_DB, Observation, Target, huber
+from warprrf.rf.fields.bistatic.observations import HUBER_DB, NOISE_DB, Observation, Target, huber
 from warprrf.rf.tracing.model import Model
 from warprrf.rf.tracing.records import Evaluation
 from warprrf.rf.tracing.render import path_gains
@@ -32,7 +32,6 @@ LARGEST = 4.0  # gain [nepers]
 LONGEST = 3.0  # step of a gain, in standard deviations
 STEPS, QUICK_STEPS = (4, 12), (2, 8)
 """Gauss-Newton steps and of conjugate gradients in each; the few of a quick fit find three quarters of what is to be found."""
-HUBER_DB = 3.0
 
 
 @dataclass(frozen=True)
@@ -45,12 +44,14 @@ class Shares:
         rest: readings of everything else, shape ``(N,)``.
         measured: how readings come from bins.
         target: what was read.
+        huber_db: larger errors count linearly [dB].
     """
 
     power: csr_matrix
     rest: np.ndarray
     measured: Measurement
     target: Target
+    huber_db: float = HUBER_DB
 
 
 def shares_of(o: Observation, model: Model, materials: Evaluation) -> Shares:
@@ -80,7 +81,7 @@ def shares_of(o: Observation, model: Model, materials: Evaluation) -> Shares:
         own = csr_matrix((np.concatenate(powers).astype(np.float32), places), shape=(count, 2 * cells))
     known = np.asarray(own.sum(axis=1)).reshape(-1, 1)
     rest = np.maximum(read(gains, o.measured) / unit - o.measured.of_bins(known)[:, 0], 0.0)
-    return Shares(own, rest, o.measured, o.target)
+    return Shares(own, rest, o.measured, o.target, o.huber_db)
 
 
 def fit_residual(
@@ -101,6 +102,7 @@ def fit_residual(
     power = vstack([s.power for s in shares], format="csr")
     rest = np.concatenate([s.rest for s in shares])
     target = Target.joined([s.target for s in shares])
+    threshold = np.repeat([s.huber_db for s in shares], [len(s.rest) for s in shares])
     # Receivers that are measured alike go through the measurement together.
     batches = [list(own) for _, own in groupby(shares, key=lambda s: s.measured.alike)]
     bins = np.cumsum([0, *(len(b) * b[0].power.shape[0] for b in batches)])
@@ -132,7 +134,7 @@ def fit_residual(
         gain = np.exp(np.clip(gains @ unknown, -LARGEST, LARGEST))
         total = np.maximum(spread(gain, quick=False), 0.0) + rest
         error, slope = target.error(total), target.slope(total)
-        robust = huber(error, HUBER_DB)[1] / noise_db**2
+        robust = huber(error, threshold)[1] / noise_db**2
 
         def curvature(
             v: np.ndarray, gain: np.ndarray = gain, weight: np.ndarray = slope**2 * robust
