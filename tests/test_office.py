@@ -84,8 +84,9 @@ def test_a_horn_and_a_power_meter_make_a_field_that_is_right_where_nobody_measur
     figures = json.loads((place / "figures.json").read_text())["bistatic"]
     assert figures["receivers"] == 5 and figures["psnr_db"] > 24.0 and figures["direction_within_3deg"] > 0.8
     truth = wr.SpectrumDataset.load(place / "truth.nc")
-    total = field.spectra(truth.receivers).path_gain.sum(axis=(1, 2)) / truth.path_gain.sum(axis=(1, 2))
-    assert np.median(np.abs(10 * np.log10(total[truth.line_of_sight]))) < 0.5
+    seen = truth.subset(truth.line_of_sight)
+    total = field.spectra(seen.receivers).path_gain.sum(axis=(1, 2)) / seen.path_gain.sum(axis=(1, 2))
+    assert np.median(np.abs(10 * np.log10(total))) < 0.5
 
 
 def test_the_page_opens_with_all_of_it(place):
