@@ -39,7 +39,7 @@ PUBLIC = """
 Camera.pinhole Camera.spherical Gaussians.save_ply Gaussians.load_ply Mesh.cast Mesh.visible RadioField.fit RadioField.save
 RadioField.load RadioField.spectrum RadioField.paths Reconstruction.from_files Reconstruction.save Reconstruction.load
 Reconstruction.report Scene.load SpectrumDataset.load SpectrumDataset.save SpectrumDataset.split SpectrumDataset.export_exr
-Relevance.table Relevance.save Relevance.load Relevance.options reconstruct relevance render simulate trace_paths
+Relevance.table Relevance.save Relevance.load Relevance.needs reconstruct relevance render simulate trace_paths
 """.split()
 
 # From a mesh to a field to a spectrum, with what is in the wheel and its core dependencies alone.

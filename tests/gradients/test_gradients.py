@@ -222,7 +222,7 @@ class PathRecords(WholePath):
     share = 1.0
 
     def draw(self, seed, rng):
-        kernel, self.launches = records.build(wp.float64)[2], []
+        kernel, self.launches = records.build(wp.float64).record_power, []
         lobes = tuple(rng.choice(40, 3, replace=False).tolist())
         weight, excess, mirror = (
             rng.uniform(0.1, 1.0, (3, 3)),

@@ -51,7 +51,7 @@ def test_powers_of_two_transmitters_are_added_and_their_strongest_paths_listed_t
 
 
 def test_fewer_mirrors_on_a_path_mean_fewer_paths(field):
-    kinds = [asked(field, mirror_order=k).paths[0].kind for k in range(field.terms.mirror_order + 1)]
+    kinds = [asked(field, mirror_order=k).paths[0].kind for k in range(field.effects.mirrors + 1)]
     mirrors = [int((kind == "mirror").sum()) for kind in kinds]
     assert mirrors[0] == 0 and mirrors == sorted(mirrors) and mirrors[-1] > 0
 

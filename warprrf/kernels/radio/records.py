@@ -10,6 +10,7 @@ Angles of a mirror: cosine of incidence, turn of the plane of incidence [rad]; o
 and of scattering, and that of the angle to the mirror direction.
 """
 
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -308,4 +309,6 @@ def build(real: type) -> Any:
                         part = real(0.5) * (part + at(moments, c, angle[1]))
                     out[b, base + j * wp.static(MOMENTS) + c] += value * part
 
-    return Materials, Table, record_power, bin_slopes, bin_components
+    return SimpleNamespace(
+        Materials=Materials, Table=Table, record_power=record_power, bin_slopes=bin_slopes, bin_components=bin_components
+    )  # fmt: skip

@@ -83,7 +83,7 @@ class Records:
         table, m, launch = self._table(materials)
         out = wp.empty(len(self), dtype=REALS[self.power.dtype], device=materials.device)
         launch(
-            kernels.build(REALS[self.power.dtype])[2],
+            kernels.build(REALS[self.power.dtype]).record_power,
             len(self),
             [table, m, m.weight, m.excess, m.mirror, out],
         )
@@ -94,7 +94,7 @@ class Records:
         material m stand from column ``place[m]`` on: lobe weights, epsilon_r - 1, mirrored share."""
         if isinstance(materials, SlabEvaluation):
             raise TypeError("materials: got slabs, expected half-spaces, which have slopes")
-        self._add(3, materials, bins, [wp.array(place, dtype=wp.int32, device=materials.device)], slopes)
+        self._add("bin_slopes", materials, bins, [wp.array(place, dtype=wp.int32, device=materials.device)], slopes)
 
     def components(self, materials: Evaluation, bins: Bins) -> tuple[np.ndarray, np.ndarray]:
         """What groups scatter into each bin at unit weight: the groups that do, shape ``(A,)``, and sums by lobe and
@@ -109,17 +109,17 @@ class Records:
             wp.array(fresnel_curves().moments, dtype=real, device=materials.device),
         ]
         found = np.zeros((bins.count, len(groups) * lobes * kernels.MOMENTS), self.power.dtype)
-        self._add(4, materials, bins, more, found)
+        self._add("bin_components", materials, bins, more, found)
         return groups, found.reshape(bins.count, len(groups), lobes, kernels.MOMENTS)
 
-    def _add(self, kernel: int, materials: Evaluation, bins: Bins, more: list[Any], sums: np.ndarray) -> None:
+    def _add(self, kernel: str, materials: Evaluation, bins: Bins, more: list[Any], sums: np.ndarray) -> None:
         if sums.size == 0 or len(self) == 0:
             return
         real, where = REALS[self.power.dtype], materials.device
         out = wp.array(sums, dtype=real, device=where, copy=False)
         table, m, launch = self._table(materials)
         ordered = [wp.array(a, dtype=wp.int32, device=where, copy=False) for a in (bins.first, bins.order)]
-        launch(kernels.build(real)[kernel], bins.count, [*ordered, table, m, *more, out])
+        launch(getattr(kernels.build(real), kernel), bins.count, [*ordered, table, m, *more, out])
         if out.ptr != sums.ctypes.data:  # it was a copy: of another precision, or on another device
             sums[...] = out.numpy()
 
@@ -127,7 +127,7 @@ class Records:
         real, where = REALS[self.power.dtype], materials.device
 
         def upload() -> Any:
-            table = kernels.build(real)[1]()
+            table = kernels.build(real).Table()
             table.power = wp.array(self.power, dtype=real, device=where, copy=False)
             table.index = wp.array(self.index, dtype=wp.int32, device=where, copy=False)
             table.angle = wp.array(self.angle, dtype=wp.types.vector(3, real), device=where, copy=False)
@@ -202,7 +202,7 @@ class Evaluation:
         return self._made.get(real, lambda: self._upload(real))
 
     def _upload(self, real: Any) -> Any:
-        p, m, where = self.parameters, kernels.build(real)[0](), self.device
+        p, m, where = self.parameters, kernels.build(real).Materials(), self.device
         even, slope = fresnel_curves().even(p.log_excess)
         rows, count = self.material, len(p.log_excess)
         values = {
