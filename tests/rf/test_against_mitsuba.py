@@ -32,7 +32,7 @@ BEAM_RAD = np.radians(2.0)
 
 
 def sequences(link: Link) -> dict[str, np.ndarray]:
-    """Ours: path gain of sharp paths, shape ``(L,)``, and of others per pixel, before any beam, shape ``(H, W)``."""
+    """Ours: path gain of specular paths, shape ``(L,)``, and of others per pixel, before any beam, shape ``(H, W)``."""
     scene = wr.Scene(link.mesh, [wr.Material(name, ()) for name in ("scatter", "mirror", "black")], link.does)
     frame = Frame(link.transmitter, link.frequency_hz, link.shape, 1e-17, (-170.0, -60.0), BEAM_RAD, None)
     no = -40.0  # ln of what is not there
@@ -54,7 +54,7 @@ def sequences(link: Link) -> dict[str, np.ndarray]:
     twice, thrice = (binned(traced(scatterings=n, mirror_scatter=False, mirrors=0), "E") for n in (2, 3))
     order = once.view.paths.order
     return {
-        "LOS": once.sharp[order == 0], "M": once.sharp[order == 1], "SS": twice, "SSS": thrice - twice,
+        "LOS": once.specular[order == 0], "M": once.specular[order == 1], "SS": twice, "SSS": thrice - twice,
         **{name: binned(once, name) for name in ("S", "MS", "SM", "MSM")},
     }  # fmt: skip
 

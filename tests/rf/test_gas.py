@@ -147,7 +147,7 @@ def test_single_bounces_of_a_field_have_their_rays_lengths(scene: RadioScene, dr
     point = view.hits.points(np.flatnonzero(lit))
     length = np.linalg.norm(point - TX, axis=1) + np.linalg.norm(point - BLOCKED, axis=1)
     np.testing.assert_allclose(after.single[lit], before.single[lit] * passed(length), rtol=1e-5)
-    np.testing.assert_allclose(after.sharp, before.sharp * passed(view.paths.length_m), rtol=1e-12)
+    np.testing.assert_allclose(after.specular, before.specular * passed(view.paths.length_m), rtol=1e-12)
     # off again, nothing is left of it
     np.testing.assert_array_equal(
         humid.with_gas(False).spectrum(BLOCKED).path_gain, field.spectrum(BLOCKED).path_gain

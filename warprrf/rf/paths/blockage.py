@@ -82,13 +82,15 @@ def past_obstacles(
     receivers: np.ndarray,
     wavelength_m: float,
     *,
-    skin_m: float,
+    position_error_m: float,
     device: DeviceLike = None,
 ) -> dict[str, SidePaths]:
     """``"diffraction"`` and ``"transmission"`` to ``receivers`` (R, 3), all without line of sight."""
     mesh, link = walls.mesh, (transmitter, receivers, wavelength_m)
-    edges = diffracted(mesh, *link, lift_m=max(LIFT_M, skin_m), device=device)
-    through = transmitted(mesh, *link, walls.permittivity, walls.thickness_m, skin_m=skin_m, device=device)
+    edges = diffracted(mesh, *link, lift_m=max(LIFT_M, position_error_m), device=device)
+    through = transmitted(
+        mesh, *link, walls.permittivity, walls.thickness_m, position_error_m=position_error_m, device=device
+    )
     return {"diffraction": edges, "transmission": through}
 
 
@@ -144,7 +146,7 @@ def transmitted(
     permittivity: np.ndarray,
     thickness_m: np.ndarray,
     *,
-    skin_m: float = 1e-4,
+    position_error_m: float = 1e-4,
     device: DeviceLike = None,
 ) -> SidePaths:
     """The straight path of each of ``receivers`` (R, 3) through all that stands in its way.
@@ -161,7 +163,7 @@ def transmitted(
         hit = mesh.cast(
             receivers[open_rays] + gone[open_rays, None] * toward[open_rays], toward[open_rays], device=device
         )
-        met = gone[open_rays] + hit.t < distance[open_rays] - skin_m
+        met = gone[open_rays] + hit.t < distance[open_rays] - position_error_m
         open_rays, face, t, normal = open_rays[met], hit.face[met], hit.t[met], hit.normal[met]
         if len(open_rays) == 0:
             break
@@ -169,7 +171,7 @@ def transmitted(
         fields = slab_transmission(np.abs(cosine), permittivity[face], thickness_m[face], wavelength_m)
         passed = 0.5 * (np.abs(fields[0]) ** 2 + np.abs(fields[1]) ** 2)
         share[open_rays] *= np.where((cosine < 0) | (not mesh.is_closed), passed, 1.0)
-        gone[open_rays] += t + skin_m
+        gone[open_rays] += t + position_error_m
     share[open_rays] = 0.0
     power = (wavelength_m / (4.0 * np.pi * distance)) ** 2 * share
     return SidePaths(np.arange(len(receivers)), power, toward, distance)

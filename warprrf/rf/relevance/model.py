@@ -163,7 +163,8 @@ class FullModel:
         self.blocked = np.array([not (v.paths.order == 0).any() for v in self.views])
         which = np.flatnonzero(self.blocked)
         past = past_obstacles(
-            walls, field.transmitter, receivers[which], field.wavelength_m, skin_m=field.surface.skin_m, device=field.device
+            walls, field.transmitter, receivers[which], field.wavelength_m, 
+            position_error_m=field.surface.position_error_m, device=field.device
         )  # fmt: skip
         self.side = {name: replace(found, receiver=which[found.receiver]) for name, found in past.items()}
         residual = ("residual",) if field.effects.residual else ()
@@ -212,7 +213,7 @@ class FullModel:
             length, records = view.single_bounce_m(), view.records
             own = {
                 name: power
-                * self._air(view.paths.length_m if name == "sharp" else length[records[name].ray], True)
+                * self._air(view.paths.length_m if name == "specular" else length[records[name].ray], True)
                 for name, power in gains.tables.items()
             }
             gains = replace(gains, tables=own)

@@ -141,7 +141,7 @@ class RayGrid:
         found = self.light_through(hits, source)
         ray = np.flatnonzero(found.strength > 0)
         free = self.surface.mesh.visible(
-            np.asarray(source, float), found.point.take(ray, axis=0), clearance=self.surface.skin_m, device=self.device,
+            np.asarray(source, float), found.point.take(ray, axis=0), clearance=self.surface.position_error_m, device=self.device,
             backend=self._backend(len(ray)),
         )  # fmt: skip
         found.strength[ray[~free]] = 0.0

@@ -2,7 +2,7 @@
 
 A table holds the paths of one sequence of interactions, named from the transmitter to the receiver: ``M`` a mirror, ``S`` a
 surface that scatters, ``E`` an element of the surface that sends on what it got of others. Mirrors and line of sight, paths
-of one direction each, are the table ``"sharp"``. All kinds are evaluated by :mod:`warprrf.kernels.radio.records`.
+of one direction each, are the table ``"specular"``. All kinds are evaluated by :mod:`warprrf.kernels.radio.records`.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ class Records:
 
     Attributes:
         power: path gain without interactions, shape ``(N,)``; its precision is that of the evaluation.
-        ray: ray of the receiver's grid that sees it, or row of a sharp path, or side of an element that is lit, ``(N,)``.
+        ray: ray of the receiver's grid that sees it, or row of a specular path, or side of an element that is lit, ``(N,)``.
         index: group that each interaction meets, or side of the element that sends, -1 for none, shape ``(N, K)`` int32.
         angle: its angles, see :mod:`warprrf.kernels.radio.records`, shape ``(N, K, 3)``.
         rough: column of what leaves light unpolarised, K where there is none.
         kind: of that, ``kernels.SCATTER`` or ``kernels.SOURCE``; 0 for none.
-        gain: which gain of the residual the cell has that its ray sees, -1 for none.
+        residual_row: which row of the residual holds the gain of the cell that its ray sees, -1 for none.
         half_width: half of the cosine's stretch that a ray stands for.
     """
 
@@ -47,7 +47,7 @@ class Records:
     angle: np.ndarray
     rough: int
     kind: int = 0
-    gain: int = -1
+    residual_row: int = -1
     half_width: float = 0.0
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(1))
 
@@ -94,7 +94,9 @@ class Records:
         material m stand from column ``place[m]`` on: lobe weights, epsilon_r - 1, mirrored share."""
         if isinstance(materials, SlabEvaluation):
             raise TypeError("materials: got slabs, expected half-spaces, which have slopes")
-        self._add("bin_slopes", materials, bins, [wp.array(place, dtype=wp.int32, device=materials.device)], slopes)
+        self._add(
+            "bin_slopes", materials, bins, [wp.array(place, dtype=wp.int32, device=materials.device)], slopes
+        )
 
     def components(self, materials: Evaluation, bins: Bins) -> tuple[np.ndarray, np.ndarray]:
         """What groups scatter into each bin at unit weight: the groups that do, shape ``(A,)``, and sums by lobe and

@@ -11,7 +11,7 @@ from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.tracing.interreflection import irradiance
 from warprrf.rf.tracing.model import Model, Parameters
 from warprrf.rf.tracing.records import Evaluation
-from warprrf.rf.tracing.tracer import SHARP, Tracer, View
+from warprrf.rf.tracing.tracer import SPECULAR, Tracer, View
 
 
 @dataclass(frozen=True)
@@ -29,14 +29,14 @@ class PathGains:
     parameters: Parameters
 
     @property
-    def sharp(self) -> np.ndarray:
+    def specular(self) -> np.ndarray:
         """Of each line of sight and mirror path, shape ``(L,)``."""
-        return self.tables[SHARP]
+        return self.tables[SPECULAR]
 
     def by_ray(self, names: Iterable[str] | None = None) -> np.ndarray:
         """Of everything but those, or of the sequences ``names``, by the ray that sees it, shape ``(R K,)``."""
         count, records = len(self.view.hits.face), self.view.records
-        chosen = [n for n in (self.tables if names is None else names) if n != SHARP and n in self.tables]
+        chosen = [n for n in (self.tables if names is None else names) if n != SPECULAR and n in self.tables]
         return sum((np.bincount(records[n].ray, self.tables[n], count) for n in chosen), np.zeros(count))
 
     @property
@@ -67,9 +67,13 @@ def path_gains(view: View, model: Model, materials: Evaluation) -> PathGains:
     gains = model.cell_gains(t.transmitter)
     for name, records in view.tables(model.effects).items():
         power = records.powers(materials)
-        factor = gains[records.gain, view.cell[records.ray]] if records.gain >= 0 else model.parameters.gain
+        factor = (
+            gains[records.residual_row, view.cell[records.ray]]
+            if records.residual_row >= 0
+            else model.parameters.gain
+        )
         found[name] = power * factor
-    found[SHARP] = np.where(view.kept_paths(model.effects), found[SHARP], 0.0)
+    found[SPECULAR] = np.where(view.kept_paths(model.effects), found[SPECULAR], 0.0)
     return PathGains(view, found, model.parameters)
 
 
@@ -85,7 +89,7 @@ def images(gains: PathGains, beam: BeamOperator) -> np.ndarray:
     count, shape = len(view.receivers), view.tracer.grid.shape
     pixels = np.einsum("...k->...", gains.by_ray().reshape(count, *shape, -1))
     found = np.moveaxis(beam(np.ascontiguousarray(np.moveaxis(pixels, 0, -1))), -1, 0)
-    sharp = gains.sharp.astype(np.float32)
+    specular = gains.specular.astype(np.float32)
     for image, own in zip(found, (view.paths.receiver == k for k in range(count)), strict=True):
-        image += np.tensordot(sharp[own], view.beams[own], axes=1)
+        image += np.tensordot(specular[own], view.beams[own], axes=1)
     return np.maximum(found, 0.0)

@@ -37,8 +37,8 @@ LEAST_ELEMENTS = 300
 CELLS = 3  # along an element
 LARGEST_FACE = 1.2  # elements' widths; longer edges are split, so that elements can be small
 MIN_MIRROR_M2 = 0.05  # smaller patches reflect too little to search for
-SKIN_M = 0.02  # depth of a reconstructed surface's skin: shadow rays ignore it
-TRUE_SKIN_M = 1e-4
+POSITION_ERROR_M = 0.02  # of a reconstructed surface: shadow rays end so far before it
+TRUE_ERROR_M = 1e-4
 _UNIT = Expected("F 3", -1.001, 1.001)
 ARRAYS = {
     "normal": _UNIT,
@@ -47,7 +47,7 @@ ARRAYS = {
     "plane_offset": lengths("P"),
     "group": index_to("G", "F"),
     "material": index_to("G", "G"),
-    "look": Expected("G K", nan=True),
+    "appearance": Expected("G K", nan=True),
     "patch_group": index_to("G", "P"),
     "element": index_to("E", "F"),
     "cell": index_to("X", "F"),
@@ -71,7 +71,7 @@ class Surface:
         plane_normal, plane_offset: planes of the patches, ``normal . x = offset`` [m], shapes ``(P, 3)``, ``(P,)``.
         group: group of each face, the smallest unit that may be of a material of its own, shape ``(F,)`` int32.
         material: which groups are taken for the same material before any measurement, shape ``(G,)`` int32.
-        look: what tells groups apart before any measurement, scaled so that 1 tells materials apart: log chromaticities
+        appearance: what tells groups apart before any measurement, scaled so that 1 tells materials apart: log chromaticities
             and log luminance as photos show them, else place and extents, shape ``(G, 4)`` or ``(G, 6)``; NaN where names
             tell it.
         patch_group: group of each patch, shape ``(P,)`` int32.
@@ -81,7 +81,7 @@ class Surface:
         element_centre, element_area, element_group: of each element, shapes ``(E, 3)`` [m], ``(E,)`` [m^2], ``(E,)``.
         thickness_m: thickness of what each group is a slab of [m], shape ``(G,)``; NaN where nobody knows.
         group_names: what the groups are called.
-        skin_m: depth of the surface's skin.
+        position_error_m: of the surface [m]: rays end so far before it.
         two_sided: whether faces have two sides; False: mirrors that of ``plane_normal``, elements the front one, of a surface
             that photos saw.
 
@@ -96,7 +96,7 @@ class Surface:
     plane_offset: np.ndarray
     group: np.ndarray
     material: np.ndarray
-    look: np.ndarray
+    appearance: np.ndarray
     patch_group: np.ndarray
     element: np.ndarray
     cell: np.ndarray
@@ -106,13 +106,13 @@ class Surface:
     element_group: np.ndarray
     thickness_m: np.ndarray
     group_names: tuple[str, ...]
-    skin_m: float
+    position_error_m: float
     two_sided: bool = False
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
 
     def __post_init__(self) -> None:
         check_arrays(vars(self), ARRAYS, F=len(self.mesh.faces), G=len(self.group_names))
-        check_number("skin_m", self.skin_m, 0.0, 10.0)
+        check_number("position_error_m", self.position_error_m, 0.0, 10.0)
 
     @cached_property
     def front_normal(self) -> np.ndarray:
@@ -150,7 +150,7 @@ class Surface:
     @property
     def by_shape(self) -> bool:
         """Whether only shapes tell its groups apart."""
-        return self.look.shape[1] == SHAPES
+        return self.appearance.shape[1] == SHAPES
 
     @property
     def cells(self) -> int:
@@ -176,27 +176,29 @@ class Surface:
         patches, colours, measured = _patches_and_colours(geometry, mesh, material)
         mesh = patches.mesh
         if material is not None:
-            group, sort = material, np.arange(len(names), dtype=np.int32)
-            look = np.full((len(names), 4), np.nan)
+            group, alike = material, np.arange(len(names), dtype=np.int32)
+            appearance = np.full((len(names), 4), np.nan)
         else:
             pieces = mesh, patches.face_patch
-            group, sort, look = shape_groups(*pieces) if colours is None else colour_groups(*pieces, colours)
-            names = tuple(f"group_{k}" for k in range(len(sort)))
+            group, alike, appearance = (
+                shape_groups(*pieces) if colours is None else colour_groups(*pieces, colours)
+            )
+            names = tuple(f"group_{k}" for k in range(len(alike)))
         if measured:
-            normal, skin = _on_patches(patches, smoothed_normals(mesh, 3)), SKIN_M
+            normal, error_m = _on_patches(patches, smoothed_normals(mesh, 3)), POSITION_ERROR_M
         else:
             # A mesh's error is not roughness: faces of a patch have its normal, and rays end so far before it.
-            normal, skin = _on_patches(patches, mesh.face_normals), max(TRUE_SKIN_M, patches.tolerance_m)
+            normal, error_m = _on_patches(patches, mesh.face_normals), max(TRUE_ERROR_M, patches.tolerance_m)
         patch, planes = patches.face_patch, (patches.normal, patches.offset)
         if patches.two_sided:
-            patch, planes = _mirrors(_apart(patches, sort[group]))
+            patch, planes = _mirrors(_apart(patches, alike[group]))
         sides = patches.two_sided
         mesh, parent = _split_long(mesh, np.flatnonzero(patches.once), LARGEST_FACE * element_m)
         group, patch = group[parent].astype(np.int32), patch[parent].astype(np.int32)
         return cls(
             mesh=mesh, normal=np.asarray(normal[parent]), patch=patch, plane_normal=planes[0], plane_offset=planes[1],
-            group=group, material=sort, look=look, patch_group=_largest_groups(mesh, patch, group, len(planes[1])),
-            thickness_m=_thickness(geometry, material, len(names)), group_names=tuple(names), skin_m=skin,
+            group=group, material=alike, appearance=appearance, patch_group=_largest_groups(mesh, patch, group, len(planes[1])),
+            thickness_m=_thickness(geometry, material, len(names)), group_names=tuple(names), position_error_m=error_m,
             two_sided=sides, **_elements(mesh, patch, group, element_m),
         )  # fmt: skip
 
@@ -208,9 +210,9 @@ class Surface:
         return cls(
             mesh=mesh, normal=mesh.face_normals, patch=patches.face_patch, plane_normal=patches.normal,
             plane_offset=patches.offset, group=material, material=np.arange(groups, dtype=np.int32),
-            look=np.full((groups, 4), np.nan), patch_group=faces, element=none, cell=none, cell_element=none[:1],
+            appearance=np.full((groups, 4), np.nan), patch_group=faces, element=none, cell=none, cell_element=none[:1],
             element_centre=mesh.center[None], element_area=np.array([mesh.areas.sum()]), element_group=none[:1],
-            thickness_m=np.full(groups, np.nan), group_names=tuple(names), skin_m=TRUE_SKIN_M, two_sided=True,
+            thickness_m=np.full(groups, np.nan), group_names=tuple(names), position_error_m=TRUE_ERROR_M, two_sided=True,
         )  # fmt: skip
 
     @cached_property
@@ -232,7 +234,7 @@ class Surface:
     def patches(self) -> PlanarPatches:
         """Its patches, of the split mesh."""
         return PlanarPatches.from_planes(
-            self.mesh, self.patch, self.plane_normal, self.plane_offset, tolerance_m=self.skin_m, two_sided=self.two_sided
+            self.mesh, self.patch, self.plane_normal, self.plane_offset, tolerance_m=self.position_error_m, two_sided=self.two_sided
         )  # fmt: skip
 
     def images(self, transmitter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -35,13 +35,13 @@ MIRROR_SLACK_M = 0.1
 LIFT_M = 0.02  # rays that start on a surface start so far off it
 THROUGH_MIRRORS = 3  # rays of a pixel that look for light by way of mirrors
 INTO_MIRRORS = 2  # square root of the rays of a pixel that go on at mirrors: what these show is seen a second time already
-SHARP = "sharp"
+SPECULAR = "specular"
 """Name of the table of line of sight and mirrors."""
 _TRACED = Cache(6)  # a lobby's take up to 90 MB each; the bound is the process's, not a surface's
 
 
 def sequences(effects: Effects) -> tuple[str, ...]:
-    """Names of the tables that ``effects`` want besides :data:`SHARP`."""
+    """Names of the tables that ``effects`` want besides :data:`SPECULAR`."""
     found = ["S", *["MS"] * effects.mirror_scatter, *["SM"] * effects.scatter_mirror] * (
         effects.scatterings > 0
     )
@@ -59,7 +59,7 @@ class View:
         receivers: positions [m], shape ``(R, 3)``.
         hits: what the rays hit.
         paths: line of sight and mirror paths, L in all.
-        records: tables by sequence, of those that were asked for; of line of sight and mirrors under :data:`SHARP`, one row
+        records: tables by sequence, of those that were asked for; of line of sight and mirrors under :data:`SPECULAR`, one row
             for each of ``paths``.
         beams: unit beam of each path over the pixels, shape ``(L, H, W)`` float32; None where none was asked for.
     """
@@ -87,7 +87,7 @@ class View:
 
     def tables(self, effects: Effects) -> dict[str, Records]:
         """The tables that count under ``effects``; they are traced when they are first asked for."""
-        wanted = (SHARP, *sequences(effects))
+        wanted = (SPECULAR, *sequences(effects))
         if not self.records.keys() >= set(wanted):
             with making:
                 self.records.update(self.tracer.trace(self, [n for n in wanted if n not in self.records]))
@@ -199,7 +199,9 @@ class Tracer:
 
     def paths(self, receivers: np.ndarray, order: int, progress: Progress | None = None) -> MirrorPaths:
         """Line of sight and mirror paths of ``receivers`` (R, 3) with at most ``order`` reflections."""
-        return zone_paths(self.images, receivers, order, self.wavelength_m, self.surface.skin_m, progress)
+        return zone_paths(
+            self.images, receivers, order, self.wavelength_m, self.surface.position_error_m, progress
+        )
 
     def view(self, receivers: np.ndarray, mirrors: int, *, paths: MirrorPaths | None = None) -> View:
         """What ``receivers``, (3,) or (R, 3) [m], see.
@@ -214,7 +216,7 @@ class Tracer:
         beams = None
         if self.beam_sigma_rad is not None:
             beams = unit_beams(found.arrival, self.grid.shape, self.beam_sigma_rad)
-        return View(self, places, self.grid.hit(places), found, {SHARP: self._sharp(found)}, beams)
+        return View(self, places, self.grid.hit(places), found, {SPECULAR: self._sharp(found)}, beams)
 
     def trace(self, view: View, names: Sequence[str]) -> dict[str, Records]:
         """Tables of sequences that a receiver sees, by name."""
@@ -308,10 +310,10 @@ class Tracer:
             if mirror is not None:
                 columns.insert(where, mirror[0])
                 angles.insert(where, np.column_stack([mirror[1], 0.0 * mirror[1], 0.0 * mirror[1]]))
-        gain = -1 if after is not None else int(kind == SOURCE or before is not None)
+        residual_row = -1 if after is not None else int(kind == SOURCE or before is not None)
         return Records(
             np.asarray(power, dtype), rays.ray[row].astype(np.int32), np.stack(columns, axis=1).astype(np.int32),
-            np.stack(angles, axis=1).astype(dtype), int(before is not None), kind, gain, self.grid.half_width,
+            np.stack(angles, axis=1).astype(dtype), int(before is not None), kind, residual_row, self.grid.half_width,
         )  # fmt: skip
 
     def _turned(self, view: View) -> Rays:
@@ -375,8 +377,8 @@ class MirroredLight:
         normal = np.where(s.two_sided & (side < 0)[:, None], -normal, normal)
         own = np.flatnonzero((s.two_sided | (side > 0)) & (s.patch[face] != patch[:, 0]))
         face, patch, point, normal = face[own], patch[own], point[own], normal[own]
-        rays = ZoneRays(s.patches, transmitter, 0.0, s.skin_m, grid.device)
-        free = rays.reached(centre[face], patch, point, s.skin_m * normal)
+        rays = ZoneRays(s.patches, transmitter, 0.0, s.position_error_m, grid.device)
+        free = rays.reached(centre[face], patch, point, s.position_error_m * normal)
         face, patch, normal = face[free], patch[free, 0], normal[free]
         order = np.lexsort((patch, face))
         face, patch, normal = face[order], patch[order], normal[order]

@@ -18,7 +18,7 @@ from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.trace import trace_paths
 from warprrf.rf.spectra.spectrum import directions_from_angles
 from warprrf.rf.tracing.model import SETS, Effects
-from warprrf.rf.tracing.tracer import SHARP
+from warprrf.rf.tracing.tracer import SPECULAR
 
 F = 28e9  # of whose zones mirrors hold the whole, so that exact paths are the truth
 RECEIVERS = RECEIVERS[:8]
@@ -100,7 +100,7 @@ def test_paths_of_unknown_length_add_in_power(field: BistaticField) -> None:
     alone = replace(field, effects=replace(SINGLE, scatterings=0))
     view = alone.view(place)
     together = ArrayImage.of(view, ARRAY, DIRECTIONS.reshape(-1, 3), 0.0).together
-    amplitude = together.amplitudes(view.records[SHARP], alone.parameters)[0]
+    amplitude = together.amplitudes(view.records[SPECULAR], alone.parameters)[0]
     each = sum(np.abs(a * row) ** 2 for a, row in zip(amplitude, together.field, strict=True))
     found = alone.array_spectrum(place, ARRAY, DIRECTIONS, length_std_m=1.0).ravel()
     np.testing.assert_allclose(found, each, rtol=1e-4)

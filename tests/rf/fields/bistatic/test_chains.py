@@ -13,7 +13,7 @@ from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.paths.trace import MirrorTracer
 from warprrf.rf.tracing.model import Effects, Parameters
 from warprrf.rf.tracing.records import Evaluation, Records
-from warprrf.rf.tracing.surface import SKIN_M, Surface
+from warprrf.rf.tracing.surface import POSITION_ERROR_M, Surface
 
 RX = RECEIVERS[0]
 
@@ -62,7 +62,7 @@ def test_mirrors_one_after_the_other_reflect_as_jones_matrices_say() -> None:
     view = field.view(RX)
     found = view.paths
     true = MirrorTracer(scene, transmitter=TX, frequency_hz=F).trace(RX, 2)
-    power = field.path_gains(view).sharp
+    power = field.path_gains(view).specular
     compared = 0
     for path in np.flatnonzero(found.order == 2):
         same = (np.abs(true.length_m - found.length_m[path]) < 1e-6) & (
@@ -97,7 +97,7 @@ def test_a_mirror_met_head_on_has_no_plane_of_incidence() -> None:
 def test_a_screen_beside_a_chain_covers_part_of_its_zone(edge_m: float, least: float, most: float) -> None:
     """Floor, then a wall: a screen across the leg between them leaves all, about half, or nothing of the path.
 
-    The screen ends ``edge_m`` past the path, where the zone has a radius of 23 mm; rays start a skin above a mirror,
+    The screen ends ``edge_m`` past the path, where the zone has a radius of 23 mm; rays start a position error above a mirror,
     which moves them by a centimetre.
     """
     mesh = Mesh(*ROOM)
@@ -124,8 +124,8 @@ def test_a_screen_beside_a_chain_covers_part_of_its_zone(edge_m: float, least: f
 
 
 def _surface(mesh: Mesh) -> Surface:
-    """A surface that is as wrong as one from photos: its skin widens the zones."""
-    return replace(Surface.of(mesh), skin_m=SKIN_M)
+    """A surface that is as wrong as one from photos: its position error widens the zones."""
+    return replace(Surface.of(mesh), position_error_m=POSITION_ERROR_M)
 
 
 @pytest.mark.parametrize("mirrors", [1, 2, 3])

@@ -24,7 +24,7 @@ from warprrf.rf.spectra.readings import Readings, horn, path_weights
 from warprrf.rf.tracing.interreflection import irradiance
 from warprrf.rf.tracing.model import SETS, Effects, Layout
 from warprrf.rf.tracing.records import Bins, Evaluation, Records
-from warprrf.rf.tracing.tracer import SHARP, View
+from warprrf.rf.tracing.tracer import SPECULAR, View
 
 RX = RECEIVERS[0]
 SINGLE, EVERYTHING = replace(SETS["single"], residual=False), Effects(residual=False)
@@ -54,7 +54,7 @@ def test_a_delay_profile_is_the_sum_of_its_paths(field: BistaticField) -> None:
     length = np.linalg.norm(view.hits.points(ray) - TX, axis=1) + view.hits.range_m[ray]
     edges = SPEED_OF_LIGHT * np.arange(0.0, 51e-9, 2e-9)
     expected = np.histogram(length, edges, weights=gains.single[ray])[0]
-    expected += np.histogram(view.paths.length_m, edges, weights=gains.sharp)[0]
+    expected += np.histogram(view.paths.length_m, edges, weights=gains.specular)[0]
     np.testing.assert_allclose(read(gains, profile), expected, rtol=1e-4)  # rays at a window's edge
     assert (expected > 0).sum() >= 5
     # three components resolve the Fresnel curves to a few parts in a thousand
@@ -175,7 +175,7 @@ def test_slopes_of_records_of_every_sequence_are_those_of_differences(
     where = layout.stride * np.arange(groups)
     for name, records in view.tables(EVERYTHING).items():
         exact = replace(records, power=records.power.astype(float))
-        own = records.ray if name == SHARP else records.ray // view.tracer.grid.per_pixel
+        own = records.ray if name == SPECULAR else records.ray // view.tracer.grid.per_pixel
         bins = Bins.of(own, int(own.max()) + 1)
         found = np.zeros((bins.count, layout.size))
         exact.add_slopes(materials(x), bins, where, found)

@@ -209,7 +209,7 @@ def test_roughness_counts_in_wavelengths_at_another_carrier(scene: RadioScene) -
     again = other.at_frequency(F)
     np.testing.assert_allclose(again.parameters.log_weight, field.parameters.log_weight, atol=1e-6)
     assert (again.floor, again.range_db) == (pytest.approx(field.floor), pytest.approx(field.range_db))
-    direct = [f.view(RECEIVERS[0]).records["sharp"].power[0] for f in (field, other)]  # line of sight
+    direct = [f.view(RECEIVERS[0]).records["specular"].power[0] for f in (field, other)]  # line of sight
     assert direct[1] / direct[0] == pytest.approx(4.0, rel=1e-6)
     with pytest.raises(ValueError, match="frequency_hz"):
         field.at_frequency(-1.0)

@@ -101,7 +101,7 @@ def test_columns_are_the_sums_of_their_records(scene: RadioScene, reciprocal: bo
     def image(by_ray: np.ndarray) -> np.ndarray:
         return beam(by_ray.reshape(*SHAPE, -1).sum(axis=-1, keepdims=True)).ravel() / field.floor
 
-    further = image(gains.by_ray([name for name in gains.tables if name not in ("sharp", "S")]))
+    further = image(gains.by_ray([name for name in gains.tables if name not in ("specular", "S")]))
     np.testing.assert_allclose(columns.power(p) - single, further, rtol=1e-3, atol=1e-6 * single.max())
     curves, records = fresnel_curves(), view.records["S"]
     components = curves.at(curves.coordinates, p.log_excess[:1])[0][0] @ curves.moments  # groups are alike
@@ -149,7 +149,7 @@ def problem(scene: RadioScene) -> Problem:
 def test_spectra_join_groups_of_one_material_and_no_others(problem: Problem, scene: RadioScene) -> None:
     area = np.bincount(scene.face_material, scene.mesh.areas)
     separate = gauss_newton(problem, Parameters.prior(3), 40)
-    alike = np.zeros((3, 4))  # all look the same
+    alike = np.zeros((3, 4))  # all appear the same
     material, parameters = merge(problem, separate.parameters, alike, area, Merging())
     assert material[1] == material[2] != material[0]
     assert len(parameters.log_excess) == 2

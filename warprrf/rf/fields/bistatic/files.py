@@ -17,7 +17,7 @@ from warprrf.rf.tracing.surface import Surface
 _SURFACE = {
     name: name
     for name in ("normal", "patch", "plane_normal", "plane_offset", "group", "material", "patch_group", "element",
-                 "element_centre", "element_area", "element_group", "look", "thickness_m")
+                 "element_centre", "element_area", "element_group", "appearance", "thickness_m")
 } | {"cell": "texel", "cell_element": "texel_element"}  # fmt: skip
 """Arrays of a surface, and what files call them."""
 _PARAMETERS = ("log_weight", "log_excess", "log_mirror")
@@ -38,7 +38,7 @@ def taken_apart(parts: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str,
         "sub_pixels": parts["sub_pixels"],
         **{name: getattr(p, name) for name in _SINGLE},
         "group_names": s.group_names,
-        "skin_m": s.skin_m,
+        "position_error_m": s.position_error_m,
         "two_sided": s.two_sided,
     }
     return tensors, header
@@ -68,7 +68,7 @@ def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict
         "surface": Surface(
             mesh=Mesh(tensors["mesh/vertices"], tensors["mesh/faces"]),
             group_names=tuple(names),
-            skin_m=header["skin_m"],
+            position_error_m=header["position_error_m"],
             two_sided=two_sided,
             **{name: tensors[f"surface/{filed}"] for name, filed in _SURFACE.items()},
         ),

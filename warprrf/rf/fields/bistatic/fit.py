@@ -586,7 +586,7 @@ def choose(t: Training) -> Choice:
         best, least = trial, loss
     if best is None:
         raise ValueError("effects: got none to choose from")
-    if np.isfinite(t.surface.look).all() and material.max() > 0 and not t.totals:
+    if np.isfinite(t.surface.appearance).all() and material.max() > 0 and not t.totals:
         best = merged(t, best, least)
     return best
 
@@ -612,7 +612,7 @@ def merged(t: Training, best: Choice, least: float) -> Choice:
     trial, options = best, BY_SHAPE if t.surface.by_shape else Merging()
     problem = t.problem(best.effects, best.material, t.few(2), best.parameters)
     for _ in range(MERGES):
-        material, start = merge(problem, trial.parameters, t.surface.look, t.area, options)
+        material, start = merge(problem, trial.parameters, t.surface.appearance, t.area, options)
         # What surfaces get of each other changes little with who is of which material: it is held.
         problem = replace(problem, material=material)
         trial = Choice(best.effects, material, gauss_newton(problem, start, SHORT_STEPS))
@@ -746,7 +746,7 @@ def _offsets(t: Training, found: Fit) -> dict[int, list[tuple[Place, np.ndarray]
         one = t.data[o.place.data]
         gains = path_gains(o.view, model, materials)
         total = np.maximum(read(gains, o.measured), 0.0) / o.floor
-        direct = gains.sharp / o.floor
+        direct = gains.specular / o.floor
         gain = o.gain(model.parameters, total)
         other = np.maximum(total - direct @ o.measured.of_paths(o.view), 0.0)
         offset = position_offset(one, o, gain * other, gain * direct)  # type: ignore[arg-type]
@@ -766,7 +766,7 @@ def left_out(t: Training, model: Model) -> dict[str, Any]:
     total, over = np.zeros((2, len(seen)))
     for k, (o, here, materials) in enumerate(seen):
         gains = path_gains(o.view, here, materials)
-        total[k] = gains.sharp.sum() + gains.by_ray().sum()
+        total[k] = gains.specular.sum() + gains.by_ray().sum()
         read_sum, predicted = o.target.sums(o.predicted(here, materials))
         over[k] = NEPER * max(np.log1p(predicted) - np.log1p(read_sum), 0.0)
     floor = np.array([o.floor for o, *_ in seen])
@@ -774,7 +774,9 @@ def left_out(t: Training, model: Model) -> dict[str, Any]:
     for tracer in {id(o.view.tracer): o.view.tracer for o, *_ in seen}.values():
         own = np.array([k for k, (o, *_) in enumerate(seen) if o.view.tracer is tracer])
         link, grid = (tracer.transmitter, receivers[own], tracer.wavelength_m), tracer.grid
-        for name, paths in past_obstacles(walls, *link, skin_m=s.skin_m, device=grid.device).items():
+        for name, paths in past_obstacles(
+            walls, *link, position_error_m=s.position_error_m, device=grid.device
+        ).items():
             power = model.parameters.gain * paths.power * grid.transmittance(paths.length_m)
             more = np.bincount(paths.receiver, power, minlength=len(own))
             change[name][own] = NEPER * np.log1p(more / (total[own] + floor[own]))

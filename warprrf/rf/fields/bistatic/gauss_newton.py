@@ -115,7 +115,7 @@ class Problem:
         for o, columns, materials, power in self.evaluated(p):
             table, index = _joined(
                 columns.slopes(materials.parameters, layout),
-                o.slopes(self.effects, materials, layout, sharp=True),
+                o.slopes(self.effects, materials, layout, specular=True),
             )
             table *= np.float32(materials.parameters.gain)
             if layout.gain:

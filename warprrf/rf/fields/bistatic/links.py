@@ -69,13 +69,13 @@ class LinkTracer:
         """Links of at most :attr:`batch` receivers (R, 3)."""
         view, count = self._tracer.view(receivers, self._model.effects.mirrors), len(receivers)
         gains = path_gains(view, self._model, self._materials)
-        paths, sharp = view.paths, gains.sharp
+        paths, specular = view.paths, gains.specular
         total, moment, square = (
-            np.bincount(paths.receiver, sharp * (paths.length_m / SPEED_OF_LIGHT) ** k, minlength=count)
+            np.bincount(paths.receiver, specular * (paths.length_m / SPEED_OF_LIGHT) ** k, minlength=count)
             for k in range(3)
         )
         best = np.zeros(count)
-        np.maximum.at(best, paths.receiver, sharp)
+        np.maximum.at(best, paths.receiver, specular)
         image = np.zeros((count, *self._shape))
         if self._model.effects.scatterings:
             power = gains.by_ray().reshape(count, -1)
@@ -89,7 +89,7 @@ class LinkTracer:
         with np.errstate(invalid="ignore"):
             mean = moment / total
             spread = np.sqrt(np.maximum(square / total - mean**2, 0.0))
-        return Links(total, best, spread, self._search(image, paths.receiver, paths.arrival, sharp))
+        return Links(total, best, spread, self._search(image, paths.receiver, paths.arrival, specular))
 
 
 def _again(again: Callable[[], Tracer], *others: Any) -> LinkTracer:

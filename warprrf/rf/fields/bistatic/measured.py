@@ -23,7 +23,7 @@ from warprrf.rf.tracing.model import Parameters
 from warprrf.rf.tracing.rays import RayGrid
 from warprrf.rf.tracing.records import Records
 from warprrf.rf.tracing.render import PathGains
-from warprrf.rf.tracing.tracer import SHARP, View
+from warprrf.rf.tracing.tracer import SPECULAR, View
 
 DEPARTURES = (60, 120)
 """Rows and columns of the grid of departures that rays are told apart in, where a transmitter's pattern counts."""
@@ -63,11 +63,11 @@ def read(gains: PathGains, measurement: Measurement) -> np.ndarray:
     own = bins >= 0
     table = np.bincount(bins[own], gains.by_ray()[own], minlength=count)[:, None]
     if together is None:
-        direct = gains.sharp.astype(np.float32) @ measurement.of_paths(view)
+        direct = gains.specular.astype(np.float32) @ measurement.of_paths(view)
     else:
-        p, sharp = gains.parameters, view.records[SHARP]
-        amplitude = together.amplitudes(sharp, p)[0]
-        direct = p.gain * together.received(np.where(gains.sharp > 0, amplitude, 0.0))
+        p, specular = gains.parameters, view.records[SPECULAR]
+        amplitude = together.amplitudes(specular, p)[0]
+        direct = p.gain * together.received(np.where(gains.specular > 0, amplitude, 0.0))
     return np.asarray(measurement.of_bins(table)[:, 0] + direct)
 
 
@@ -273,20 +273,20 @@ class Superposition:
     ends: tuple[np.ndarray, np.ndarray]
 
     def amplitudes(
-        self, sharp: Records, p: Parameters, material: np.ndarray | None = None
+        self, specular: Records, p: Parameters, material: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Of each path ``(L,)``, real because half-spaces have no phase but their sign, and its derivatives to
         ``log_excess`` of each mirror met ``(L, K)``; those to ``log_mirror`` are half of it. The common gain apart.
 
         Args:
-            sharp: the paths.
+            specular: the paths.
             p: parameters of materials.
             material: of each group; by default groups are rows of ``p``.
         """
-        reflects, own = sharp.index >= 0, np.maximum(sharp.index, 0)
+        reflects, own = specular.index >= 0, np.maximum(specular.index, 0)
         own = own if material is None else material[own]
-        size = np.sqrt(sharp.power) * np.exp(0.5 * np.where(reflects, p.log_mirror[own], 0.0).sum(axis=1))
-        cosine, turn = sharp.angle[..., 0], sharp.angle[..., 1]
+        size = np.sqrt(specular.power) * np.exp(0.5 * np.where(reflects, p.log_mirror[own], 0.0).sum(axis=1))
+        cosine, turn = specular.angle[..., 0], specular.angle[..., 1]
         polarised, slope = chain_amplitude(p.log_excess[own], cosine, turn, reflects, self.ends)
         return size * polarised, size[:, None] * slope
 

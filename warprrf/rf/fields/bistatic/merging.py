@@ -1,4 +1,4 @@
-"""Which surfaces are of one material: decided by their look first, then by what the spectra say.
+"""Which surfaces are of one material: decided by their appearance first, then by what the spectra say.
 
 Colours or shapes tell materials apart only so far. Once materials have parameters, each group of faces is tried as every other
 material: what the objective would rise or fall by is known without a new fit, because a spectrum is linear in what its
@@ -17,7 +17,7 @@ from warprrf.rf.fields.bistatic.gauss_newton import Problem
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, Observation, huber
 from warprrf.rf.tracing.model import Parameters
 from warprrf.rf.tracing.records import Evaluation
-from warprrf.rf.tracing.tracer import SHARP
+from warprrf.rf.tracing.tracer import SPECULAR
 
 
 @dataclass(frozen=True)
@@ -25,40 +25,40 @@ class Merging:
     """What it takes to be of one material, in units of the fit's objective.
 
     Attributes:
-        look_cost: of one unit of difference in look, squared.
+        appearance_cost: of one unit of difference in appearance, squared.
         join: rise that a material of its own must be worth.
         move: fall that a group must bring to go over.
     """
 
-    look_cost: float = 3.0
+    appearance_cost: float = 3.0
     join: float = 30.0
     move: float = 4.0
 
 
-BY_SHAPE = Merging(look_cost=1.0, join=15.0, move=30.0)
+BY_SHAPE = Merging(appearance_cost=1.0, join=15.0, move=30.0)
 """For groups that only shapes tell apart: place and extent say less of a material than colour, a thing's parts more."""
-MOST_LOOK = 9.0
+MOST_APPEARANCE = 9.0
 """Largest squared difference of looks that counts: those that differ more tell no more."""
 
 
 def merge(
-    problem: Problem, p: Parameters, look: np.ndarray, area: np.ndarray, options: Merging
+    problem: Problem, p: Parameters, appearance: np.ndarray, area: np.ndarray, options: Merging
 ) -> tuple[np.ndarray, Parameters]:
     """Materials of the groups anew, shape ``(G,)``, numbered without gaps, and the parameters of those left.
 
     Args:
         problem: observations, and the material of each group now.
         p: parameters of the materials.
-        look: of each group, shape ``(G, K)``; see :class:`warprrf.rf.tracing.surface.Surface`.
+        appearance: of each group, shape ``(G, K)``; see :class:`warprrf.rf.tracing.surface.Surface`.
         area: of each group [m^2].
         options: what it takes.
     """
     o, count, material = options, len(p.log_excess), problem.material
-    typical = _mean_look(look, material, area, count)
+    typical = _mean_appearance(appearance, material, area, count)
 
     # whole materials first, small ones before large ones
     cost = _costs(problem, p, material, np.arange(count))
-    cost += _look_cost(typical, typical, o)
+    cost += _appearance_cost(typical, typical, o)
     np.fill_diagonal(cost, np.inf)
     size = np.bincount(material, area, minlength=count)
     target = np.arange(count)
@@ -73,9 +73,9 @@ def merge(
     material = target[material]
 
     # then single groups
-    typical = _mean_look(look, material, area, count)
+    typical = _mean_appearance(appearance, material, area, count)
     alive = np.unique(material)
-    cost = _costs(problem, p, np.arange(len(material)), material) + _look_cost(look, typical, o)
+    cost = _costs(problem, p, np.arange(len(material)), material) + _appearance_cost(appearance, typical, o)
     rows = np.arange(len(material))
     change = cost - cost[rows, material][:, None]
     change[:, np.setdiff1d(np.arange(count), alive)] = np.inf
@@ -86,16 +86,18 @@ def merge(
     return material.reshape(-1), p.take(left)
 
 
-def _mean_look(look: np.ndarray, material: np.ndarray, area: np.ndarray, count: int) -> np.ndarray:
-    """Mean look of each material, shape ``(count, K)``."""
+def _mean_appearance(
+    appearance: np.ndarray, material: np.ndarray, area: np.ndarray, count: int
+) -> np.ndarray:
+    """Mean appearance of each material, shape ``(count, K)``."""
     size = np.maximum(np.bincount(material, area, minlength=count), 1e-12)
-    sums = [np.bincount(material, area * channel, minlength=count) for channel in look.T]
+    sums = [np.bincount(material, area * channel, minlength=count) for channel in appearance.T]
     return np.stack(sums, axis=1) / size[:, None]
 
 
-def _look_cost(look: np.ndarray, typical: np.ndarray, o: Merging) -> np.ndarray:
-    gap = ((look[:, None] - typical[None]) ** 2).sum(axis=2)
-    return o.look_cost * np.minimum(np.nan_to_num(gap, nan=MOST_LOOK), MOST_LOOK)
+def _appearance_cost(appearance: np.ndarray, typical: np.ndarray, o: Merging) -> np.ndarray:
+    gap = ((appearance[:, None] - typical[None]) ** 2).sum(axis=2)
+    return o.appearance_cost * np.minimum(np.nan_to_num(gap, nan=MOST_APPEARANCE), MOST_APPEARANCE)
 
 
 def _costs(problem: Problem, p: Parameters, unit_of: np.ndarray, owner: np.ndarray) -> np.ndarray:
@@ -134,14 +136,14 @@ def _mirror_changes(
     o: Observation, problem: Problem, materials: Evaluation, unit_of: np.ndarray
 ) -> dict[int, np.ndarray]:
     """By unit the change of readings, shape ``(materials, N)``, by paths that meet it if it became each material."""
-    p, sharp, found = materials.parameters, o.view.records[SHARP], {}
-    sharp = sharp.take(np.flatnonzero(o.view.kept_paths(problem.effects)))
-    meets, count = sharp.index >= 0, len(p.log_excess)
-    unit = np.where(meets, unit_of[np.maximum(sharp.index, 0)], -1)
-    now = np.where(meets, materials.material[np.maximum(sharp.index, 0)], -1).astype(np.int32)
+    p, specular, found = materials.parameters, o.view.records[SPECULAR], {}
+    specular = specular.take(np.flatnonzero(o.view.kept_paths(problem.effects)))
+    meets, count = specular.index >= 0, len(p.log_excess)
+    unit = np.where(meets, unit_of[np.maximum(specular.index, 0)], -1)
+    now = np.where(meets, materials.material[np.maximum(specular.index, 0)], -1).astype(np.int32)
     path = o.path[o.view.kept_paths(problem.effects)]
     rows = Evaluation(p, device=materials.device)
-    before = replace(sharp, index=now).powers(rows)
+    before = replace(specular, index=now).powers(rows)
     for one in np.unique(unit[meets]):
         if o.measured.together is not None:
             found[int(one)] = _heard(o, problem, now, unit == one, p)
@@ -149,7 +151,7 @@ def _mirror_changes(
         own = np.flatnonzero((unit == one).any(axis=1))
         trial = np.where(unit[own] == one, np.arange(count, dtype=np.int32)[:, None, None], now[own])
         several = replace(
-            sharp.take(np.tile(own, count)), index=trial.reshape(-1, now.shape[1]).astype(np.int32)
+            specular.take(np.tile(own, count)), index=trial.reshape(-1, now.shape[1]).astype(np.int32)
         )
         new = several.powers(rows).reshape(count, -1)
         found[int(one)] = (new - before[own]).astype(np.float32) @ path[own]
@@ -159,12 +161,12 @@ def _mirror_changes(
 def _heard(o: Observation, problem: Problem, now: np.ndarray, own: np.ndarray, p: Parameters) -> np.ndarray:
     """The same where phases count: of all paths, ``own`` (L, K) of whose mirrors change."""
     kept = o.view.kept_paths(problem.effects)
-    together, sharp = o.measured.together, o.view.records[SHARP].take(np.flatnonzero(kept))
+    together, specular = o.measured.together, o.view.records[SPECULAR].take(np.flatnonzero(kept))
     if together is None:
         raise TypeError("measured: got one that hears powers alone, expected phases")
     together = together.subset(kept)
     heard = [
-        together.received(together.amplitudes(replace(sharp, index=index), p)[0]) / o.floor
+        together.received(together.amplitudes(replace(specular, index=index), p)[0]) / o.floor
         for index in (now, *(np.where(own, material, now) for material in range(len(p.log_excess))))
     ]
     return np.asarray(heard[1:], np.float32) - np.float32(heard[0])

@@ -38,7 +38,7 @@ from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, to_db
 from warprrf.rf.tracing.model import SETS, Effects, Layout, Model, Parameters
 from warprrf.rf.tracing.records import Bins, Evaluation, Records
 from warprrf.rf.tracing.render import path_gains
-from warprrf.rf.tracing.tracer import SHARP, View
+from warprrf.rf.tracing.tracer import SPECULAR, View
 
 NEPER = 10.0 / np.log(10.0)
 """Decibels of a neper of power."""
@@ -249,7 +249,7 @@ class Observation:
 
         def components() -> tuple[np.ndarray, np.ndarray]:
             own, count = self.ray_bins
-            (records,) = (t for name, t in self.view.tables(SETS["single"]).items() if name != SHARP)
+            (records,) = (t for name, t in self.view.tables(SETS["single"]).items() if name != SPECULAR)
             groups, sums = records.components(materials, Bins.of(own[records.ray], count))
             found = self.measured.of_bins(sums.reshape(count, -1), quick=True) / np.float32(self.floor)
             return groups, np.ascontiguousarray(found.T).reshape(*sums.shape[1:], found.shape[0])
@@ -281,24 +281,24 @@ class Observation:
 
     def direct(self, effects: Effects, materials: Evaluation) -> np.ndarray:
         """Readings of line of sight and mirrors in units of the floor, shape ``(N,)``."""
-        kept, sharp, together = (
+        kept, specular, together = (
             self.view.kept_paths(effects),
-            self.view.records[SHARP],
+            self.view.records[SPECULAR],
             self.measured.together,
         )
         if together is None:
-            return np.where(kept, sharp.powers(materials), 0.0).astype(np.float32) @ self.path
-        amplitude = together.amplitudes(sharp, materials.parameters, materials.material)[0]
+            return np.where(kept, specular.powers(materials), 0.0).astype(np.float32) @ self.path
+        amplitude = together.amplitudes(specular, materials.parameters, materials.material)[0]
         return together.received(np.where(kept, amplitude, 0.0)) / self.floor
 
     def slopes(
-        self, effects: Effects, materials: Evaluation, layout: Layout, *, sharp: bool = False
+        self, effects: Effects, materials: Evaluation, layout: Layout, *, specular: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of readings to the parameters of materials ``(C, N)`` float32, and their places ``(C,)``; those of
-        line of sight and mirrors alone, if ``sharp``."""
-        tables = [] if sharp else [(n, r) for n, r in self.view.tables(effects).items() if n != SHARP]
+        line of sight and mirrors alone, if ``specular``."""
+        tables = [] if specular else [(n, r) for n, r in self.view.tables(effects).items() if n != SPECULAR]
         side, (own, count) = self.view.tracer.surface.side_group, self.ray_bins
-        groups = [r.groups(side) for r in (self.view.records[SHARP], *(r for _, r in tables))]
+        groups = [r.groups(side) for r in (self.view.records[SPECULAR], *(r for _, r in tables))]
         seen = np.unique(materials.material[np.concatenate(groups)])
         index = (layout.stride * seen[:, None] + np.arange(layout.stride)).ravel()
         place = np.zeros(layout.groups, np.int32)
@@ -316,14 +316,14 @@ class Observation:
         self, effects: Effects, materials: Evaluation, place: np.ndarray, count: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of path powers, or amplitudes where phases count, ``(L, count)``, and what each reads ``(L, N)``."""
-        kept, sharp, p = self.view.kept_paths(effects), self.view.records[SHARP], materials.parameters
-        found = np.zeros((len(sharp), count))
+        kept, specular, p = self.view.kept_paths(effects), self.view.records[SPECULAR], materials.parameters
+        found = np.zeros((len(specular), count))
         if (together := self.measured.together) is None:
-            sharp.add_slopes(materials, Bins.of(np.arange(len(sharp)), len(sharp)), place, found)
+            specular.add_slopes(materials, Bins.of(np.arange(len(specular)), len(specular)), place, found)
             return found * kept[:, None], self.path
-        amplitude, rise = together.amplitudes(sharp, p, materials.material)
-        for path, mirror in zip(*np.nonzero(sharp.index >= 0), strict=True):
-            at = place[materials.material[sharp.index[path, mirror]]] + len(p.lobes)
+        amplitude, rise = together.amplitudes(specular, p, materials.material)
+        for path, mirror in zip(*np.nonzero(specular.index >= 0), strict=True):
+            at = place[materials.material[specular.index[path, mirror]]] + len(p.lobes)
             found[path, at : at + 2] += rise[path, mirror], 0.5 * amplitude[path]
         return found * kept[:, None], together.slopes(np.where(kept, amplitude, 0.0)) / self.floor
 
@@ -618,7 +618,7 @@ def _shares(o: Observation) -> tuple[np.ndarray, np.ndarray]:
     none = np.zeros((2, surface.cells))
     model = Model(SETS["single"], Parameters.prior(surface.groups), none, o.place.transmitter)
     materials = Evaluation(model.parameters, device=o.view.tracer.grid.device)
-    single = o.view.records[SHARP].powers(materials)[:, None] * o.path
+    single = o.view.records[SPECULAR].powers(materials)[:, None] * o.path
     share = single / np.maximum(o.predicted(model, materials), np.maximum(single.sum(axis=0), 1e-300))
     return share[o.view.paths.order == 0].sum(axis=0), (share**2).sum(axis=0)
 

@@ -30,8 +30,8 @@ def paths_of(
         max_paths: strongest to keep; None for all.
     """
     view, found = gains.view, gains.view.paths
-    exact = np.flatnonzero(gains.sharp > 0)
-    sharp, vertices = gains.sharp[exact], found.point[exact]
+    exact = np.flatnonzero(gains.specular > 0)
+    specular, vertices = gains.specular[exact], found.point[exact]
     kinds = np.where(found.order[exact] == 0, "los", "mirror").astype("<U7")
     diffuse = gains.by_ray().reshape(*image.shape, -1).sum(axis=-1)
     point = _bounce_points(view, gains.single, floor)
@@ -40,7 +40,7 @@ def paths_of(
         kept = diffuse == diffuse.max()
     power = diffuse[kept]
     if len(power):
-        power = power * max(float(image.sum()) - sharp.sum(), 0.0) / power.sum()
+        power = power * max(float(image.sum()) - specular.sum(), 0.0) / power.sum()
     over = np.full((len(power), *vertices.shape[1:]), np.nan)
     over[:, 0] = point[kept]
     whole = np.isfinite(over[:, 0]).all(axis=1)
@@ -49,7 +49,7 @@ def paths_of(
         view.tracer.transmitter,
         view.receivers[0],
         np.concatenate([vertices, over]),
-        np.sqrt(np.concatenate([sharp, power])).astype(complex),
+        np.sqrt(np.concatenate([specular, power])).astype(complex),
         np.concatenate([kinds, np.full(len(power), "diffuse", dtype="<U7")]),
         view.tracer.frequency_hz,
     )
@@ -60,7 +60,7 @@ def paths_of(
 def strongest(gains: PathGains, image: np.ndarray, beam_sigma_rad: float) -> tuple[np.ndarray, np.ndarray]:
     """Delay [s] ``(H, W)`` and angles of departure [rad] ``(H, W, 2)`` of each pixel's strongest path through the
     receiver's beam; NaN where empty."""
-    view, power = gains.view, gains.sharp
+    view, power = gains.view, gains.specular
     grid, receiver, transmitter = view.tracer.grid, view.receivers[0], view.tracer.transmitter
     ray = strongest_rays(grid.device_directions, gains.single, grid.shape, beam_sigma_rad, device=grid.device)
     dark = ray < 0

@@ -22,7 +22,7 @@ from warprrf.rf.fields.bistatic.observations import NOISE_DB, Observation, Place
 from warprrf.rf.spectra.readings import Readings, path_weights
 from warprrf.rf.tracing.model import Parameters
 from warprrf.rf.tracing.records import Evaluation
-from warprrf.rf.tracing.tracer import SHARP, View
+from warprrf.rf.tracing.tracer import SPECULAR, View
 
 STRONGEST = 20  # paths that count
 STEPS = 360
@@ -75,7 +75,7 @@ def _zero(one: Readings, seen: Sequence[tuple[Place, View]]) -> float:
 def _strongest(view: View) -> tuple[np.ndarray, ...]:
     """Powers of its strongest direct paths before any measurement, directions of arrival and departure, delays."""
     prior = Parameters.prior(view.tracer.surface.groups)
-    power = view.records[SHARP].powers(Evaluation(prior, device=view.tracer.grid.device))
+    power = view.records[SPECULAR].powers(Evaluation(prior, device=view.tracer.grid.device))
     kept = np.argsort(-power)[:STRONGEST]
     return power[kept], *(values[kept] for values in direct_paths(view))
 

@@ -24,7 +24,7 @@ from warprrf.rf.tracing.model import Model
 from warprrf.rf.tracing.records import Evaluation
 from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.surface import Surface
-from warprrf.rf.tracing.tracer import SHARP
+from warprrf.rf.tracing.tracer import SPECULAR
 
 DEVIATIONS = ((0.5, 0.5), (1.0, 2.0))
 """A priori of the gains of elements and of cells from 1 [nepers]: for single bounces, and for light that is sent on."""
@@ -67,12 +67,12 @@ def shares_of(o: Observation, model: Model, materials: Evaluation) -> Shares:
     rows, columns, powers = [], [], []
     for name, power in gains.tables.items():
         records = view.records[name]
-        if name == SHARP or not 0 <= records.gain < learned:
+        if name == SPECULAR or not 0 <= records.residual_row < learned:
             continue
         k = np.flatnonzero((power > 0) & (bins[records.ray] >= 0))
         ray = records.ray[k]
         rows.append(bins[ray])
-        columns.append(cells * records.gain + view.cell[ray])
+        columns.append(cells * records.residual_row + view.cell[ray])
         powers.append(power[k] / unit)
     if not rows:
         own = csr_matrix((count, 2 * cells), dtype=np.float32)

@@ -21,7 +21,7 @@ from warprrf.rf.spectra.spectrum import pixel_directions, pixel_of
 from warprrf.rf.tracing.model import Model
 from warprrf.rf.tracing.records import Evaluation
 from warprrf.rf.tracing.render import path_gains
-from warprrf.rf.tracing.tracer import SHARP, Tracer
+from warprrf.rf.tracing.tracer import SPECULAR, Tracer
 
 SHAPE = (40, 80)
 """Pixels that are told apart around a receiver: as wide as a usual beam."""
@@ -93,17 +93,17 @@ class Sensitivity:
         s, count = self.tracer.surface, SHAPE[0] * SHAPE[1]
         elements, element = len(s.element_area), s.element.take(view.hits.face, mode="wrap")
         pixel = np.ravel_multi_index(pixel_of(view.paths.arrival, SHAPE), SHAPE)
-        mirror = view.records[SHARP].index[:, 0]
+        mirror = view.records[SPECULAR].index[:, 0]
         own = mirror >= 0
         parts, rest = (
-            [(pixel[own], 2 * elements + mirror[own], found.sharp[own])],
-            [(pixel[~own], found.sharp[~own])],
+            [(pixel[own], 2 * elements + mirror[own], found.specular[own])],
+            [(pixel[~own], found.specular[~own])],
         )
         for name, power in found.tables.items():
-            ray, gain = view.records[name].ray, view.records[name].gain
+            ray, gain = view.records[name].ray, view.records[name].residual_row
             if gain >= 0:
                 parts.append((ray, elements * gain + element[ray], power))
-            elif name != SHARP:
+            elif name != SPECULAR:
                 rest.append((ray, power))  # what mirrors show is taken for known, as line of sight is
         row, unknown, power = (np.concatenate(column) for column in zip(*parts, strict=True))
         table = csr_matrix((power, (row, unknown)), shape=(count, 2 * elements + s.groups))
