@@ -57,7 +57,7 @@ FEW = 20
 MOST_TO_CHOOSE = 24
 """Receivers that fits which only decide about something learn from."""
 SHORT_STEPS = 10  # of such a fit
-BETTER, MUCH_BETTER = 0.995, 0.5
+BETTER, MUCH_BETTER = 0.995, 0.8
 """Share to which further effects must lower the mean square error of receivers held out; to which single bounces must lower
 it where receivers are too few to hold any out."""
 CLEARLY_WORSE, NOT_MUCH_WORSE = 1.05, 1.25
