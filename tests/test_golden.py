@@ -1,4 +1,4 @@
-"""What every public verb gave on small inputs when the goldens were written (:mod:`golden.make`), it gives today."""
+"""What public verbs gave on small inputs when the goldens were written (:mod:`golden.make`), it gives today."""
 
 import numpy as np
 import pytest

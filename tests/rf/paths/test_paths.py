@@ -129,19 +129,6 @@ def test_a_bare_mesh_reflects_perfectly_and_metal_does_almost():
     np.testing.assert_allclose(rough.power[1] / metal.power[1], 1 - 0.36, rtol=1e-3)
 
 
-def test_two_bounces_in_one_plane_of_incidence_multiply_te_and_tm():
-    # Floor and ceiling, ends above one another in x: both reflections share the plane of incidence.
-    mesh, part = joined(square(30.0), square(30.0, 3.0))
-    glass = SlabMaterial(relative_permittivity=6.0, conductivity=1.0)
-    scene = RadioScene(mesh, part, [glass, glass])
-    p = trace_paths(scene, transmitter=[-2, 0, 1.0], receivers=[2, 0, 2.0], frequency_hz=F, mirror_order=2)
-    for k in np.flatnonzero(np.isfinite(p.vertices[:, 1, 0])):
-        cos = np.abs(p.arrival[k, 2])
-        te, tm = slab_reflection(cos, glass.permittivity(F), glass.thickness_m, WAVELENGTH)
-        power = 0.5 * (np.abs(te) ** 4 + np.abs(tm) ** 4) * (WAVELENGTH / (4 * np.pi * p.length_m[k])) ** 2
-        assert p.power[k] == pytest.approx(power, rel=1e-9)
-
-
 def test_slab_limits():
     te, tm = slab_reflection(np.linspace(0.1, 1, 9), 1 - 1e9j, 0.1, WAVELENGTH)
     np.testing.assert_allclose(te, -1, atol=1e-3)
