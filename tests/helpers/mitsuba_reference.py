@@ -47,27 +47,8 @@ class Link:
         return (SPEED_OF_LIGHT / self.frequency_hz / (4.0 * np.pi)) ** 2
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """Path gain from independent runs, shape ``(N,)``."""
-
-    runs: np.ndarray
-
-    def __sub__(self, other: "Estimate") -> "Estimate":
-        return Estimate(self.runs - other.runs)
-
-    @property
-    def total(self) -> float:
-        return float(self.runs.mean())
-
-    @property
-    def error(self) -> float:
-        """Standard error of the total."""
-        return float(self.runs.std(ddof=1) / np.sqrt(len(self.runs)))
-
-
-def mitsuba_sequences(link: Link, samples: int, runs: int = 8) -> dict[str, Estimate]:
-    """S, SM, MS, SS and SSS, from ``runs`` times ``samples`` paths per pixel."""
+def mitsuba_sequences(link: Link, samples: int, runs: int = 8) -> dict[str, np.ndarray]:
+    """S, SM, MS, SS and SSS of each of ``runs`` independent runs of ``samples`` paths per pixel, shape ``(runs,)``."""
     dark = replace(link, does=np.where(link.does == MIRROR, BLACK, link.does))
     with mitsuba("llvm_ad_mono") as mi:
         _register(mi)
@@ -162,7 +143,7 @@ def _traced(
     *,
     integrator: str = "path",
     light: dict[str, Any] | None = None,
-) -> Estimate:
+) -> np.ndarray:
     """Paths with 1 to ``bounces`` interactions that ``integrator`` finds."""
     point = {"type": "point", "position": link.transmitter.tolist(), "intensity": 1.0}
     index = float(np.sqrt(link.permittivity))
@@ -195,7 +176,7 @@ def _traced(
         scene[f"part_{kind}"] = part
     loaded = mi.load_dict(scene)
     found = [np.array(mi.render(loaded, spp=samples, seed=seed), float).mean() for seed in range(runs)]
-    return Estimate(link.friis * np.array(found))
+    return link.friis * np.array(found)
 
 
 def floor_and_mirror(permittivity: float = 201.0) -> Link:

@@ -8,13 +8,10 @@ from furnished import RECEIVERS, TX, F, furnished, spectra
 from radio_scenes import RadioScene, SlabMaterial
 from twin_fields import known_field
 
-from warprrf.kernels.radio.records import SCATTER
 from warprrf.rf.em.fresnel import lobe
 from warprrf.rf.em.materials import NARROWEST_LOBE
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
-from warprrf.rf.tracing.model import Parameters
-from warprrf.rf.tracing.records import Evaluation, Records
 
 WAVELENGTH = SPEED_OF_LIGHT / F
 RX = RECEIVERS[0]
@@ -57,24 +54,6 @@ def test_a_reciprocal_lobe_is_symmetric_and_either_kind_scatters_all_that_comes(
             assert weight @ f.mean(axis=1) * 2.0 * np.pi == pytest.approx(
                 1.0, rel=1e-9 if reciprocal else 1e-6
             )
-
-
-def test_scattering_of_a_field_takes_both_ends_alike():
-    # Records of a unit of light, then the same with the two cosines exchanged: equal to the bit.
-    rng = np.random.default_rng(4)
-    angle = np.stack([*rng.uniform(0.0, 1.0, (2, 4000)), rng.uniform(-1.0, 1.0, 4000)], axis=1)[:, None]
-    group, ones = rng.integers(0, 2, (4000, 1)).astype(np.int32), np.ones(4000, np.float32)
-    weight = np.log([[0.1, 0.2, 0.3], [0.3, 0.1, 0.05]])
-    p = Parameters(weight, np.log([2.0, 5.0]), np.zeros(2), (0, 4, 30), reciprocal=True)
-
-    def power(p, angle):
-        records = Records(ones, group[:, 0], group, angle.astype(np.float32), 0, SCATTER, half_width=0.01)
-        return records.powers(Evaluation(p))
-
-    back = angle[..., [1, 0, 2]]
-    assert np.array_equal(power(p, angle), power(p, back))
-    plain = replace(p, reciprocal=False)
-    assert not np.allclose(power(plain, angle), power(plain, back), rtol=0.1)
 
 
 def test_a_fields_scattered_power_is_the_same_both_ways():

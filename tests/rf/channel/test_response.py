@@ -24,7 +24,7 @@ WAVELENGTH = SPEED_OF_LIGHT / F
 BAND = thz_channel(69)
 
 
-def far_square(material, half=200.0):
+def far_square(material, half=1100.0):
     """A floor in the plane z = 0."""
     return RadioScene(Mesh(*square(half)), np.zeros(2, np.int32), [material])
 
@@ -51,9 +51,10 @@ def test_friis_at_100_m():
 
 
 @pytest.mark.parametrize("material", [METAL, SlabMaterial(thickness_m=np.inf), SlabMaterial(scattering=0.6)])
-def test_two_rays_at_100_m(material):
-    h1, h2, across = 2.0, 1.5, 100.0
-    tx, rx = np.array([0, 0, h1]), np.array([across, 0, h2])
+@pytest.mark.parametrize("across", [100.0, 1000.0])
+def test_two_rays_from_100_m_to_a_kilometre(material, across):
+    h1, h2 = 12.3456789, 1.5
+    tx, rx = np.array([-0.5 * across, 3, h1]), np.array([0.5 * across, 3, h2])
     p = trace_paths(far_square(material), transmitter=tx, receivers=rx, frequency_hz=F)
     direct, bounced = np.hypot(across, h1 - h2), np.hypot(across, h1 + h2)
     te, tm = slab_reflection((h1 + h2) / bounced, material.permittivity(F), material.thickness_m, WAVELENGTH)
