@@ -2,18 +2,10 @@
 
 import numpy as np
 import pytest
-from sionna_room import sionna_or_skip, write_scene
+from sionna_room import write_scene
 
 import warprrf as wr
 from warprrf.rf.scene import Scene
-
-
-@pytest.fixture(scope="module")
-def rt():
-    sionna_or_skip()
-    from warprrf.rf.scene_sionna import sionna_rt
-
-    return sionna_rt()
 
 
 def test_a_scene_of_sionna_is_the_scene_of_its_file(rt):

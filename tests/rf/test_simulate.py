@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from radio_scenes import box_mesh, joined
 
-import warprrf.rf.simulate as module
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.materials import Band, Material
 from warprrf.rf.scene import Scene
@@ -38,35 +37,6 @@ def test_a_frequency_outside_the_band_names_material_and_band():
     stuff = Material("stone", (Band(1e9, 100e9, 5.0, 0.0, 0.1, 0.8),))
     with pytest.raises(ValueError, match=r"300 GHz.*'stone'.*1 to 100 GHz"):
         run([[3.0, 0, 1]], scene(stuff))
-
-
-def test_a_killed_run_goes_on_where_it_stopped(tmp_path, monkeypatch):
-    places = np.array([[3.0, 0, 1], [4, 1, 1.5], [-3, -3, 2]])
-    whole = run(places)
-    real, calls = module.ExactEngine.receive, []
-
-    def stop_at_third(self, point):
-        calls.append(point)
-        if len(calls) == 3:
-            raise KeyboardInterrupt
-        return real(self, point)
-
-    monkeypatch.setattr(module.ExactEngine, "receive", stop_at_third)
-    with pytest.raises(KeyboardInterrupt):
-        run(places, workspace=tmp_path)
-    seen = []
-    again = run(places, workspace=tmp_path, progress=lambda *state: seen.append(state))
-    assert len(calls) == 4
-    np.testing.assert_array_equal(again.path_gain, whole.path_gain)
-    np.testing.assert_array_equal(again.delay_s, whole.delay_s)
-    assert seen[-1] == ("simulate", 3, 3)
-    run(places[::-1], workspace=tmp_path)  # order plays no part
-    assert len(calls) == 4
-    next(tmp_path.glob("*.npz")).write_bytes(b"cut short")
-    run(places, workspace=tmp_path)
-    assert len(calls) == 5
-    run(places[:1], workspace=tmp_path, beam_sigma_rad=0.1)  # another beam is another spectrum
-    assert len(calls) == 6
 
 
 def test_receivers_are_drawn_from_the_air():

@@ -229,29 +229,6 @@ def fill(file: Path, rows: int = 6) -> np.ndarray:
     return store.arrays()["gain"] if file.exists() else GAIN[:0]
 
 
-def test_damage_of_an_unfinished_store_is_mended_or_refused_and_never_sealed(tmp_path: Path) -> None:
-    file, unfinished = tmp_path / "gain.nc", tmp_path / "gain.nc.unfinished"
-    fill(file, 4)
-    begun = unfinished.read_bytes()
-    fill(file)
-    whole, ends = file.read_bytes(), set()
-    row = begun.index(GAIN[2].tobytes())
-    for bit in [8 * row + 13, *np.random.default_rng(0).integers(8 * len(begun), size=60).tolist()]:
-        file.unlink(missing_ok=True)
-        spoilt = bytearray(begun)
-        spoilt[bit // 8] ^= 1 << bit % 8
-        unfinished.write_bytes(spoilt)
-        try:
-            fill(file)
-        except ValueError as error:
-            ends.add("refused")
-            assert "gain.nc.unfinished" in str(error) and not file.exists()
-        else:
-            ends.add("mended")
-            assert file.read_bytes() == whole
-    assert ends == {"refused", "mended"}
-
-
 @pytest.mark.parametrize("opened", [False, True])
 def test_a_store_that_another_process_finishes_meanwhile_is_read(
     opened: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -1,6 +1,5 @@
 """A field knows which receivers it was fitted on, and scoring says so when they are among those scored."""
 
-import json
 import warnings
 from pathlib import Path
 
@@ -46,30 +45,6 @@ def test_a_field_and_its_file_know_what_it_was_fitted_on(model: str, room: Path,
     words = [str(tmp_path / "field.safetensors"), str(room / "spectra.nc"), "-o", str(figures)]
     assert cli.main(["evaluate", *words, "--quiet", "--device", "cpu"]) == 2
     assert not figures.exists()
-
-
-def test_the_command_line_scores_what_it_fitted_without_the_test_receivers(
-    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Lookups see as many receivers as the field did, of the same order."""
-    field, figures = str(tmp_path / "field.safetensors"), tmp_path / "figures.json"
-    spectra, common = str(room / "spectra.nc"), ["--quiet", "--device", "cpu"]
-    fit = ["fit", str(room / "reconstruction"), spectra, "-o", field, "--train", "3", "--quick", *common]
-    assert cli.main(fit) == 0
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert cli.main(["evaluate", field, spectra, "-o", str(figures), *common]) == 0
-    held = json.loads(figures.read_text())
-    assert {row["receivers_fitted_on"] for row in held.values()} == {0}
-    train, test = wr.SpectrumDataset.load(spectra).split(3)
-    expected = wr.evaluate(test, lookups.nearest(train))
-    assert held["nearest"]["psnr_db"] == pytest.approx(expected["psnr_db"], rel=1e-9)
-    other = wr.SpectrumDataset.load(spectra)
-    moved = wr.RadioField.load(field).was_fitted_on(
-        type(other)(**{**vars(other), "transmitter": other.transmitter + 0.1})
-    )
-    assert not moved.any()  # under another transmitter these are other spectra
-    capsys.readouterr()
 
 
 def test_a_lookup_knows_what_it_was_built_from(room: Path) -> None:

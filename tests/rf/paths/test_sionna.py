@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from path_makers import CARRIER, random_paths
 from places import LOBBY
-from sionna_room import sionna_or_skip
 
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.interop.sionna_engine import load_sionna_scene
@@ -15,14 +14,6 @@ from warprrf.rf.spectra.dataset import SpectrumDataset
 
 TX = np.array([13.6, 11.2, 2.5])
 RECEIVERS = np.array([[7.0, 4.0, 1.5], [3.1, 9.2, 1.2], [15.0, 3.0, 1.7]])
-
-
-@pytest.fixture(scope="module")
-def rt():
-    sionna_or_skip()
-    from warprrf.rf.scene_sionna import sionna_rt
-
-    return sionna_rt()
 
 
 def solve(rt, scene, tx_array, rx_array, depth=2):

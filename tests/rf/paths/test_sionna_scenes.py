@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from sionna_room import sionna_or_skip
 
 import warprrf as wr
 from warprrf.rf.paths.path_set import Paths
@@ -22,14 +21,6 @@ PLACES = {
     "simple_street_canyon": ((-33.0, 0.0, 32.0), (10.0, 3.0, 1.5), (-20.0, -4.0, 1.5), (40.0, 0.0, 1.5)),
 }
 """Transmitter, then receivers [m]."""
-
-
-@pytest.fixture(scope="module")
-def rt():
-    sionna_or_skip()
-    from warprrf.rf.scene_sionna import sionna_rt
-
-    return sionna_rt()
 
 
 @pytest.mark.parametrize("name", PLACES)

@@ -63,24 +63,13 @@ def test_mirrors_one_after_the_other_reflect_as_jones_matrices_say() -> None:
     found = view.paths
     true = MirrorTracer(scene, transmitter=TX, frequency_hz=F).trace(RX, 2)
     power = field.path_gains(view).specular
-    compared = 0
-    for path in np.flatnonzero(found.order == 2):
+    for path in range(len(found)):
         same = (np.abs(true.length_m - found.length_m[path]) < 1e-6) & (
             true.arrival @ found.arrival[path] > 1 - 1e-9
         )
         assert same.sum() == 1
         assert power[path] == pytest.approx(true.power[same][0], rel=1e-6)
-        compared += 1
-    assert compared >= 8
-
-
-def test_one_mirror_reflects_the_mean_of_both_polarisations_and_absent_ones_nothing() -> None:
-    excess, cosine = np.geomspace(0.1, 50.0, 20), np.linspace(0.05, 1.0, 20)
-    root = np.sqrt(excess + cosine**2)
-    te, tm = ((a - root) / (a + root) for a in (cosine, (1.0 + excess) * cosine))
-    rest = np.zeros((20, 2))
-    share = reflected(np.column_stack([excess, rest]), np.column_stack([cosine, rest]), np.zeros((20, 3)))
-    np.testing.assert_allclose(share, 0.5 * (te**2 + tm**2), rtol=1e-12)
+    assert (np.bincount(found.order) >= [0, 5, 8]).all()  # fewer mirrors leave columns of none
 
 
 def test_a_mirror_met_head_on_has_no_plane_of_incidence() -> None:

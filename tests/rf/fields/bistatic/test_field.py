@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 from furnished import MATERIALS, RECEIVERS, ROOM, SHAPE, SIGMA, TX, F, spectra
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths, observation
-from twin_fields import known_field, room
 
 from warprrf.rf.em.fresnel import fresnel_curves, slab_transmission
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import fit as fitting
 from warprrf.rf.fields.bistatic import gauss_newton as newton
@@ -261,13 +259,6 @@ def test_duplicate_receivers_change_little(scene: RadioScene, data: SpectrumData
 def test_what_was_traced_at_other_places_is_refused(scene: RadioScene, data: SpectrumDataset) -> None:
     with pytest.raises(ValueError, match="views"):
         RadioField.fit(scene, data.subset([1]), views=trace(scene, data.subset([0])))
-
-
-def test_a_tracer_on_true_materials_matches_the_exact_engine() -> None:
-    field = known_field()
-    engine = ExactEngine(room(), transmitter=TX, frequency_hz=F, shape=field.shape, beam_sigma_rad=SIGMA)
-    power = field.path_gains(field.view(RECEIVERS[0])).single
-    assert power.sum() == pytest.approx(engine.diffuse(RECEIVERS[0]).power.sum(), rel=0.02)
 
 
 def test_the_beam_operator_is_the_beam_of_every_pixel() -> None:

@@ -7,7 +7,6 @@ import pytest
 from furnished import RECEIVERS, ROOM, SHAPE, TX, F, spectra
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths, observation
 
-from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
@@ -19,9 +18,7 @@ from warprrf.rf.fields.bistatic.observations import columns_of
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.spectrum import to_db
 from warprrf.rf.tracing.model import SETS, Effects, Parameters
-from warprrf.rf.tracing.records import Evaluation
 from warprrf.rf.tracing.surface import Surface
-from warprrf.rf.tracing.tracer import Tracer
 
 WAVELENGTH = SPEED_OF_LIGHT / F
 RECEIVERS = RECEIVERS[:6]
@@ -33,57 +30,6 @@ def test_a_surface_too_small_for_a_mirror_has_line_of_sight_alone() -> None:
     surface = Surface.of(RadioScene(mesh, part, [SlabMaterial()]))
     assert len(surface.plane_offset) == 0
     assert len(mirror_paths(surface, TX, np.array([[1.0, 1, 1]]), WAVELENGTH, 3)) == 1
-
-
-def plane(z: float, up: bool) -> tuple[np.ndarray, np.ndarray]:
-    corners = np.array([[-4.0, -4, z], [4, -4, z], [4, 4, z], [-4, 4, z]])
-    faces = np.array([[0, 1, 2], [0, 2, 3]])
-    return corners, faces if up else faces[:, ::-1]
-
-
-@pytest.mark.parametrize("name", ["MS", "SM"])
-def test_what_a_mirror_throws_on_a_floor_or_shows_of_it_comes_from_the_image(name: str) -> None:
-    """A rough floor under a mirror: besides the transmitter's own light, that of its image behind the mirror; and the
-    floor as the receiver's image sees it."""
-    mesh, part = joined(plane(0.0, True), plane(3.0, False))
-    both = Surface.of(RadioScene(mesh, part, [SlabMaterial("floor"), SlabMaterial("mirror")]))
-    mesh, part = joined(
-        plane(0.0, True), plane(6.0, False)
-    )  # a black lid far above, to have room for the image
-    alone = Surface.of(RadioScene(mesh, part, [SlabMaterial("floor"), SlabMaterial("lid")]))
-    receiver, transmitter = np.array([1.0, -0.5, 1.2]), np.array([-0.7, 0.4, 1.6])
-    nothing = -60.0
-    lobes = (0, 5)
-    weight = np.array([[np.log(0.2), np.log(0.3)], [nothing, nothing]])
-
-    def field(surface: Surface, source: np.ndarray, name: str = "") -> BistaticField:
-        return BistaticField(
-            surface=surface, transmitter=source, frequency_hz=F, shape=SHAPE, floor=1e-20, range_db=(-200.0, -80.0),
-            beam_sigma_rad=np.radians(5.0), effects=Effects(False, 0, 1, name == "MS", name == "SM"),
-            parameters=Parameters(weight, np.log([4.0, 199.0]), np.array([nothing, 0.0]), lobes),
-            material=np.arange(2), residual=np.zeros((2, surface.cells)),
-        )  # fmt: skip
-
-    def image(one: BistaticField, place: np.ndarray, name: str, flip: int = 1) -> np.ndarray:
-        power = one.path_gains(one.view(place)).by_ray([name]).reshape(*SHAPE, -1).sum(axis=-1)[::flip]
-        return BeamOperator(SHAPE, one.beam_sigma_rad)(power[..., None])[..., 0]
-
-    lit, dark = (field(both, transmitter, on) for on in (name, ""))
-    extra, behind = image(lit, receiver, name), np.array([0.0, 0.0, 6.0])
-    if name == "MS":
-        wanted = image(field(alone, behind + transmitter * [1, 1, -1]), receiver, "S")
-    else:  # upside down
-        wanted = image(field(alone, transmitter), behind + receiver * [1, 1, -1], "S", flip=-1)
-    # The mirror keeps what its Fresnel curve says, which hardly depends on the angle up to 60 degrees.
-    reflected = fresnel_curves().value(np.full(2, np.log(199.0)), np.array([0.5, 1.0]))[0]
-    # Rows whose pixels' rays meet the floor well inside: the receiver's image stands four times as high.
-    steep = slice(17, None) if name == "MS" else slice(3)
-    ratio = extra[steep] / wanted[steep]
-    assert 0.97 * reflected.min() < np.median(ratio) < 1.03 * reflected.max()
-    assert 0.9 * reflected.min() < ratio.min() and ratio.max() < 1.1 * reflected.max()
-    assert 0.97 * reflected.min() < extra.sum() / wanted.sum() < 1.03 * reflected.max()
-    more = lit.spectrum(receiver).path_gain.sum() - dark.spectrum(receiver).path_gain.sum()
-    assert more == pytest.approx(extra.sum(), rel=1e-5)
 
 
 @pytest.mark.usefixtures("device")
@@ -179,18 +125,3 @@ def test_columns_of_materials_predict_what_those_of_their_groups_do(problem: Pro
         light = rng.uniform(0, 5, (2, columns.single.shape[-1])).astype(np.float32)
         groups = replace(columns, senders=np.array([0, 2]), further=light)
         assert np.allclose(groups.power(p.take(owner)), groups.by_materials(owner).power(p), rtol=1e-5)
-
-
-def test_an_even_radiance_all_around_arrives_from_the_whole_sphere() -> None:
-    """In a closed room whose surfaces send L evenly, the sum over pixels is (lambda / 4 pi)^2 4 pi L."""
-    surface, shape = Surface.of(Mesh(*ROOM)), (12, 24)
-    radiance = 0.7
-    sides = surface.side_group
-    materials = Evaluation(Parameters.prior(surface.groups), None, sides, np.full(len(sides), radiance))
-    for sub_pixels in (1, 3):
-        view = Tracer.of(surface, TX, F, shape, sub_pixels).view(RECEIVERS[0], 0)
-        seen = view.tables(Effects())["E"]
-        power = np.bincount(seen.ray, seen.powers(materials), minlength=len(view.hits.face))
-        expected = (WAVELENGTH / (4.0 * np.pi)) ** 2 * 4.0 * np.pi * radiance
-        assert power.sum() == pytest.approx(expected, rel=1e-6)
-        assert (power.reshape(-1, sub_pixels**2).sum(axis=1) > 0).all()

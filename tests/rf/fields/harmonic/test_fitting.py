@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.special import factorial, lpmv
 
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.kernels.ssim import RADIUS, WINDOW
@@ -58,31 +59,22 @@ def coefficients_for(problem: Problem, kind: str, seed: int = 2) -> np.ndarray:
     return table
 
 
-def harmonics_by_hand(d: np.ndarray) -> np.ndarray:
-    """Real harmonics of degree 0 to 3 from Legendre functions, in the INRIA order and signs, shape (..., 16)."""
-    x, y, z = np.moveaxis(d, -1, 0)
-    azimuth, sine = np.arctan2(y, x), np.sqrt(x * x + y * y)
-    # Associated Legendre without the Condon-Shortley phase.
-    legendre = {
-        (0, 0): 1 + 0 * z, (1, 0): z, (1, 1): sine, (2, 0): (3 * z**2 - 1) / 2, (2, 1): 3 * z * sine,
-        (2, 2): 3 * sine**2, (3, 0): (5 * z**3 - 3 * z) / 2, (3, 1): 1.5 * (5 * z**2 - 1) * sine,
-        (3, 2): 15 * z * sine**2, (3, 3): 15 * sine**3,
-    }  # fmt: skip
-    factorial = [1, 1, 2, 6, 24, 120, 720]
-    out = []
+def harmonics(d: np.ndarray) -> np.ndarray:
+    """Real harmonics of degree 0 to 3 from SciPy's Legendre functions, in the INRIA order and signs, shape (..., 16)."""
+    azimuth, out = np.arctan2(d[..., 1], d[..., 0]), []
     for degree in range(4):
         for order in range(-degree, degree + 1):
             m = abs(order)
-            norm = np.sqrt((2 * degree + 1) / (4 * np.pi) * factorial[degree - m] / factorial[degree + m])
+            norm = np.sqrt((2 * degree + 1) / (4 * np.pi) * factorial(degree - m) / factorial(degree + m))
             turn = 1.0 if m == 0 else np.sqrt(2) * (np.cos(m * azimuth) if order > 0 else np.sin(m * azimuth))
-            out.append((-1) ** m * norm * turn * legendre[degree, m])
+            out.append(norm * turn * lpmv(m, degree, d[..., 2]))
     return np.stack(out, axis=-1)
 
 
 def loss_by_hand(problem: Problem, target: Target, kind: str, table: np.ndarray) -> float:
     """The documented loss in NumPy: dense loops, no kernels."""
     t = problem.transport
-    basis = harmonics_by_hand(pixel_directions(SHAPE).reshape(-1, 3))
+    basis = harmonics(pixel_directions(SHAPE).reshape(-1, 3))
     local = np.searchsorted(problem.seen, t.gaussian)
     pixel = np.repeat(np.arange(len(t.start) - 1), np.diff(t.start))
     x = np.einsum("ek,ek->e", table[local], basis[pixel % (SHAPE[0] * SHAPE[1])])
@@ -134,11 +126,6 @@ def test_loss_and_gradient_against_numpy_and_finite_differences(kind: str, with_
         direction = rng.normal(size=table.shape)
         numeric = (loss(table + step * direction) - loss(table - step * direction)) / (2 * step)
         assert (gradient * direction).sum() == pytest.approx(numeric, rel=2e-5, abs=1e-9)
-    for gaussian, k in ((0, 0), (4, 7), (8, 15)):
-        nudge = np.zeros_like(table)
-        nudge[gaussian, k] = step
-        numeric = (loss(table + nudge) - loss(table - nudge)) / (2 * step)
-        assert gradient[gaussian, k] == pytest.approx(numeric, rel=1e-4, abs=1e-9)
 
 
 def test_batches_split_the_receivers_and_each_epoch_uses_all_of_them() -> None:
