@@ -67,12 +67,10 @@ class Paths(PathArrays):
         bandwidth_hz: float,
         l_min: int,
         l_max: int,
-        *,
-        center_hz: float | None = None,
         **link: Unpack[LinkOptions],
     ) -> np.ndarray:
         """Taps of the discrete baseband channel; see :func:`warprrf.rf.channel.response.channel_taps`."""
-        return channel_taps(self, bandwidth_hz, l_min, l_max, center_hz=center_hz, **link)
+        return channel_taps(self, bandwidth_hz, l_min, l_max, **link)
 
     def diffuse_power(
         self, *, tx_array: PlanarArray | None = None, rx_array: PlanarArray | None = None

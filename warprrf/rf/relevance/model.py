@@ -163,7 +163,7 @@ class FullModel:
         self.blocked = np.array([not (v.paths.order == 0).any() for v in self.views])
         which = np.flatnonzero(self.blocked)
         past = past_obstacles(
-            walls, field.transmitter, receivers[which], field.wavelength_m, 
+            walls, field.transmitter, receivers[which], field.wavelength_m,
             position_error_m=field.surface.position_error_m, device=field.device
         )  # fmt: skip
         self.side = {name: replace(found, receiver=which[found.receiver]) for name, found in past.items()}
