@@ -1,8 +1,8 @@
 """Files that are whole or not there: written under a temporary name in their folder, then put in place in one step.
 
 What others' formats leave unchecked is sealed: a line with the SHA-256 of all before it ends the file. Readers of NetCDF
-and OpenEXR pass over it, to those of NPZ it is the comment of a zip file, and an editor of such a file drops it. JSON
-holds its own under the name ``sha256``.
+pass over it, to those of NPZ it is the comment of a zip file, and an editor of such a file drops it. JSON holds its own
+under the name ``sha256``.
 """
 
 from __future__ import annotations

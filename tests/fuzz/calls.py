@@ -220,7 +220,6 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "Reconstruction.report": lambda p: {"path": "report.html"},
     "Scene.to_sionna": lambda p: {"frequency_hz": 300e9},
     "Scene.load": lambda p: {"path": p.folder / "scene.xml"},
-    "Scene.object_faces": lambda p: {"name": "walls"},
     # materials and air
     "Material.custom": lambda p: {"name": "stone", "relative_permittivity": 5.0},
     "Air.from_attributes": lambda p: {"attributes": wr.Air().attributes},
@@ -286,7 +285,6 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "RadioMap.picture": lambda p: {"path": "map.png"},
     "RadioMap.plot_values": lambda p: {"quantity": "total_path_gain"},
     "Relevance.load": lambda p: {"path": p.folder / "relevance.json"},
-    "Relevance.reduce": lambda p: {"full": p.field},
     # channels
     "Paths.as_several": lambda p: {"self": p.paths.row(0)},
     "Paths.cfr": lambda p: {"frequencies_hz": 300e9 + np.linspace(-1e9, 1e9, 8), **LINK},

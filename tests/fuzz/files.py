@@ -32,7 +32,6 @@ from warprrf.geometry.photos.photo_files import check_photos, find_photos, read_
 from warprrf.geometry.photos.poses import DepthFile, read_depth, read_poses
 from warprrf.geometry.photos.sfm import read_colmap
 from warprrf.rf.interop.twin import write_twin
-from warprrf.rf.spectra.dataset_files import export_exr, import_exr
 from warprrf.steps import Steps
 
 Edit = tuple[str, int, int]
@@ -403,7 +402,6 @@ FORMATS: dict[str, Format] = {
     "transforms": Format(_text("transforms.json", TRANSFORMS), read_poses, "json"),
     "pose of a frame": Format(_made("frame-0.pose.txt", _frame), lambda p: read_poses(p.parent), "words"),
     "depth PNG": Format(_made("depth.png", _depth), lambda p: read_depth(DepthFile(p))),
-    "EXR": Format(_made("one.exr", lambda p, path: export_exr(path, p.spectra[0])), import_exr, "", "sealed"),
     "PNG": Format(_copy("photos/0.png"), _photo),
     "JPEG": Format(_copy("photos/1.jpg"), _photo),
     "PLY mesh": Format(_copy("walls.ply"), _mesh, "words", "one value"),

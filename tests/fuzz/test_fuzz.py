@@ -99,7 +99,7 @@ def test_what_is_no_argument_is_refused_by_its_name(attempt, name):
 
 
 FOUND = """
-Mesh.crossings: directions=as bool, points=no rows; Paths.taps: center_hz=huge; Paths.select: chosen=2^63
+Mesh.crossings: directions=as bool, points=no rows; Paths.select: chosen=2^63
 BistaticField.at_frequency: frequency_hz=tiny; RadioField.cfr: client=true; RadioField.fit: relevance=text
 RadioField.links: shape=with -inf; RadioField.load: path=no text; RadioField.suggest: candidates=with 1e+09
 Readings: chain=ragged; Readings.from_table: table=list; SpectrumDataset.empty: frequency_hz=tiny

@@ -83,6 +83,11 @@ def exact_spectra(scene, receivers, *, transmitter, frequency_hz, shape, sigma, 
     )  # fmt: skip
 
 
+def object_faces(scene, name):
+    """Indices of the faces of one object."""
+    return np.flatnonzero(scene.face_object == scene.object_names.index(name))
+
+
 def enclosed_volume(vertices, faces):
     """Signed volume [m^3]: positive where the faces of a closed surface point outwards."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from places import LOBBY
+from radio_scenes import object_faces
 
 from warprrf import cli
 from warprrf.geometry.mesh import Mesh
@@ -33,11 +34,11 @@ def lobby() -> Scene:
 def test_each_face_has_the_material_of_its_object(lobby: Scene) -> None:
     expected = {"floor": "marble", "wall_west": "glass", "gallery": "concrete", "elevator": "metal"}
     for name, material in expected.items():
-        used = {lobby.materials[k].name for k in lobby.face_material[lobby.object_faces(name)]}
+        used = {lobby.materials[k].name for k in lobby.face_material[object_faces(lobby, name)]}
         assert used == {material}
     assert len(lobby.face_object) == len(lobby.mesh.faces) == len(lobby.face_material)
     part = read_mesh(LOBBY / "meshes" / "kiosk.ply")
-    corners = lobby.mesh.vertices[lobby.mesh.faces[lobby.object_faces("kiosk")]]
+    corners = lobby.mesh.vertices[lobby.mesh.faces[object_faces(lobby, "kiosk")]]
     np.testing.assert_array_equal(corners, part.vertices[part.faces])
 
 

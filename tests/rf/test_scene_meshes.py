@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from model_files import obj_with_materials, room_glb
-from radio_scenes import box_mesh
+from radio_scenes import box_mesh, object_faces
 
 import warprrf as wr
 
@@ -18,7 +18,7 @@ def test_materials_of_a_mesh_file_are_known_by_name(tmp_path: Path) -> None:
     assert set(scene.object_names) == {"room", "table", "other table"}
     values = {material.name: material for material in scene.materials}
     assert values["itu_concrete"].itu == "concrete" and values["Wood_01"].itu == "wood"
-    faces = scene.object_faces("other table")
+    faces = object_faces(scene, "other table")
     assert {scene.materials[k].name for k in scene.face_material[faces]} == {"Wood_01"}
     assert scene.mesh.face_colours is not None
 

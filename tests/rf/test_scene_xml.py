@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from radio_scenes import box_mesh, enclosed_volume, is_wound_alike
+from radio_scenes import box_mesh, enclosed_volume, is_wound_alike, object_faces
 from sionna_room import sionna_or_skip
 
 import warprrf as wr
@@ -142,7 +142,7 @@ def test_surfaces_stand_where_mitsuba_puts_them(tmp_path: Path) -> None:
     theirs = mitsuba.load_string(f'<scene version="3.0.0">{plain}</scene>', optimize=False)
     for shape in theirs.shapes():
         corners = np.array(shape.vertex_positions_buffer()).reshape(-1, 3)
-        mine = ours.mesh.triangles[ours.object_faces(shape.id())].reshape(-1, 3)
+        mine = ours.mesh.triangles[object_faces(ours, shape.id())].reshape(-1, 3)
         gap = np.linalg.norm(mine[:, None] - corners, axis=2)
         assert gap.min(axis=1).max() < 1e-5 and gap.min(axis=0).max() < 1e-5, shape.id()
 

@@ -170,11 +170,7 @@ def check_dataset(
     Raises, warns: as :func:`check_positions`, :func:`question_unit` and
     :func:`~warprrf.rf.spectra.dataset.question_spectra`; and of what fields do not model.
     """
-    receivers = check_array("ds.receivers", ds.receivers, (None, 3))
-    transmitter, wavelength_m = (
-        check_array("ds.transmitter", ds.transmitter, (3,)),
-        SPEED_OF_LIGHT / ds.frequency_hz,
-    )
+    receivers, transmitter, wavelength_m = ds.receivers, ds.transmitter, SPEED_OF_LIGHT / ds.frequency_hz
     question_spectra(ds)
     if mesh is not None:
         question_unit(mesh, wavelength_m)

@@ -236,12 +236,6 @@ class Scene:
         """Lower and upper corner of the mesh [m], shape ``(2, 3)``."""
         return np.stack([self.mesh.vertices.min(axis=0), self.mesh.vertices.max(axis=0)])
 
-    def object_faces(self, name: str) -> np.ndarray:
-        """Indices of the faces of one object; ValueError for an unknown name."""
-        if name not in self.object_names:
-            raise ValueError(f"name: got {name!r}, expected one of {', '.join(self.object_names)}")
-        return np.flatnonzero(self.face_object == self.object_names.index(name))
-
     def is_free(
         self, points: ArrayLike, *, clearance_m: float = 0.0, device: DeviceLike = None
     ) -> np.ndarray:

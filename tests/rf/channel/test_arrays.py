@@ -94,7 +94,7 @@ def test_polarised_field_carries_the_gain(pattern):
 
 def test_plane_wave_error_falls_as_fresnel_says():
     a = PlanarArray(64, 64)
-    size = a.aperture_m(WAVELENGTH)
+    size = np.linalg.norm(np.ptp(a.positions(WAVELENGTH), axis=0))
     fraunhofer = 2 * size**2 / WAVELENGTH
     for distance in (fraunhofer, 10 * fraunhofer):
         # Path to the corner: r (sqrt(1 + (D / 2 r)^2) - 1) ~ D^2 / 8 r.

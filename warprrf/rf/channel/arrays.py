@@ -24,7 +24,6 @@ from numpy.typing import ArrayLike
 
 from warprrf.cache import cached_property
 from warprrf.checks import check_array, check_count, check_positive, checked
-from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
 from warprrf.rf.spectra.spectrum import angles_from_directions, transverse_basis
 
@@ -116,11 +115,6 @@ class PlanarArray:
         local[:, 2] = (0.5 * (self.rows - 1) - row) * down
         return local @ self.rotation.T
 
-    def aperture_m(self, wavelength_m: float) -> float:
-        """Largest distance between two elements [m]."""
-        p = self.positions(wavelength_m)
-        return float(np.linalg.norm(p[-1] - p[0])) if len(p) > 1 else 0.0
-
     def gain(self, directions: ArrayLike) -> np.ndarray:
         """Power gain of an element [linear] towards world ``directions`` (..., 3), shape ``(...)``."""
         local = check_array("directions", directions, (..., 3), finite=False) @ self.rotation
@@ -148,29 +142,23 @@ class PlanarArray:
             [size[..., None] * (turn @ np.array([np.cos(zeta), np.sin(zeta)])) for zeta in slants]
         )
 
-    def response(
-        self, directions: ArrayLike, wavelength_m: float, frequency_hz: float | None = None
-    ) -> np.ndarray:
-        """Plane-wave response exp(j 2 pi f / c d . u) of elements at d to world ``directions`` u (..., 3).
+    def response(self, directions: ArrayLike, wavelength_m: float) -> np.ndarray:
+        """Plane-wave response exp(j 2 pi / lambda d . u) of elements at d to world ``directions`` u (..., 3).
 
         Args:
-            wavelength_m: Of the carrier that the spacing is counted in.
-            frequency_hz: Frequency of the wave; the carrier by default.
+            wavelength_m: lambda, of the wave, that the spacing is counted in.
 
         Returns:
             Shape ``(..., N)``, complex, of unit modulus, phase zero at the array's centre.
         """
         reach = check_array("directions", directions, (..., 3), finite=False) @ self.positions(wavelength_m).T
-        number = 1.0 / wavelength_m if frequency_hz is None else frequency_hz / SPEED_OF_LIGHT
-        return np.exp(2j * np.pi * number * reach)
+        return np.exp(2j * np.pi / wavelength_m * reach)
 
-    def spherical_response(
-        self, points: ArrayLike, wavelength_m: float, frequency_hz: float | None = None
-    ) -> np.ndarray:
+    def spherical_response(self, points: ArrayLike, wavelength_m: float) -> np.ndarray:
         """Response to a source at ``points`` (..., 3) [m] from the array's centre, relative to that at the centre.
 
-        Every element's own distance counts, in phase and (as its inverse) in amplitude: r / r_n exp(-j 2 pi f (r_n -
-        r) / c). Shape ``(..., N)``, complex; other arguments as in :meth:`response`.
+        Every element's own distance counts, in phase and (as its inverse) in amplitude: r / r_n exp(-j 2 pi (r_n -
+        r) / lambda). Shape ``(..., N)``, complex; other arguments as in :meth:`response`.
         """
         source = check_array("points", points, (..., 3), finite=False)[..., None, :]
         place = self.positions(wavelength_m)
@@ -178,8 +166,7 @@ class PlanarArray:
         each = np.linalg.norm(source - place, axis=-1)
         # r_n - r without cancellation: (|d|^2 - 2 d . p) / (r_n + r).
         longer = ((place**2).sum(axis=-1) - 2.0 * (source * place).sum(axis=-1)) / (each + far)
-        number = 1.0 / wavelength_m if frequency_hz is None else frequency_hz / SPEED_OF_LIGHT
-        return far / each * np.exp(-2j * np.pi * number * longer)
+        return far / each * np.exp(-2j * np.pi / wavelength_m * longer)
 
 
 def rotation_matrix(orientation: ArrayLike) -> np.ndarray:

@@ -277,11 +277,6 @@ class MultiUserChoice:
     rx: np.ndarray
     sinr: np.ndarray
 
-    @property
-    def spectral_efficiency(self) -> float:
-        """Predicted sum over users of log2(1 + SINR) [bit/s/Hz]."""
-        return float(np.log2(1.0 + self.sinr).sum())
-
 
 @checked
 def select_beams_multiuser(

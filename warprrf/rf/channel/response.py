@@ -129,25 +129,18 @@ def frequency_response(
 
 
 def channel_taps(
-    paths: PathArrays,
-    bandwidth_hz: float,
-    l_min: int,
-    l_max: int,
-    *,
-    center_hz: float | None = None,
-    **link: Unpack[LinkOptions],
+    paths: PathArrays, bandwidth_hz: float, l_min: int, l_max: int, **link: Unpack[LinkOptions]
 ) -> np.ndarray:
     """Taps of the discrete baseband channel behind ideal low-pass filters of ``bandwidth_hz`` W.
 
-    h_l = sum of a exp(-j 2 pi f_0 tau) sinc(l - W tau) for l from ``l_min`` to ``l_max`` (Tse and Viswanath,
-    Fundamentals of Wireless Communication, eq. (2.34)), f_0 the centre of the band: the coefficients of the channel
-    sampled at W. Absorption is that at the carrier.
+    h_l = sum of a exp(-j 2 pi f_c tau) sinc(l - W tau) for l from ``l_min`` to ``l_max`` (Tse and Viswanath,
+    Fundamentals of Wireless Communication, eq. (2.34)), f_c the carrier, which is the centre of the band: the
+    coefficients of the channel sampled at W. Absorption is that at the carrier.
 
     Args:
         bandwidth_hz: Bandwidth W [Hz].
         l_min, l_max: First and last tap. A path of delay tau falls on tap W tau: count delays from the first path
             (``normalize_delays``) or let the taps reach that far.
-        center_hz: Centre of the band; the carrier by default.
         **link: See :class:`LinkOptions`.
 
     Returns:
@@ -158,21 +151,16 @@ def channel_taps(
     """
     check_positive("bandwidth_hz", bandwidth_hz)
     check_count("l_max", l_max, check_count("l_min", l_min, -(2**31)))
-    if center_hz is not None:
-        check_positive("center_hz", center_hz)
     lags = np.arange(l_min, l_max + 1)
 
     def taps(one: _Link) -> np.ndarray:
-        offset = (one.carrier_hz if center_hz is None else float(center_hz)) - one.carrier_hz
-
         def basis(delay: np.ndarray, which: slice) -> np.ndarray:
-            pulse = np.sinc(lags[which] - bandwidth_hz * (delay - one.shift_s)[..., None])
-            return pulse if offset == 0.0 else pulse * carrier_phase(offset, delay)[..., None]
+            return np.sinc(lags[which] - bandwidth_hz * (delay - one.shift_s)[..., None])
 
         h = np.zeros((*one.ports, len(lags)), dtype=complex)
         for _, ports, job in one.jobs():
             h[ports] += dense_sum(job, basis, len(lags))
-        return h * carrier_phase(-(one.carrier_hz + offset), one.shift_s)
+        return h * carrier_phase(-one.carrier_hz, one.shift_s)
 
     found = [taps(one) for one in _links(paths, **link)]
     return np.stack(found) if paths.batched else found[0]

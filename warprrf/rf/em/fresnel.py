@@ -249,33 +249,18 @@ class FresnelCurves:
 
     def at(self, table: np.ndarray, log_excess: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Rows of ``table`` (97, K) at ``log_excess`` (G,), clipped to the family, and derivatives, ``(G, K)``."""
-        i, s, step = self._place(log_excess)
-        s = s[:, None]
-        return (1 - s) * table[i] + s * table[i + 1], (table[i + 1] - table[i]) / step
-
-    def value(self, log_excess: ArrayLike, cosine: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Reflection (N,) at ``log_excess`` (N,) and ``cosine`` (N,), and its derivative to ``log_excess``."""
-        i, s, step = self._place(log_excess)
-        x = np.clip(np.asarray(cosine, float), 0.0, 1.0) * (COSINES - 1)
-        j = np.minimum(x.astype(int), COSINES - 2)
-        r = x - j
-        low = (1 - r) * self.curves[i, j] + r * self.curves[i, j + 1]
-        high = (1 - r) * self.curves[i + 1, j] + r * self.curves[i + 1, j + 1]
-        return (1 - s) * low + s * high, (high - low) / step
-
-    def even(self, log_excess: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Reflection under even light, 2 int F cos dcos, at ``log_excess`` (G,), and its derivative."""
-        cosine = np.linspace(0.0, 1.0, COSINES)
-        return tuple(rows @ cosine / cosine.sum() for rows in self.at(self.curves, log_excess))  # type: ignore[return-value]
-
-    def _place(self, log_excess: ArrayLike) -> tuple[np.ndarray, np.ndarray, float]:
-        """Row below each ``log_excess``, the share of the next, and the distance of rows."""
         step = self.log_excess[1] - self.log_excess[0]
         x = np.clip(
             (np.asarray(log_excess, float) - self.log_excess[0]) / step, 0.0, len(self.log_excess) - 1.001
         )
         i = x.astype(int)
-        return i, x - i, float(step)
+        s = (x - i)[:, None]
+        return (1 - s) * table[i] + s * table[i + 1], (table[i + 1] - table[i]) / step
+
+    def even(self, log_excess: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Reflection under even light, 2 int F cos dcos, at ``log_excess`` (G,), and its derivative."""
+        cosine = np.linspace(0.0, 1.0, COSINES)
+        return tuple(rows @ cosine / cosine.sum() for rows in self.at(self.curves, log_excess))  # type: ignore[return-value]
 
 
 @lru_cache(maxsize=1)

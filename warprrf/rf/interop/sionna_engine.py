@@ -120,11 +120,6 @@ class SionnaEngine:
         self._solver = self._rt.PathSolver(deterministic=True)
         self._solved = 0
 
-    @property
-    def version(self) -> str:
-        """Sionna RT's version."""
-        return str(self._rt.__version__)
-
     def solve(self, receiver: ArrayLike, *, specular: bool = True) -> dict[str, np.ndarray]:
         """Paths of one receiver (3,): ``power``, ``jones`` (L,2,2) without the delay's phase, along zenith and azimuth unit
         vectors, ``tau``, ``arrival`` (L,3), ``aod`` (L,2), ``diffuse``, ``bounces``.

@@ -34,7 +34,7 @@ from scipy.optimize import minimize
 from warprrf.checks import check_positive, checked
 from warprrf.files import partial_path, read_json, write_json
 from warprrf.geometry.mesh_files import write_mesh
-from warprrf.rf.em.fresnel import LAMBERTIAN, fresnel_curves, lobe, slab_reflection
+from warprrf.rf.em.fresnel import COSINES, LAMBERTIAN, fresnel_curves, lobe, slab_reflection
 from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, Band, Material, table_entry
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
@@ -243,9 +243,9 @@ def project_reflection(
         thickness_wavelengths: of the slab, over the wavelength; inf for a half-space.
     """
     cosine, weight, family = _slabs(thickness_wavelengths)
-    gap = (
-        family - NEPER * np.log(fresnel_curves().value(np.full(len(cosine), log_excess), cosine)[0])[:, None]
-    )
+    curves = fresnel_curves()
+    wanted_curve = curves.at(curves.curves, [log_excess])[0][0]
+    gap = family - NEPER * np.log(np.interp(cosine, np.linspace(0.0, 1.0, COSINES), wanted_curve))[:, None]
     level = weight @ gap
     shape = weight @ (gap - level) ** 2
     excess = np.log(_EXCESS)

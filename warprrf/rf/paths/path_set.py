@@ -12,24 +12,17 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from warprrf import netcdf_files
 from warprrf.checks import Expected, check_arrays, check_positive, checked, lengths, one_line
 from warprrf.netcdf_files import Variable
+from warprrf.rf.channel import dispersion as dispersions
+from warprrf.rf.channel import response
 from warprrf.rf.channel.arrays import PlanarArray
-from warprrf.rf.channel.dispersion import Dispersion, dispersion
 from warprrf.rf.channel.path_arrays import PathArrays
-from warprrf.rf.channel.response import (
-    LinkOptions,
-    channel_taps,
-    diffuse_power,
-    frequency_response,
-    impulse_response,
-)
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.paths import sionna
 from warprrf.tensor_files import named
@@ -47,44 +40,11 @@ class Paths(PathArrays):
 
     __repr__ = one_line
 
-    def cir(self, **link: Unpack[LinkOptions]) -> tuple[np.ndarray, np.ndarray]:
-        """Impulse response, one coefficient a path; see :func:`warprrf.rf.channel.response.impulse_response`."""
-        return impulse_response(self, **link)
-
-    def cfr(
-        self,
-        frequencies_hz: ArrayLike,
-        *,
-        amplitude: str = "carrier",
-        method: str = "auto",
-        **link: Unpack[LinkOptions],
-    ) -> np.ndarray:
-        """Frequency response; see :func:`warprrf.rf.channel.response.frequency_response`."""
-        return frequency_response(self, frequencies_hz, amplitude=amplitude, method=method, **link)
-
-    def taps(
-        self,
-        bandwidth_hz: float,
-        l_min: int,
-        l_max: int,
-        *,
-        center_hz: float | None = None,
-        **link: Unpack[LinkOptions],
-    ) -> np.ndarray:
-        """Taps of the discrete baseband channel; see :func:`warprrf.rf.channel.response.channel_taps`."""
-        return channel_taps(self, bandwidth_hz, l_min, l_max, center_hz=center_hz, **link)
-
-    def diffuse_power(
-        self, *, tx_array: PlanarArray | None = None, rx_array: PlanarArray | None = None
-    ) -> np.ndarray:
-        """Mean power that diffuse paths add to any pair of elements; see
-        :func:`warprrf.rf.channel.response.diffuse_power`."""
-        return diffuse_power(self, tx_array=tx_array, rx_array=rx_array)
-
-    def dispersion(self) -> Dispersion:
-        """Delay and angular spreads, K-factor and coherence bandwidth; see
-        :func:`warprrf.rf.channel.dispersion.dispersion`."""
-        return dispersion(self)
+    cir = response.impulse_response
+    cfr = response.frequency_response
+    taps = response.channel_taps
+    diffuse_power = response.diffuse_power
+    dispersion = dispersions.dispersion
 
     def to_sionna(
         self,

@@ -163,7 +163,7 @@ class FullModel:
         self.blocked = np.array([not (v.paths.order == 0).any() for v in self.views])
         which = np.flatnonzero(self.blocked)
         past = past_obstacles(
-            walls, field.transmitter, receivers[which], field.wavelength_m, 
+            walls, field.transmitter, receivers[which], field.wavelength_m,
             position_error_m=field.surface.position_error_m, device=field.device
         )  # fmt: skip
         self.side = {name: replace(found, receiver=which[found.receiver]) for name, found in past.items()}
@@ -210,7 +210,7 @@ class FullModel:
         """One spectrum; light over several surfaces is as long as what the same ray sees of single ones."""
         gains = field.path_gains(view)
         if gas:
-            length, records = view.single_bounce_m(), view.records
+            length, records = view.single_bounce_m(), gains.records
             own = {
                 name: power
                 * self._air(view.paths.length_m if name == "specular" else length[records[name].ray], True)

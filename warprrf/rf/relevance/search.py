@@ -26,7 +26,7 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.positions import check_positions, check_receivers, question_unit
-from warprrf.rf.relevance.model import FullModel, effects_of, full_field, lobe_name, with_lobes
+from warprrf.rf.relevance.model import FullModel, effects_of, full_field, lobe_name
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape
 from warprrf.rf.tracing.model import Effects
 
@@ -157,12 +157,6 @@ class Relevance:
             residual="residual" not in out and m.scatterings > 0,
         )
         return most, None if self.materials == "assumed" and m.scatterings else self.lobes
-
-    def reduce(self, full: BistaticField) -> BistaticField:
-        """``full``, a field with the effects that this was made of, cut down to the smallest model."""
-        return replace(
-            full, effects=self.model, parameters=with_lobes(full.parameters, self.lobes), errors=None
-        )
 
     def table(self) -> str:
         """The effects as a Markdown table, with what was chosen below it."""

@@ -2,7 +2,7 @@
 
 What goes in and comes out are the fields of :class:`~warprrf.rf.spectra.dataset.SpectrumDataset`, by name. A compact file holds
 the same variables with mantissas rounded to what matters, so that zlib finds something to compress.
-One spectrum alone also goes to and comes from OpenEXR: channels path_gain, delay, aod_zenith and aod_azimuth, 32-bit;
+One spectrum alone also goes to OpenEXR: channels path_gain, delay, aod_zenith and aod_azimuth, 32-bit;
 numbers in the header are text, because EXR headers hold 32-bit floats only.
 """
 
@@ -18,9 +18,9 @@ import numpy as np
 
 from warprrf import netcdf_files
 from warprrf.device import require
-from warprrf.files import check_seal, write_atomically
+from warprrf.files import write_atomically
 from warprrf.netcdf_files import XYZ, Axis, Variable
-from warprrf.rf.spectra.spectrum import Spectrum, check_range_db
+from warprrf.rf.spectra.spectrum import Spectrum
 
 # What a compact file keeps. A relative step of 2^-7 errs by at most 0.017 dB, half of N0 / 64 moves the dB image by at
 # most 0.034 dB.
@@ -182,42 +182,4 @@ def export_exr(path: str | os.PathLike[str], spectrum: Spectrum) -> None:
         except RuntimeError as error:
             raise OSError(errno.EIO, f"OpenEXR could not write it ({error})", os.fspath(path)) from error
 
-    write_atomically(path, write, seal=True)
-
-
-def import_exr(path: str | os.PathLike[str]) -> Spectrum:
-    """Read one spectrum from OpenEXR; position, frequency, beam and engine are in its ``attributes``.
-
-    Raises:
-        OSError: naming the file, if it cannot be read.
-        ValueError: naming it, if it is damaged, or does not read as one of ours.
-    """
-    file = os.fspath(path)
-    check_seal(file)
-    exr = require("OpenEXR", extra="exr")
-    try:
-        with exr.File(file, separate_channels=True) as opened:
-            header = dict(opened.header())
-            channels = {name: np.array(channel.pixels) for name, channel in opened.channels().items()}
-    except (OSError, RuntimeError, ValueError) as error:
-        raise ValueError(f"{file}: damaged, or no OpenEXR file: {error}") from error
-    lacking = [n for n in _CHANNELS if n not in channels] + [
-        n for n in ("floor", "range_db") if f"warprrf_{n}" not in header
-    ]
-    if lacking:
-        raise ValueError(f"{file}: lacks {', '.join(lacking)}, expected a spectrum exported by warprrf")
-    try:
-        numbers: dict[str, Any] = {}
-        for name in (n for n in (*_NUMBERS, "floor", "range_db") if f"warprrf_{n}" in header):
-            row = np.array([float(v) for v in str(header[f"warprrf_{name}"]).split()])
-            numbers[name] = row if len(row) > 1 else float(row[0])
-        return Spectrum(
-            path_gain=channels["path_gain"],
-            delay_s=channels["delay"].astype(np.float64),
-            aod=np.stack([channels["aod_zenith"], channels["aod_azimuth"]], axis=-1),
-            floor=numbers.pop("floor"),
-            range_db=check_range_db(numbers.pop("range_db")),
-            attributes=numbers | {name: str(header.get(f"warprrf_{name}", "")) for name in _WORDS},
-        )
-    except (IndexError, TypeError, ValueError) as error:
-        raise ValueError(f"{file}: {error}") from error
+    write_atomically(path, write)

@@ -159,13 +159,10 @@ def _same(spectrum: Spectrum, _: np.ndarray) -> Spectrum:
 
 
 def _receivers(train: SpectrumDataset) -> np.ndarray:
-    if not hasattr(train, "receivers"):
-        raise TypeError(f"train: got {type(train).__name__}, expected a SpectrumDataset")
-    receivers = np.asarray(train.receivers, dtype=np.float64)
-    if len(receivers) == 0:
+    if len(train.receivers) == 0:
         raise ValueError("train: got no receivers, expected at least one")
     check_whole("train.path_gain", train.path_gain)
-    return receivers
+    return train.receivers
 
 
 def _bare(path_gain: np.ndarray, train: SpectrumDataset) -> Spectrum:

@@ -15,35 +15,18 @@ from warprrf.geometry.splats.gaussians import Gaussians
 Y00 = 0.28209479177387814  # harmonic of degree 0
 TOLD_APART = 0.02  # faces whose colours differ by less are of one colour: what exporters write by default
 
-
-@dataclass(frozen=True)
-class ColourGrouping:
-    """What is told apart by colour. Colours are in steps: log chromaticity over ``chroma``, log luminance over
-    ``luminance``.
-
-    Attributes:
-        cell_m: colours are averaged over cells of this size.
-        sheet_m2: smaller connected pieces of a patch count as one.
-        piece_m2: a piece of one colour of a patch this large is a group of its own.
-        group_m2: smaller groups, from which nothing is learned, join the one that looks most like them.
-        chroma: log chromaticities that differ by less look alike.
-        luminance: and log luminances, which are also shade.
-        apart: least distance of two colours of one sheet, and in standard deviations within each.
-        alike: a small piece this near to a large one's colour joins it.
-        curved: pieces off all patches this near are one.
-        rest: small pieces that look like no large one are one this near.
-    """
-
-    cell_m: float = 0.4
-    sheet_m2: float = 0.2
-    piece_m2: float = 1.5
-    group_m2: float = 0.5
-    chroma: float = 0.05
-    luminance: float = 0.3
-    apart: tuple[float, float] = (1.2, 4.0)
-    alike: float = 1.0
-    curved: float = 2.0
-    rest: float = 4.0
+# Colours are compared in steps: log chromaticity over CHROMA, log luminance, which is also shade, over LUMINANCE.
+CHROMA = 0.05
+LUMINANCE = 0.3
+CELL_M = 0.4  # colours are averaged over cells of this size
+SHEET_M2 = 0.2  # smaller connected pieces of a patch count as one
+PIECE_M2 = 1.5  # a piece of one colour of a patch this large is a group of its own
+GROUP_M2 = 0.5  # smaller groups, from which nothing is learned, join the one that looks most like them
+APART = 1.2  # least distance of two colours of one sheet,
+APART_STD = 4.0  # and in standard deviations within each
+ALIKE = 1.0  # a small piece this near to a large one's colour joins it
+CURVED = 2.0  # pieces off all patches this near are one
+REST = 4.0  # small pieces that look like no large one are one this near
 
 
 @dataclass(frozen=True)
@@ -78,7 +61,7 @@ class Colours:
 
 
 def colour_groups(
-    mesh: Mesh, patch: np.ndarray, colours: Colours, options: ColourGrouping | None = None
+    mesh: Mesh, patch: np.ndarray, colours: Colours
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Groups of faces by patch and photo colour.
 
@@ -91,36 +74,34 @@ def colour_groups(
         mesh: F faces.
         patch: planar patch of each, -1 for none, shape ``(F,)``.
         colours: on its faces.
-        options: what is told apart.
 
     Returns:
         The group of each face, shape ``(F,)``; the material that each group is taken for, shape ``(G,)``; and its
         colour in steps, shape ``(G, 4)``.
     """
-    o = options or ColourGrouping()
-    sheet = _sheets(mesh, patch, o)
-    place = np.floor((mesh.triangles.mean(axis=1) - mesh.bounds[0]) / o.cell_m).astype(np.int64)
+    sheet = _sheets(mesh, patch)
+    place = np.floor((mesh.triangles.mean(axis=1) - mesh.bounds[0]) / CELL_M).astype(np.int64)
     unit = np.unique(np.column_stack([sheet, place]), axis=0, return_inverse=True)[1].reshape(-1)
     owner = np.full(int(unit.max()) + 1, -1)
     owner[unit] = sheet
     size = np.bincount(unit, mesh.areas) + 1e-9
-    feature = _colours(unit[colours.face], owner, size, colours, o)
+    feature = _colours(unit[colours.face], owner, size, colours)
     piece = np.zeros(len(owner), np.int64)
     for s in np.unique(owner):
         own = np.flatnonzero(owner == s)
-        split = _halved(feature[own], size[own], o) if s >= 0 else _joined(feature[own], o.curved)
+        split = _halved(feature[own], size[own]) if s >= 0 else _joined(feature[own], CURVED)
         piece[own] = split + (piece.max() + 1 if s > owner.min() else 0)
     area = np.bincount(piece, size)
     colour = np.stack([np.bincount(piece, size * channel) for channel in feature.T], axis=1) / area[:, None]
     flat = np.bincount(piece, size * (owner >= 0))
-    material = _alike(colour, flat, area, o)
+    material = _alike(colour, flat, area)
     return piece[unit].astype(np.int32), material.astype(np.int32), colour
 
 
-def _sheets(mesh: Mesh, patch: np.ndarray, o: ColourGrouping) -> np.ndarray:
+def _sheets(mesh: Mesh, patch: np.ndarray) -> np.ndarray:
     """Connected pieces of each patch, shape ``(F,)``, its crumbs together; -1 off all patches."""
     piece = connected_pieces(mesh, patch)
-    crumb = np.bincount(piece, mesh.areas)[piece] < o.sheet_m2
+    crumb = np.bincount(piece, mesh.areas)[piece] < SHEET_M2
     key = np.where(crumb, patch + int(piece.max()) + 1, piece)
     sheet = np.full(len(patch), -1)
     own = patch >= 0
@@ -128,9 +109,7 @@ def _sheets(mesh: Mesh, patch: np.ndarray, o: ColourGrouping) -> np.ndarray:
     return sheet
 
 
-def _colours(
-    unit: np.ndarray, owner: np.ndarray, size: np.ndarray, colours: Colours, o: ColourGrouping
-) -> np.ndarray:
+def _colours(unit: np.ndarray, owner: np.ndarray, size: np.ndarray, colours: Colours) -> np.ndarray:
     """Colour of each unit in steps, shape ``(U, 4)``: the mean of ``colours``, which stand at ``unit``; of one without
     any that of its sheet, or of all."""
     count = len(owner)
@@ -144,13 +123,13 @@ def _colours(
         seen = seen if seen.any() else known
         mean[(owner == s) & ~known] = np.average(mean[seen], axis=0, weights=size[seen])
     luminance = mean.mean(axis=1, keepdims=True)
-    return np.concatenate([(mean - luminance) / o.chroma, luminance / o.luminance], axis=1)
+    return np.concatenate([(mean - luminance) / CHROMA, luminance / LUMINANCE], axis=1)
 
 
-def _halved(feature: np.ndarray, size: np.ndarray, o: ColourGrouping) -> np.ndarray:
+def _halved(feature: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Cluster of each row: halved by two means as long as the halves are clearly apart."""
     one = np.zeros(len(feature), np.int64)
-    if len(feature) < 4 or size.sum() < o.group_m2:
+    if len(feature) < 4 or size.sum() < GROUP_M2:
         return one
     mean = np.average(feature, axis=0, weights=size)
     axis = np.linalg.svd((feature - mean) * np.sqrt(size)[:, None], full_matrices=False)[2][0]
@@ -170,11 +149,11 @@ def _halved(feature: np.ndarray, size: np.ndarray, o: ColourGrouping) -> np.ndar
     centre = np.stack([np.average(feature[label == k], axis=0, weights=size[label == k]) for k in (0, 1)])
     gap = np.linalg.norm(centre[1] - centre[0])
     along = (feature - centre[label]) @ (centre[1] - centre[0]) / max(gap, 1e-12)
-    if gap <= max(o.apart[0], o.apart[1] * np.sqrt(np.average(along**2, weights=size))):
+    if gap <= max(APART, APART_STD * np.sqrt(np.average(along**2, weights=size))):
         return one
     for k in (0, 1):
         own = label == k
-        one[own] = _halved(feature[own], size[own], o) + (one.max() + 1 if k else 0)
+        one[own] = _halved(feature[own], size[own]) + (one.max() + 1 if k else 0)
     return one
 
 
@@ -185,7 +164,7 @@ def _joined(colour: np.ndarray, distance: float) -> np.ndarray:
     return np.asarray(fcluster(linkage(colour, "centroid"), distance, "distance"), np.int64) - 1
 
 
-def _alike(colour: np.ndarray, flat: np.ndarray, area: np.ndarray, o: ColourGrouping) -> np.ndarray:
+def _alike(colour: np.ndarray, flat: np.ndarray, area: np.ndarray) -> np.ndarray:
     """Material that each piece is taken for, numbered without gaps, shape ``(G,)``.
 
     Args:
@@ -193,20 +172,20 @@ def _alike(colour: np.ndarray, flat: np.ndarray, area: np.ndarray, o: ColourGrou
         flat: area on patches, shape ``(G,)`` [m^2].
         area: in all.
     """
-    large = np.flatnonzero(flat >= o.piece_m2)
+    large = np.flatnonzero(flat >= PIECE_M2)
     material = np.full(len(colour), -1)
     material[large] = np.arange(len(large))
     small = np.flatnonzero(material < 0)
     if len(large) and len(small):
         distance, nearest = cKDTree(colour[large]).query(colour[small])
-        material[small] = np.where(distance < o.alike, nearest, -1)
+        material[small] = np.where(distance < ALIKE, nearest, -1)
     rest = np.flatnonzero(material < 0)
-    material[rest] = len(large) + _joined(colour[rest], o.rest)
+    material[rest] = len(large) + _joined(colour[rest], REST)
     while True:  # too small to learn from: join what looks most like it
         material = np.unique(material, return_inverse=True)[1].reshape(-1)
         whole = np.bincount(material, area)
         tiny = int(whole.argmin())
-        if len(whole) < 2 or whole[tiny] >= o.group_m2:
+        if len(whole) < 2 or whole[tiny] >= GROUP_M2:
             return material
         centre = (
             np.stack([np.bincount(material, area * channel) for channel in colour.T], axis=1) / whole[:, None]

@@ -10,7 +10,7 @@ import numpy as np
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.tracing.interreflection import irradiance
 from warprrf.rf.tracing.model import Model, Parameters
-from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.records import Evaluation, Records
 from warprrf.rf.tracing.tracer import SPECULAR, Tracer, View
 
 
@@ -21,11 +21,13 @@ class PathGains:
     Attributes:
         view: what they see.
         tables: of each record, by sequence; see :class:`View`.
+        records: by sequence.
         parameters: under which they are.
     """
 
     view: View
     tables: dict[str, np.ndarray]
+    records: dict[str, Records]
     parameters: Parameters
 
     @property
@@ -35,7 +37,7 @@ class PathGains:
 
     def by_ray(self, names: Iterable[str] | None = None) -> np.ndarray:
         """Of everything but those, or of the sequences ``names``, by the ray that sees it, shape ``(R K,)``."""
-        count, records = len(self.view.hits.face), self.view.records
+        count, records = len(self.view.hits.face), self.records
         chosen = [n for n in (self.tables if names is None else names) if n != SPECULAR and n in self.tables]
         return sum((np.bincount(records[n].ray, self.tables[n], count) for n in chosen), np.zeros(count))
 
@@ -65,7 +67,8 @@ def path_gains(view: View, model: Model, materials: Evaluation) -> PathGains:
     """
     t, found = view.tracer, {}
     gains = model.cell_gains(t.transmitter)
-    for name, records in view.tables(model.effects).items():
+    tables = view.tables(model.effects)
+    for name, records in tables.items():
         power = records.powers(materials)
         factor = (
             gains[records.residual_row, view.cell[records.ray]]
@@ -74,7 +77,7 @@ def path_gains(view: View, model: Model, materials: Evaluation) -> PathGains:
         )
         found[name] = power * factor
     found[SPECULAR] = np.where(view.kept_paths(model.effects), found[SPECULAR], 0.0)
-    return PathGains(view, found, model.parameters)
+    return PathGains(view, found, tables, model.parameters)
 
 
 def images(gains: PathGains, beam: BeamOperator) -> np.ndarray:

@@ -4,12 +4,10 @@ A piece is a connected part of a plane, or of a smooth curved surface. Which pie
 tell, but things are mostly made of one: the pieces of a connected part are taken for one material before any
 measurement. A part that reaches through the whole room (its shell, or a scan in which all hangs together) is no such
 thing: there each piece stands for itself. The spectra then decide which of them are alike, and where they say nothing,
-pieces of like extent, height and place are (:mod:`warprrf.rf.fields.bistatic.grouping`).
+pieces of like extent, height and place are (:mod:`warprrf.rf.fields.bistatic.merging`).
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -17,76 +15,55 @@ from scipy.spatial import cKDTree
 from warprrf.geometry.mesh import Mesh, components, edge_pairs
 
 SHAPES = 6  # numbers that tell shapes apart
+SMOOTH_RAD = 0.5  # small flat pieces that meet at a smaller angle are a curved one
+SMALL_M2 = 1.5  # a smaller piece may be a facet of such
+CRUMB_M2 = 0.2  # smaller pieces, from which nothing is learned, join the nearest of their part
+THROUGH = 0.5  # a part whose extents are at least this share of the mesh's along all axes is the room's shell
+BODY_M2 = 0.5  # smaller bodies are taken for the material of the larger one that is most like them
+PLACE_M = 1.0  # distance that counts as much as a material's difference,
+EXTENT = 10.0  # and ratio of extents
+THIN_M = 0.03  # smaller extents count as this
 
 
-@dataclass(frozen=True)
-class ShapeGrouping:
-    """What is told apart by shape.
-
-    Attributes:
-        smooth_rad: small flat pieces that meet at a smaller angle are a curved one.
-        small_m2: a smaller piece may be a facet of such.
-        crumb_m2: smaller pieces, from which nothing is learned, join the nearest of their part.
-        through: a part whose extents are at least this share of the mesh's along all axes reaches through the room.
-        body_m2: smaller bodies are taken for the material of the larger one that is most like them.
-        place_m: distance that counts as much as a material's difference.
-        extent: and ratio of extents.
-        thin_m: smaller extents count as this.
-    """
-
-    smooth_rad: float = 0.5
-    small_m2: float = 1.5
-    crumb_m2: float = 0.2
-    through: float = 0.5
-    body_m2: float = 0.5
-    place_m: float = 1.0
-    extent: float = 10.0
-    thin_m: float = 0.03
-
-
-def shape_groups(
-    mesh: Mesh, patch: np.ndarray, options: ShapeGrouping | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def shape_groups(mesh: Mesh, patch: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Groups of faces by planar patch and connected part.
 
     Args:
         mesh: F faces.
         patch: planar patch of each, -1 for none, shape ``(F,)``.
-        options: what is told apart.
 
     Returns:
         The group of each face, shape ``(F,)``; the material that each group is taken for, shape ``(G,)``; and its
         shape in steps: height and place of its body, and the body's extents upward, along and across, shape ``(G, 6)``.
     """
-    o = options or ShapeGrouping()
     pairs = edge_pairs(mesh.welded_faces)
     part = components(len(mesh.faces), pairs)
-    group = _without_crumbs(mesh, _pieces(mesh, patch, pairs, o), part, o)
+    group = _without_crumbs(mesh, _pieces(mesh, patch, pairs), part)
     _, first = np.unique(group, return_index=True)
-    through = _extents(mesh, part) >= o.through * _extents(mesh, np.zeros(len(part), np.int64))
+    through = _extents(mesh, part) >= THROUGH * _extents(mesh, np.zeros(len(part), np.int64))
     lone = np.asarray(through.all(axis=1))[part[first]]
     body = np.unique(np.where(lone, np.arange(len(first)), len(first) + part[first]), return_inverse=True)[1]
-    shape, area = _shape(mesh, body[group], o), np.bincount(body[group], mesh.areas)
-    large = np.flatnonzero(area >= min(o.body_m2, float(area.max())))
+    shape, area = _shape(mesh, body[group]), np.bincount(body[group], mesh.areas)
+    large = np.flatnonzero(area >= min(BODY_M2, float(area.max())))
     material = cKDTree(shape[large]).query(shape)[1]
     material[large] = np.arange(len(large))
     return group.astype(np.int32), material[body].astype(np.int32), shape[body]
 
 
-def _pieces(mesh: Mesh, patch: np.ndarray, pairs: np.ndarray, o: ShapeGrouping) -> np.ndarray:
+def _pieces(mesh: Mesh, patch: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Connected sheets of the patches, those that are facets of a smooth surface together, shape ``(F,)``."""
     a, b = pairs.T
     together = (patch[a] == patch[b]) & (patch[a] >= 0)
     sheet = components(len(patch), pairs[together])
-    small = np.bincount(sheet, mesh.areas)[sheet] < o.small_m2
+    small = np.bincount(sheet, mesh.areas)[sheet] < SMALL_M2
     n = mesh.face_normals
-    bend = np.abs(np.einsum("ni,ni->n", n[a], n[b])) > np.cos(o.smooth_rad)
+    bend = np.abs(np.einsum("ni,ni->n", n[a], n[b])) > np.cos(SMOOTH_RAD)
     return components(len(patch), pairs[together | (bend & small[a] & small[b])])
 
 
-def _without_crumbs(mesh: Mesh, piece: np.ndarray, part: np.ndarray, o: ShapeGrouping) -> np.ndarray:
+def _without_crumbs(mesh: Mesh, piece: np.ndarray, part: np.ndarray) -> np.ndarray:
     """Pieces numbered without gaps, crumbs joined to the nearest piece of their part, or to each other, ``(F,)``."""
-    crumb = np.bincount(piece, mesh.areas)[piece] < o.crumb_m2
+    crumb = np.bincount(piece, mesh.areas)[piece] < CRUMB_M2
     whole = np.zeros(int(part.max()) + 1, bool)
     whole[part[~crumb]] = True
     piece = np.where(crumb & ~whole[part], int(piece.max()) + 1 + part, piece)
@@ -120,7 +97,7 @@ def _extents(mesh: Mesh, owner: np.ndarray) -> np.ndarray:
     return np.sqrt(12.0 * np.maximum(np.column_stack([second[:, 2, 2], level]), 0.0))
 
 
-def _shape(mesh: Mesh, owner: np.ndarray, o: ShapeGrouping) -> np.ndarray:
+def _shape(mesh: Mesh, owner: np.ndarray) -> np.ndarray:
     """Shape of each of ``owner`` (F,) in steps, ``(N, 6)``; see :func:`shape_groups`."""
-    extents = np.log(np.maximum(_extents(mesh, owner), o.thin_m)) / np.log(o.extent)
-    return np.column_stack([(_moments(mesh, owner)[0] - mesh.center) / o.place_m, extents])
+    extents = np.log(np.maximum(_extents(mesh, owner), THIN_M)) / np.log(EXTENT)
+    return np.column_stack([(_moments(mesh, owner)[0] - mesh.center) / PLACE_M, extents])

@@ -61,7 +61,7 @@ class View:
         paths: line of sight and mirror paths, L in all.
         records: tables by sequence, of those that were asked for; of line of sight and mirrors under :data:`SPECULAR`, one row
             for each of ``paths``.
-        beams: unit beam of each path over the pixels, shape ``(L, H, W)`` float32; None where none was asked for.
+        keeps: whether what is made when it is first asked for is kept; tables of single bounces are in any case.
     """
 
     tracer: Tracer
@@ -69,7 +69,21 @@ class View:
     hits: Hits
     paths: MirrorPaths
     records: dict[str, Records] = field(repr=False)
-    beams: np.ndarray | None = field(default=None, repr=False)
+    keeps: bool = True
+    _beams: list[np.ndarray] = field(init=False, repr=False, default_factory=list)
+
+    @property
+    def beams(self) -> np.ndarray | None:
+        """Unit beam of each path over the pixels, shape ``(L, H, W)`` float32; None where the tracer has no beam."""
+        sigma = self.tracer.beam_sigma_rad
+        if sigma is None:
+            return None
+        made = (
+            self._beams[0] if self._beams else unit_beams(self.paths.arrival, self.tracer.grid.shape, sigma)
+        )
+        if self.keeps:
+            self._beams[:] = [made]
+        return made
 
     @property
     def cell(self) -> np.ndarray:
@@ -88,10 +102,14 @@ class View:
     def tables(self, effects: Effects) -> dict[str, Records]:
         """The tables that count under ``effects``; they are traced when they are first asked for."""
         wanted = (SPECULAR, *sequences(effects))
-        if not self.records.keys() >= set(wanted):
+        missing = [name for name in wanted if name not in self.records]
+        made = self.tracer.trace(self, missing) if missing else {}
+        if made:
             with making:
-                self.records.update(self.tracer.trace(self, [n for n in wanted if n not in self.records]))
-        return {name: self.records[name] for name in wanted}
+                self.records.update(
+                    {name: table for name, table in made.items() if self.keeps or name == "S"}
+                )
+        return {name: made[name] if name in made else self.records[name] for name in wanted}
 
     def kept_paths(self, effects: Effects) -> np.ndarray:
         """Which line of sight and mirror paths count, shape ``(L,)`` bool."""
@@ -203,20 +221,20 @@ class Tracer:
             self.images, receivers, order, self.wavelength_m, self.surface.position_error_m, progress
         )
 
-    def view(self, receivers: np.ndarray, mirrors: int, *, paths: MirrorPaths | None = None) -> View:
+    def view(
+        self, receivers: np.ndarray, mirrors: int, *, paths: MirrorPaths | None = None, keeps: bool = True
+    ) -> View:
         """What ``receivers``, (3,) or (R, 3) [m], see.
 
         Args:
             receivers: positions, off the surface.
             mirrors: most reflections of mirror paths.
             paths: line of sight and mirror paths, if they are known.
+            keeps: whether the view keeps what is made when it is first asked for.
         """
         places = np.asarray(receivers, np.float64).reshape(-1, 3)
         found = self.paths(places, mirrors) if paths is None else paths
-        beams = None
-        if self.beam_sigma_rad is not None:
-            beams = unit_beams(found.arrival, self.grid.shape, self.beam_sigma_rad)
-        return View(self, places, self.grid.hit(places), found, {SPECULAR: self._sharp(found)}, beams)
+        return View(self, places, self.grid.hit(places), found, {SPECULAR: self._specular(found)}, keeps)
 
     def trace(self, view: View, names: Sequence[str]) -> dict[str, Records]:
         """Tables of sequences that a receiver sees, by name."""
@@ -231,7 +249,7 @@ class Tracer:
             return self.seen(rays)
         return self.lit_by_mirrors(rays) if name.startswith("M") else self.lit(rays)
 
-    def _sharp(self, p: MirrorPaths) -> Records:
+    def _specular(self, p: MirrorPaths) -> Records:
         """Line of sight and mirror paths as records, in double precision."""
         friis = (self.wavelength_m / (4.0 * np.pi * p.length_m)) ** 2 * p.share**2
         group = np.append(self.surface.patch_group, -1)[p.patch]  # no patch has no group
@@ -344,9 +362,11 @@ class Tracer:
         return replace(view, tracer=self, hits=replace(view.hits, **own))
 
 
-def traced(again: Callable[[], Tracer], effects: Effects, part: tuple[np.ndarray, MirrorPaths]) -> View:
+def traced(
+    again: Callable[[], Tracer], effects: Effects, keeps: bool, part: tuple[np.ndarray, MirrorPaths]
+) -> View:
     """What a receiver (3,) of known line of sight and mirror paths sees, without what all receivers share."""
-    view = again().view(part[0], effects.mirrors, paths=part[1])
+    view = again().view(part[0], effects.mirrors, paths=part[1], keeps=keeps)
     view.tables(effects)
     none: dict[str, Any] = {"directions": None, "solid_angle": None}
     return replace(view, tracer=None, hits=replace(view.hits, **none))  # type: ignore[arg-type]

@@ -81,6 +81,8 @@ NORMAL_MEDIAN = 1.4826  # standard deviation over the median size of normal erro
 MOST_RAYS = 500_000_000
 """Spectra with more rays than this are refused: what rays meet is kept during a fit."""
 RAY_BYTES = 40  # kept of each ray
+MOST_KEPT = 30_000_000
+"""Rays up to which light over several surfaces is kept too, for as much again; of more it is traced when it is asked for."""
 SUB_PIXELS, QUICK_SUB_PIXELS = 3, 1
 """Square roots of the rays per pixel."""
 
@@ -249,6 +251,7 @@ def trace(
     tell("patches", 0, 1)
     surface = Surface.of(geometry)
     tell("patches", 1, 1)
+    keeps = len(places) * places[0].shape[0] * places[0].shape[1] * sub_pixels**2 <= MOST_KEPT
     together: dict[tuple[object, ...], list[int]] = {}  # places under one transmitter
     for k, place in enumerate(places):
         together.setdefault((place.transmitter.tobytes(), *place.seen_from[2:]), []).append(k)
@@ -265,7 +268,7 @@ def trace(
             wanted = replace(wanted, mirrors=tracer.images.affordable(receivers, wanted.mirrors))
         found = tracer.paths(receivers, wanted.mirrors, progress)
         parts = [(receivers[r], found.subset(np.flatnonzero(found.receiver == r))) for r in range(len(own))]
-        for r, view in each(partial(traced, tracer.again, wanted), parts, client):
+        for r, view in each(partial(traced, tracer.again, wanted, keeps), parts, client):
             views[own[r]] = tracer.adopted(view)
             tell("transport", len(views), len(places))
     seconds = time.perf_counter() - started

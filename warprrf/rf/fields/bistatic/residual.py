@@ -66,7 +66,7 @@ def shares_of(o: Observation, model: Model, materials: Evaluation) -> Shares:
     learned = 1 + np.array_equal(view.tracer.transmitter, model.transmitter)
     rows, columns, powers = [], [], []
     for name, power in gains.tables.items():
-        records = view.records[name]
+        records = gains.records[name]
         if name == SPECULAR or not 0 <= records.residual_row < learned:
             continue
         k = np.flatnonzero((power > 0) & (bins[records.ray] >= 0))

@@ -100,7 +100,7 @@ class Sensitivity:
             [(pixel[~own], found.specular[~own])],
         )
         for name, power in found.tables.items():
-            ray, gain = view.records[name].ray, view.records[name].residual_row
+            ray, gain = found.records[name].ray, found.records[name].residual_row
             if gain >= 0:
                 parts.append((ray, elements * gain + element[ray], power))
             elif name != SPECULAR:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.cache import cached_property
-from warprrf.checks import check_array, check_count
+from warprrf.checks import check_array
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.splats.camera import Camera
@@ -142,22 +142,17 @@ def transport(
         progress: called once a receiver with the stage ``"transport"``.
 
     Raises:
-        ValueError: for positions that are not finite, an unknown rule, or a ``top_k`` below 1.
+        ValueError: for positions that are not finite, or an unknown rule.
     """
     positions = check_array("receivers", receivers, (None, 3))
     if len(positions) == 0:
         raise ValueError("receivers: got none, expected at least one position")
-    if rule not in TRANSMITTANCE:
-        raise ValueError(f"rule: got {rule!r}, expected one of {', '.join(TRANSMITTANCE)}")
-    check_count("top_k", top_k)
     rows, columns = check_shape(shape)
     blending = cutoffs(range_db, rule)
     views = []
     for i, position in enumerate(positions):
         camera = Camera.spherical(columns, rows, position=position)
-        views.append(
-            _kept(blend_weights(gaussians, camera, top_k=int(top_k), blending=blending, device=device))
-        )
+        views.append(_kept(blend_weights(gaussians, camera, top_k=top_k, blending=blending, device=device)))
         if progress is not None:
             progress("transport", i + 1, len(positions))
     counts, gaussian, weight, dominant, expected = zip(*views, strict=True)
@@ -232,10 +227,8 @@ def interaction_points(
             back on ``"peak"``.
 
     Raises:
-        ValueError: for an unknown kind, or ``"mesh"`` without a mesh.
+        ValueError: for ``"mesh"`` without a mesh.
     """
-    if kind not in INTERACTION_POINTS:
-        raise ValueError(f"interaction_point: got {kind!r}, expected one of {', '.join(INTERACTION_POINTS)}")
     if kind == "mesh" and mesh is None:
         raise ValueError('interaction_point: got "mesh", but the geometry has no mesh; use "peak"')
     directions = pixel_directions(seen.shape)
