@@ -81,7 +81,7 @@ class HarmonicField(RadioField):
         delay_unit: seconds per unit of the delay layer.
         air: absorption over every path's length, that of the data set it was fitted to; None for none. ``rf3dgs`` has
             lengths for an explicit line of sight alone and learns it with the gain.
-        fitted_on: receivers whose spectra it was fitted to [m], shape ``(R, 3)``; None where it is not known.
+        fitted_on: receivers whose spectra it was fitted to [m], shape ``(R, 3)``.
         report: how the fit went: seconds, pairs, losses, Gaussians seen.
     """
 
@@ -100,7 +100,7 @@ class HarmonicField(RadioField):
     gain_unit: float
     delay_unit: float
     air: Air | None = None
-    fitted_on: np.ndarray | None = field(default=None, repr=False)
+    fitted_on: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
     report: dict[str, Any] = field(default_factory=dict, repr=False)
     device: DeviceLike = field(default=None, repr=False)
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(8))
