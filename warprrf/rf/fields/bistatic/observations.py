@@ -7,10 +7,11 @@ come from paths (:mod:`warprrf.rf.fields.bistatic.measured`).
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -415,27 +416,44 @@ def _summed(owner: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndar
     return found, out
 
 
-class Kind(Protocol):
-    """How one kind of data set is taken apart; made with its number among the data sets, and the set."""
+@dataclass(eq=False)
+class Kind(ABC):
+    """How one kind of data set is taken apart.
 
-    def ends(self) -> tuple[np.ndarray, np.ndarray]:
-        """Transmitter of each receiver and the receivers [m], shape ``(R, 3)`` each."""
+    Attributes:
+        number: index among the data sets.
+        one: the data set.
+    """
 
+    number: int
+    one: Any
+
+    @abstractmethod
     def places(self, mesh: Mesh | None, device: DeviceLike) -> list[Place]:
         """Where it was taken, checked."""
 
+    @abstractmethod
     def observe(self, place: Place, view: View) -> Observation:
         """What was read at ``place``, where ``view`` is seen."""
 
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """Transmitter of each receiver and the receivers [m], shape ``(R, 3)`` each."""
+        return self.one.transmitters, self.one.receivers
+
     def frame(self) -> Frame:
-        """What a field's spectra are made with, if it is the first."""
+        """What a field's spectra are made with, if it is the first: floor and range are those of the powers."""
+        one = self.one
+        floor = float(np.min(one.floor))
+        levels = 10.0 * float(np.log10(floor)), 10.0 * float(np.log10(np.nanmax(one.power)))
+        return Frame(
+            one.transmitters[0], one.frequency_hz, READINGS_SHAPE, floor, levels, BEAM_SIGMA_RAD, one.air
+        )
 
 
 @dataclass(eq=False)
-class _Spectra:
+class _Spectra(Kind):
     """Whole spectra: pixels through a beam."""
 
-    number: int
     one: SpectrumDataset
     _whole: dict[Any, Any] = field(default_factory=dict)
 
@@ -468,15 +486,11 @@ class _Spectra:
 
 
 @dataclass(eq=False)
-class _Tables:
+class _Tables(Kind):
     """Tables of readings: horns, power alone, taps of delay."""
 
-    number: int
     one: Readings
     _pointings: list[tuple[np.ndarray, np.ndarray] | None] = field(default_factory=list)
-
-    def ends(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.one.transmitters, self.one.receivers
 
     def places(self, mesh: Mesh | None, device: DeviceLike) -> list[Place]:
         one = self.one
@@ -522,19 +536,12 @@ class _Tables:
         huber_db = HUBER_DB if one.samples is None and not one.total else WIDE_HUBER_DB
         return replace(bare, target=target, sight=None if one.total else sight, huber_db=huber_db)
 
-    def frame(self) -> Frame:
-        return _frame_of_powers(self.one)
-
 
 @dataclass(eq=False)
-class _Arrays:
+class _Arrays(Kind):
     """Spectra of coherent arrays."""
 
-    number: int
     one: ArraySpectra
-
-    def ends(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.one.transmitters, self.one.receivers
 
     def places(self, mesh: Mesh | None, device: DeviceLike) -> list[Place]:
         one = self.one
@@ -573,11 +580,8 @@ class _Arrays:
         )
         return replace(bare, target=target.trusted(NOISE_DB / np.hypot(NOISE_DB, std_db)), robust=True)
 
-    def frame(self) -> Frame:
-        return _frame_of_powers(self.one)
 
-
-KINDS: dict[type, Any] = {SpectrumDataset: _Spectra, Readings: _Tables, ArraySpectra: _Arrays}
+KINDS: dict[type, type[Kind]] = {SpectrumDataset: _Spectra, Readings: _Tables, ArraySpectra: _Arrays}
 """How each kind of data set is taken apart."""
 
 
@@ -661,15 +665,6 @@ class Frame:
     range_db: tuple[float, float]
     beam_sigma_rad: float
     air: Air | None
-
-
-def _frame_of_powers(one: Readings | ArraySpectra) -> Frame:
-    """Floor and range are those of the powers."""
-    floor = float(np.min(one.floor))
-    levels = 10.0 * float(np.log10(floor)), 10.0 * float(np.log10(np.nanmax(one.power)))
-    return Frame(
-        one.transmitters[0], one.frequency_hz, READINGS_SHAPE, floor, levels, BEAM_SIGMA_RAD, one.air
-    )
 
 
 def frame_of(data: Sequence[Measured]) -> Frame:
