@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
 from functools import partial
 from importlib.metadata import version
-from typing import Any, ClassVar, Self, TypeAlias, Unpack, cast
+from typing import Any, ClassVar, Self, TypeAlias, TypeVar, Unpack, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -539,6 +539,22 @@ class RadioField(ABC):
             raise ValueError(f"transmitter: got {self.transmitter}, expected at most {LARGEST_M:g} m")
         if self.air is not None:
             self.air.loss_per_m(self.frequency_hz)
+
+
+Options = TypeVar("Options", bound=Any)
+
+
+def with_settings(options: Options, settings: Mapping[str, Any]) -> Options:
+    """``options`` of a fit, a dataclass, with ``settings`` in place of the attributes that they name.
+
+    Raises:
+        TypeError: for a name that is no option.
+        ValueError: for a value out of range.
+    """
+    names = [f.name for f in fields(options)]
+    if unknown := sorted(set(settings) - set(names)):
+        raise TypeError(f"fit: got unknown option {', '.join(unknown)}, expected among {', '.join(names)}")
+    return replace(options, **settings)
 
 
 class ResponseOptions(LinkEnds, total=False):

@@ -41,7 +41,7 @@ from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.materials import assumed_permittivity
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
-from warprrf.rf.fields.base import Data, Measured, RadioField
+from warprrf.rf.fields.base import Data, Measured, RadioField, with_settings
 from warprrf.rf.fields.bistatic import files
 from warprrf.rf.fields.bistatic.fit import SUB_PIXELS, FitOptions, TrainingViews, fit
 from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
@@ -195,7 +195,7 @@ class BistaticField(RadioField):
                 empty, or ``views`` of others.
             TypeError: for a geometry without a mesh, or an unknown option.
         """
-        chosen, data = FitOptions.of(options, settings), as_list(ds)
+        chosen, data = with_settings(options or FitOptions(), settings), as_list(ds)
         if model != "bistatic":
             raise ValueError(f"model: got {model!r}, expected 'bistatic'")
         if not any(map(len, data)):

@@ -136,22 +136,6 @@ class FitOptions:
             check_count("sub_pixels", self.sub_pixels, 1, 16)
         Parameters.prior(1, LOBES if self.lobes is None else self.lobes)
 
-    @classmethod
-    def of(cls, options: FitOptions | None, settings: dict[str, Any]) -> FitOptions:
-        """``options`` with ``settings`` by name.
-
-        Raises:
-            TypeError: for a name that is no option.
-            ValueError: for a value out of range.
-        """
-        names = [f.name for f in fields(cls)]
-        unknown = sorted(set(settings) - set(names))
-        if unknown:
-            raise TypeError(
-                f"fit: got unknown option {', '.join(unknown)}, expected among {', '.join(names)}"
-            )
-        return replace(options or cls(), **settings)
-
     def candidates(self, frequency_hz: float) -> list[Effects]:
         """Effects to choose from, the fewest first; one where they are given. What ``relevance`` rules out is off."""
         most = Effects() if self.relevance is None else self.relevance.needs(frequency_hz)[0]

@@ -42,7 +42,7 @@ from warprrf.geometry.splats.gaussians import Gaussians, discs_on_mesh, gaussian
 from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.fields.base import RadioField
+from warprrf.rf.fields.base import RadioField, with_settings
 from warprrf.rf.fields.harmonic.fitting import KINDS, SAVED_EVERY, Checkpoint, State, fit_layer, targets
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining, list_responses
 from warprrf.rf.fields.harmonic.options import FieldOptions, Rates, SingleBounce
@@ -164,7 +164,7 @@ class HarmonicField(RadioField):
                 f"ds: got {type(ds).__name__}, expected a SpectrumDataset: model {model!r} is fitted to whole spectra; "
                 'a model="bistatic" takes readings and arrays too'
             )
-        chosen = FieldOptions.of(options, {**settings, "model": model})
+        chosen = with_settings(options or FieldOptions(), {**settings, "model": model})
         started = time.perf_counter()
         gaussians, mesh = _geometry(geometry)
         receivers, transmitter = check_dataset(mesh, ds, device=device)
