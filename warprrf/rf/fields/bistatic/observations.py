@@ -21,7 +21,7 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.fresnel import fresnel_curves
-from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT
 from warprrf.rf.fields.base import Data, Measured
 from warprrf.rf.fields.bistatic.measured import (
     ArrayImage,
@@ -41,8 +41,6 @@ from warprrf.rf.tracing.records import Bins, Evaluation, Records
 from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.tracer import SPECULAR, View
 
-NEPER = 10.0 / np.log(10.0)
-"""Decibels of a neper of power."""
 OWN_GAIN = -2
 """In place of a measuring chain's index: readings of one place whose common gain is not known. Their sum tells it."""
 NOISE_DB = 3.0
