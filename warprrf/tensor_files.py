@@ -1,7 +1,7 @@
 """Arrays by name on disk: safetensors (no pickle), plain values as JSON in the header, replaced at once.
 
 Files carry a SHA-256 of all that they hold, in their metadata: other tools open them as they are, and what a disk or a
-transfer changed is found before anything is computed from it. Files without one, of older versions, are read too.
+transfer changed is found before anything is computed from it. Files without one, of other tools, are read too.
 """
 
 from __future__ import annotations

@@ -90,7 +90,7 @@ def wrong(answer: Leaves, usual: Leaves, unknown: tuple[str, ...] = ()) -> str:
 
     NaN is right where names end in one of ``unknown``. Attributes of a data set are the caller's own.
     A pixel of a spectrum from which nothing comes has no delay and no direction: these are NaN there. So is a thickness that
-    nobody knows, as in older files of fields.
+    nobody knows.
     """
     for where, array in answer.items():
         if not _holds_nan(array) or ".attributes." in where or where.endswith((".thickness_m", *unknown)):

@@ -266,7 +266,7 @@ def _text(name: str, content: str) -> Callable[[Place, Path], Path]:
 
 
 def without_checksum(place: Place, path: Path) -> None:
-    """The bistatic field as older versions wrote it."""
+    """The bistatic field as something else would write it."""
     data = (place.folder / "bistatic.safetensors").read_bytes()
     size = int.from_bytes(data[:8], "little")
     header = json.loads(data[8 : 8 + size])
@@ -358,7 +358,7 @@ FORMATS: dict[str, Format] = {
         f"{name} field": Format(_copy(f"{name}.safetensors"), _field, "tensors", "sealed", ("transmitter",))
         for name in ("bistatic", "harmonic", "rf3dgs")
     },
-    "older field": Format(_made("old.safetensors", without_checksum), _field, "", "whole", ("transmitter",)),
+    "field without checksum": Format(_made("old.safetensors", without_checksum), _field, "", "whole", ("transmitter",)),
     "unfinished store": Format(_copy("store.nc.unfinished", "bistatic.safetensors"), _resumed, "", "sealed"),
     "paths": Format(_copy("paths.nc"), _paths, "netcdf", "sealed"),
     "reconstruction": Format(

@@ -119,7 +119,7 @@ def test_what_is_learned_of_surfaces_is_shown_on_them(field):
     wanted = 10 * np.log10(np.exp(p.log_mirror) * gamma**2)
     np.testing.assert_allclose(room.learned(field, "reflection"), wanted[surface.group], atol=0.05)
     known = field.gain_std_db()
-    unmeasured = dataclasses.replace(field, fitted_on=None).gain_std_db()
+    unmeasured = dataclasses.replace(field, fitted_on=np.zeros((0, 3)), fitted_under=None).gain_std_db()
     prior = 10 / np.log(10) * np.hypot(SHARED[0], OWN[0])
     np.testing.assert_allclose(unmeasured, prior)
     assert (known <= unmeasured).all() and known.min() < 0.5 * prior

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -455,10 +454,8 @@ def _evaluate(args: argparse.Namespace, out: Output) -> None:
 
     field = wr.RadioField.load(existing(args.field))
     dataset = load_spectra(args.spectra)
-    if field.fitted_on is None:
-        warnings.warn(f"{args.field}: an older file, which does not say what it was fitted on", stacklevel=1)
     there = int(np.count_nonzero(dataset.role == "train"))
-    count = there if field.fitted_on is None else min(max(len(field.fitted_on), 1), there)
+    count = min(max(len(field.fitted_on), 1), there)
     train, test = dataset.split(count if args.train is None else args.train, seed=args.seed)
     learned = field.was_fitted_on(test)
     if learned.any():

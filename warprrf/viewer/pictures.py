@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from warprrf import device as _device
-from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.gaussians import Y00, Gaussians
 
 Image = tuple[str, np.ndarray, float, float, str]
 """Title, values (H, W) [dB], lowest and highest of the colours, colour map."""
@@ -126,7 +126,7 @@ def named_colours(index: np.ndarray) -> np.ndarray:
 def splats(gaussians: Gaussians) -> dict[str, np.ndarray]:
     """Arrays that viser draws: ``centers`` (N, 3), ``covariances`` (N, 3, 3), ``rgbs`` (N, 3), ``opacities`` (N, 1)."""
     turned = gaussians.rotations * gaussians.scales[:, None, :]
-    base = gaussians.sh[:, 0, :3] * 0.28209479177387814 + 0.5
+    base = gaussians.sh[:, 0, :3] * Y00 + 0.5
     return {
         "centers": gaussians.means,
         "covariances": turned @ np.swapaxes(turned, 1, 2),

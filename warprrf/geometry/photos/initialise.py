@@ -26,9 +26,8 @@ from warprrf.geometry.photos.sparse import SparseModel
 from warprrf.geometry.photos.sweep import GreyPhotos, choose_views, joined, level_planes, proven_cells
 from warprrf.geometry.planes import Plane, aligned, plane_axes
 from warprrf.geometry.splats.camera import Camera
-from warprrf.geometry.splats.gaussians import Gaussians, quaternions_of
+from warprrf.geometry.splats.gaussians import Y00, Gaussians, quaternions_of
 
-SH_DC = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
 OPACITY = 0.95
 SPREAD = 0.65  # standard deviation of a disc in units of the spacing: little light leaks between neighbours
 FLATNESS = 0.05  # thickness over radius
@@ -87,7 +86,7 @@ def discs(centres: np.ndarray, normals: np.ndarray, radius: np.ndarray, colors: 
     axes = np.array([plane_axes(n) for n in kinds])[which.ravel()]
     rotation = np.stack([axes[:, 0], axes[:, 1], normals], axis=2)
     scales = np.stack([radius, radius, np.maximum(FLATNESS * radius, 1e-4)], axis=1)
-    sh = ((colors - 0.5) / SH_DC)[:, None, :]
+    sh = ((colors - 0.5) / Y00)[:, None, :]
     return Gaussians(centres, quaternions_of(rotation), scales, np.full(len(centres), OPACITY), sh)
 
 

@@ -12,7 +12,7 @@ from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.cells import in_frame
 from warprrf.geometry.splats.camera import Camera
-from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.gaussians import Y00, Gaussians
 
 SAMPLES = 30_000  # points of the surface, spread by area
 FARTHEST_M, GRAZING = 15.0, 0.1  # a photo shows a point nearer than this, at a cosine of incidence above this
@@ -118,4 +118,4 @@ def painted(points: np.ndarray, light: np.ndarray, places: np.ndarray, colours: 
 
 def colours_of(gaussians: Gaussians) -> np.ndarray:
     """Mean colour of each Gaussian in [0, 1], shape ``(N, 3)``."""
-    return np.clip(0.28209479177387814 * gaussians.sh[:, 0] + 0.5, 0.0, 1.0)
+    return np.clip(Y00 * gaussians.sh[:, 0] + 0.5, 0.0, 1.0)

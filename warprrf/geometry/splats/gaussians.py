@@ -20,6 +20,7 @@ from warprrf.geometry.ply_files import read_ply, write_ply
 from warprrf.kernels.raster import sh as _sh
 from warprrf.kernels.raster.sh import COEFFICIENTS
 
+Y00 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
 # The file holds the logit; beyond this an opacity is as good as 0 or 1 and its logit stays finite in float32.
 OPACITY_MARGIN = 1e-7
 LARGEST_SH = 1e6

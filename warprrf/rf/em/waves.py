@@ -8,6 +8,8 @@ from numpy.typing import ArrayLike
 from warprrf.checks import check_alike, check_array, checked
 
 SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact
+NEPER = 10.0 / np.log(10.0)
+"""Decibels of a neper of power."""
 CARRIERS_HZ = (1e5, 1e16)
 """What a carrier may be: a smaller number is one in megahertz or gigahertz."""
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
 from functools import partial
 from importlib.metadata import version
-from typing import Any, ClassVar, Self, TypeAlias, Unpack, cast
+from typing import Any, ClassVar, Self, TypeAlias, TypeVar, Unpack, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -65,7 +65,7 @@ class RadioField(ABC):
         frequency_hz: carrier [Hz].
         shape: rows and columns of its spectra.
         floor, range_db, beam_sigma_rad: of the data set it was fitted to.
-        fitted_on: receivers that it was fitted to [m], shape ``(R, 3)``; None where an older file does not say.
+        fitted_on: receivers that it was fitted to [m], shape ``(R, 3)``.
         fitted_under: transmitter of each of those [m], shape ``(R, 3)``; None for its own.
         mesh: what blocks; None if the geometry has no mesh.
         air: absorption in its path gains, that of the data set it was fitted to; None for none.
@@ -80,7 +80,7 @@ class RadioField(ABC):
     floor: float
     range_db: tuple[float, float]
     beam_sigma_rad: float
-    fitted_on: np.ndarray | None
+    fitted_on: np.ndarray
     fitted_under: np.ndarray | None = None
     mesh: Mesh | None
     air: Air | None
@@ -139,7 +139,7 @@ class RadioField(ABC):
                 "shape": tuple(header["shape"]),
                 "range_db": tuple(header["range_db"]),
                 "transmitter": tensors["transmitter"],
-                "fitted_on": tensors.get("fitted_on"),
+                "fitted_on": tensors["fitted_on"],
                 "air": Air.from_attributes(header),
                 "report": header["report"],
                 "device": device,
@@ -153,10 +153,9 @@ class RadioField(ABC):
     def _whole(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Tensors and header of its file."""
         tensors, header = self._taken_apart()
-        tensors["transmitter"] = self.transmitter
-        for name in ("fitted_on", "fitted_under"):
-            if getattr(self, name) is not None:
-                tensors[name] = getattr(self, name)
+        tensors |= {"transmitter": self.transmitter, "fitted_on": self.fitted_on}
+        if self.fitted_under is not None:
+            tensors["fitted_under"] = self.fitted_under
         header |= {name: getattr(self, name) for name in _PLAIN} | {
             "model": self.model,
             "report": self.report,
@@ -517,8 +516,6 @@ class RadioField(ABC):
 
     def was_fitted_on(self, ds: SpectrumDataset) -> np.ndarray:
         """Which receivers of ``ds`` it was fitted on, under the same transmitter, shape ``(R,)`` bool."""
-        if self.fitted_on is None:
-            return np.zeros(len(ds.receivers), dtype=bool)
         under = self.transmitter if self.fitted_under is None else self.fitted_under
         return measured_at(ds, self.fitted_on, under)
 
@@ -535,14 +532,29 @@ class RadioField(ABC):
         if not low <= high:
             raise ValueError(f"range_db: got {self.range_db}, expected the lower end first")
         check_beam(self.beam_sigma_rad)
-        if self.fitted_on is not None:
-            known = check_array("fitted_on", self.fitted_on, (None, 3))
-            if self.fitted_under is not None:
-                check_array("fitted_under", self.fitted_under, known.shape)
+        known = check_array("fitted_on", self.fitted_on, (None, 3))
+        if self.fitted_under is not None:
+            check_array("fitted_under", self.fitted_under, known.shape)
         if np.abs(self.transmitter).max() > LARGEST_M:
             raise ValueError(f"transmitter: got {self.transmitter}, expected at most {LARGEST_M:g} m")
         if self.air is not None:
             self.air.loss_per_m(self.frequency_hz)
+
+
+Options = TypeVar("Options", bound=Any)
+
+
+def with_settings(options: Options, settings: Mapping[str, Any]) -> Options:
+    """``options`` of a fit, a dataclass, with ``settings`` in place of the attributes that they name.
+
+    Raises:
+        TypeError: for a name that is no option.
+        ValueError: for a value out of range.
+    """
+    names = [f.name for f in fields(options)]
+    if unknown := sorted(set(settings) - set(names)):
+        raise TypeError(f"fit: got unknown option {', '.join(unknown)}, expected among {', '.join(names)}")
+    return replace(options, **settings)
 
 
 class ResponseOptions(LinkEnds, total=False):

@@ -36,9 +36,9 @@ from warprrf.files import partial_path, read_json, write_json
 from warprrf.geometry.mesh_files import write_mesh
 from warprrf.rf.em.fresnel import COSINES, LAMBERTIAN, fresnel_curves, lobe, slab_reflection
 from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, Band, Material, table_entry
+from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.observations import NEPER
 
 ABOUT = "Digital twin written by warprrf."
 """First line of a twin's ``materials.json``: a folder that says so may be replaced."""

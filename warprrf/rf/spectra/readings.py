@@ -33,12 +33,11 @@ from warprrf.checks import (
     users_level,
 )
 from warprrf.rf.em.absorption import Air
-from warprrf.rf.em.waves import check_frequency
+from warprrf.rf.em.waves import NEPER, check_frequency
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
 from warprrf.rf.spectra.levels import FADING_DB, MARGIN_DB, free_space_gain, question_levels
 from warprrf.rf.spectra.spectrum import directions_from_angles
 
-NEPER = 10.0 / np.log(10.0)
 COLUMNS = {
     "transmitter": ("tx_x", "tx_y", "tx_z"),
     "receiver": ("rx_x", "rx_y", "rx_z"),

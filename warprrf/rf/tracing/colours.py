@@ -10,9 +10,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from warprrf.geometry.mesh import Mesh, connected_pieces
-from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.gaussians import Y00, Gaussians
 
-Y00 = 0.28209479177387814  # harmonic of degree 0
 TOLD_APART = 0.02  # faces whose colours differ by less are of one colour: what exporters write by default
 
 # Colours are compared in steps: log chromaticity over CHROMA, log luminance, which is also shade, over LUMINANCE.

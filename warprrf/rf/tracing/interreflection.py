@@ -44,7 +44,6 @@ class Interreflection:
             known = np.union1d(known, surface.side_met(face[ray], grid.directions[ray]))
         shift = np.random.default_rng(0).random((2, len(surface.element_area)))
         scale = np.float32(np.pi / RAYS * (4.0 * np.pi / tracer.wavelength_m) ** 2)
-        self.surface, self._device = surface, grid.device
         self.lit: list[Records] = []
         rows, columns, values, new = [], [], [], known
         while len(new):
@@ -62,34 +61,23 @@ class Interreflection:
         pairs = tuple(map(np.concatenate, (rows, columns)))
         self.between = csr_matrix((np.concatenate(values), pairs), shape=(surface.element_sides,) * 2)
 
-    @classmethod
-    def of(cls, tracer: Tracer) -> Interreflection:
-        """That under the transmitter of ``tracer``, which keeps it."""
-        return tracer.kept.get("interreflection", lambda: cls(tracer.of_transmitter))
-
-    def irradiance(self, p: Parameters, effects: Effects, onto: Records | None) -> np.ndarray:
-        """What sides get of surfaces that scattered before, in units in which the transmitter gives an irradiance of
-        cos(theta_i) / d1^2 [1/m^2], shape ``(E,)``; ``onto`` is light that mirrors throw on sides."""
-        materials, sides = Evaluation(p, device=self._device), self.surface.element_sides
-        share = p.scattered_share[self.surface.side_group] / np.pi
-        got = sum(np.bincount(r.ray, r.powers(materials), minlength=sides) for r in self.lit)
-        if onto is not None:
-            got = got + self.between @ (
-                share * np.bincount(onto.ray, onto.powers(materials), minlength=sides)
-            )
-        first = got
-        for _ in range(2, effects.scatterings):
-            got = first + self.between @ (share * got)
-        return np.asarray(got)
-
 
 def irradiance(tracer: Tracer, p: Parameters, effects: Effects) -> np.ndarray | None:
-    """Irradiance of elements' sides by other surfaces under parameters of groups, shape ``(E,)``; None where ``effects``
-    hold no second scattering."""
+    """Irradiance of elements' sides by surfaces that scattered before, under parameters of groups, in units in which the
+    transmitter gives cos(theta_i) / d1^2 [1/m^2], shape ``(E,)``; None where ``effects`` hold no second scattering."""
     if effects.scatterings < 2:
         return None
-    onto = tracer.mirrored.onto if effects.mirror_scatter else None
-    return Interreflection.of(tracer).irradiance(p, effects, onto)
+    light = tracer.kept.get("interreflection", lambda: Interreflection(tracer.of_transmitter))
+    materials, sides = Evaluation(p, device=tracer.grid.device), tracer.surface.element_sides
+    share = p.scattered_share[tracer.surface.side_group] / np.pi
+    got = sum(np.bincount(r.ray, r.powers(materials), minlength=sides) for r in light.lit)
+    if effects.mirror_scatter:
+        onto = tracer.mirrored.onto
+        got = got + light.between @ (share * np.bincount(onto.ray, onto.powers(materials), minlength=sides))
+    first = got
+    for _ in range(2, effects.scatterings):
+        got = first + light.between @ (share * got)
+    return np.asarray(got)
 
 
 def _sample_points(surface: Surface) -> tuple[np.ndarray, np.ndarray]:

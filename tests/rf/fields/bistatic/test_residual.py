@@ -10,10 +10,10 @@ from scipy import sparse
 from trimesh.remesh import subdivide_to_size
 
 from warprrf.geometry.mesh import Mesh
+from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.links import LinkTracer
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
-from warprrf.rf.fields.bistatic.observations import NEPER
 from warprrf.rf.fields.bistatic.residual import Shares, fit_residual, shares_of
 from warprrf.rf.maps.links import LinkOptions
 from warprrf.rf.spectra.beam import BeamOperator

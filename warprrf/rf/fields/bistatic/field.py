@@ -40,14 +40,13 @@ from warprrf.rf.channel.array_spectra import check_steering
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.materials import assumed_permittivity
-from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
-from warprrf.rf.fields.base import Data, Measured, RadioField
+from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT, check_frequency
+from warprrf.rf.fields.base import Data, Measured, RadioField, with_settings
 from warprrf.rf.fields.bistatic import files
 from warprrf.rf.fields.bistatic.fit import SUB_PIXELS, FitOptions, TrainingViews, fit
 from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, read
 from warprrf.rf.fields.bistatic.observations import (
-    NEPER,
     Frame,
     Observation,
     Place,
@@ -95,7 +94,7 @@ class BistaticField(RadioField):
         errors: how wrong it is; None if it was fitted to fewer receivers than that takes.
         sub_pixels: square root of the rays per pixel.
         air: absorption of every path: that of the data set it was fitted to; None for none.
-        fitted_on: receivers that it was fitted to [m], shape ``(R, 3)``; None where it is not known.
+        fitted_on: receivers that it was fitted to [m], shape ``(R, 3)``.
         fitted_under: transmitter of each of those [m], shape ``(R, 3)``; None for its own.
         report: how the fit went.
         device: where it computes.
@@ -117,7 +116,7 @@ class BistaticField(RadioField):
     errors: ErrorModel | None = field(default=None, repr=False)
     sub_pixels: int = SUB_PIXELS
     air: Air | None = None
-    fitted_on: np.ndarray | None = field(default=None, repr=False)
+    fitted_on: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
     fitted_under: np.ndarray | None = field(default=None, repr=False)
     report: dict[str, Any] = field(default_factory=dict, repr=False)
     device: DeviceLike = field(default=None, repr=False)
@@ -195,7 +194,7 @@ class BistaticField(RadioField):
                 empty, or ``views`` of others.
             TypeError: for a geometry without a mesh, or an unknown option.
         """
-        chosen, data = FitOptions.of(options, settings), as_list(ds)
+        chosen, data = with_settings(options or FitOptions(), settings), as_list(ds)
         if model != "bistatic":
             raise ValueError(f"model: got {model!r}, expected 'bistatic'")
         if not any(map(len, data)):
@@ -288,7 +287,6 @@ class BistaticField(RadioField):
             residual=np.zeros((2, surface.cells)),
             sub_pixels=sub_pixels,
             air=getattr(ds, "air", None),
-            fitted_on=np.zeros((0, 3)),
             device=device,
         )
 
@@ -500,17 +498,15 @@ class BistaticField(RadioField):
             angles = check_turned("arrival", arrival, len(places))
             pointings = Pointings(directions_from_angles(*angles.T), receive_pattern)
         sensitivity, unknowns = self._sensitivity(self.transmitter)
-        measured = np.zeros((0, 3)) if self.fitted_on is None else self.fitted_on
         return suggest(
-            sensitivity, unknowns, places, n, measured=measured, pointings=pointings, progress=progress
+            sensitivity, unknowns, places, n, measured=self.fitted_on, pointings=pointings, progress=progress
         )
 
     def gain_std_db(self, progress: Progress | None = None) -> np.ndarray:
         """How far the gain of what each element of the surface scatters is known after spectra at ``fitted_on``: standard
         deviation [dB], shape ``(E,)``; see :mod:`warprrf.rf.fields.bistatic.suggest`."""
         sensitivity, unknowns = self._sensitivity(self.transmitter)
-        places = np.zeros((0, 3)) if self.fitted_on is None else self.fitted_on
-        variance = unknowns.variance(sensitivity.precision(places, progress=progress))
+        variance = unknowns.variance(sensitivity.precision(self.fitted_on, progress=progress))
         return NEPER * np.sqrt(variance[: len(self.surface.element_area)])
 
     def _sensitivity(self, transmitter: np.ndarray) -> tuple[Sensitivity, Unknowns]:

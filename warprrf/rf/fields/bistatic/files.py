@@ -9,17 +9,14 @@ import numpy as np
 
 from warprrf.checks import check_type
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.fields.bistatic.uncertainty import ARRAYS as ERROR_ARRAYS
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
 from warprrf.rf.tracing.model import Effects, Parameters
 from warprrf.rf.tracing.surface import Surface
 
-_SURFACE = {
-    name: name
-    for name in ("normal", "patch", "plane_normal", "plane_offset", "group", "material", "patch_group", "element",
-                 "element_centre", "element_area", "element_group", "appearance", "thickness_m")
-} | {"cell": "texel", "cell_element": "texel_element"}  # fmt: skip
-"""Arrays of a surface, and what files call them."""
+_SURFACE = (
+    "normal", "patch", "plane_normal", "plane_offset", "group", "material", "patch_group", "element", "element_centre",
+    "element_area", "element_group", "appearance", "thickness_m", "cell", "cell_element",
+)  # fmt: skip
 _PARAMETERS = ("log_weight", "log_excess", "log_mirror")
 _SINGLE = ("lobes", "reciprocal", "log_gain", "roughness")
 
@@ -27,7 +24,7 @@ _SINGLE = ("lobes", "reciprocal", "log_gain", "roughness")
 def taken_apart(parts: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Tensors and header of the ``parts`` of a field, by the names of its attributes, but for what every model has."""
     s, p = parts["surface"], parts["parameters"]
-    tensors = {f"surface/{filed}": np.asarray(getattr(s, name)) for name, filed in _SURFACE.items()}
+    tensors = {f"surface/{name}": np.asarray(getattr(s, name)) for name in _SURFACE}
     tensors |= {"mesh/vertices": s.mesh.vertices, "mesh/faces": s.mesh.faces}
     tensors |= {f"parameters/{name}": getattr(p, name) for name in _PARAMETERS}
     tensors |= {name: parts[name] for name in ("residual", "material")}
@@ -50,18 +47,12 @@ def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict
     Raises:
         KeyError, TypeError, ValueError: for what is missing or does not fit.
     """
-    tensors.setdefault(
-        "surface/thickness_m", np.full(len(header["group_names"]), np.nan)
-    )  # older files have none
-    names, two_sided = header["group_names"], header.get("two_sided", False)
+    names, two_sided = header["group_names"], header["two_sided"]
     check_type("group_names", names, list)
     check_type("two_sided", two_sided, bool)
     for name in names:
         check_type("group_names", name, str)
     errors = {n.removeprefix("errors/"): t for n, t in tensors.items() if n.startswith("errors/")}
-    errors = {
-        n: t if ERROR_ARRAYS[n].shape else t.squeeze() for n, t in errors.items()
-    }  # older: single values as (1,)
     parameters: dict[str, Any] = {name: tensors[f"parameters/{name}"] for name in _PARAMETERS}
     parameters |= {name: header[name] for name in _SINGLE}
     return {
@@ -70,7 +61,7 @@ def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict
             group_names=tuple(names),
             position_error_m=header["position_error_m"],
             two_sided=two_sided,
-            **{name: tensors[f"surface/{filed}"] for name, filed in _SURFACE.items()},
+            **{name: tensors[f"surface/{name}"] for name in _SURFACE},
         ),
         "effects": Effects(**header["effects"]),
         "sub_pixels": header["sub_pixels"],

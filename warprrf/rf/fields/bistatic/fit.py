@@ -21,12 +21,12 @@ from warprrf.cluster import each
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
+from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import Data, Measured
 from warprrf.rf.fields.bistatic.gauss_newton import Fitted, Problem, gauss_newton, layout_of
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, WeighedPaths, read
 from warprrf.rf.fields.bistatic.merging import BY_SHAPE, Merging, merge
 from warprrf.rf.fields.bistatic.observations import (
-    NEPER,
     NOISE_DB,
     Observation,
     Place,
@@ -137,22 +137,6 @@ class FitOptions:
         if self.sub_pixels is not None:
             check_count("sub_pixels", self.sub_pixels, 1, 16)
         Parameters.prior(1, LOBES if self.lobes is None else self.lobes)
-
-    @classmethod
-    def of(cls, options: FitOptions | None, settings: dict[str, Any]) -> FitOptions:
-        """``options`` with ``settings`` by name.
-
-        Raises:
-            TypeError: for a name that is no option.
-            ValueError: for a value out of range.
-        """
-        names = [f.name for f in fields(cls)]
-        unknown = sorted(set(settings) - set(names))
-        if unknown:
-            raise TypeError(
-                f"fit: got unknown option {', '.join(unknown)}, expected among {', '.join(names)}"
-            )
-        return replace(options or cls(), **settings)
 
     def candidates(self, frequency_hz: float) -> list[Effects]:
         """Effects to choose from, the fewest first; one where they are given. What ``relevance`` rules out is off."""

@@ -17,8 +17,8 @@ from scipy.linalg import solve
 from scipy.linalg.blas import ssyrk
 
 from warprrf.cache import cached_property
+from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.bistatic.observations import (
-    NEPER,
     NOISE_DB,
     OWN_GAIN,
     Columns,

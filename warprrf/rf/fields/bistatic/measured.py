@@ -71,8 +71,17 @@ def read(gains: PathGains, measurement: Measurement) -> np.ndarray:
     return np.asarray(measurement.of_bins(table)[:, 0] + direct)
 
 
+class ByPixels:
+    """What does not tell the rays of a pixel of their grid apart."""
+
+    def bins(self, view: View) -> tuple[np.ndarray, int]:
+        """A bin for each pixel."""
+        grid = view.tracer.grid
+        return np.arange(len(view.hits.face)) // grid.sub_pixels**2, grid.shape[0] * grid.shape[1]
+
+
 @dataclass(frozen=True, eq=False)
-class SpectrumPixels:
+class SpectrumPixels(ByPixels):
     """Pixels of a receiver's spectrum.
 
     Attributes:
@@ -93,11 +102,6 @@ class SpectrumPixels:
     def alike(self) -> object:
         """Itself: receivers of one data set have one."""
         return id(self)
-
-    def bins(self, view: View) -> tuple[np.ndarray, int]:
-        """A bin for each pixel."""
-        grid = view.tracer.grid
-        return np.arange(len(view.hits.face)) // grid.sub_pixels**2, grid.shape[0] * grid.shape[1]
 
     def of_bins(self, power: np.ndarray, *, quick: bool = False) -> np.ndarray:
         """Seen through the beam."""
@@ -306,7 +310,7 @@ class Superposition:
 
 
 @dataclass(frozen=True, eq=False)
-class ArrayImage:
+class ArrayImage(ByPixels):
     """Angular spectrum |a^H h|^2 / M^2 of an array, in expectation over the phases of what is scattered.
 
     Scattered light adds a^H R a, R its covariance between elements: sums over the lags between them.
@@ -351,11 +355,6 @@ class ArrayImage:
             _vertical(view),
         )
         return cls(steered.astype(np.float32), np.ascontiguousarray(arriving.T, np.float32), together)
-
-    def bins(self, view: View) -> tuple[np.ndarray, int]:
-        """A bin for each pixel of the rays' grid."""
-        grid = view.tracer.grid
-        return np.arange(len(view.hits.face)) // grid.sub_pixels**2, grid.shape[0] * grid.shape[1]
 
     def of_bins(self, power: np.ndarray, *, quick: bool = False) -> np.ndarray:
         """By their lags."""

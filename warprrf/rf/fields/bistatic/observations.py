@@ -7,10 +7,11 @@ come from paths (:mod:`warprrf.rf.fields.bistatic.measured`).
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.fresnel import fresnel_curves
-from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT
 from warprrf.rf.fields.base import Data, Measured
 from warprrf.rf.fields.bistatic.measured import (
     ArrayImage,
@@ -40,8 +41,6 @@ from warprrf.rf.tracing.records import Bins, Evaluation, Records
 from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.tracer import SPECULAR, View
 
-NEPER = 10.0 / np.log(10.0)
-"""Decibels of a neper of power."""
 OWN_GAIN = -2
 """In place of a measuring chain's index: readings of one place whose common gain is not known. Their sum tells it."""
 NOISE_DB = 3.0
@@ -415,27 +414,44 @@ def _summed(owner: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndar
     return found, out
 
 
-class Kind(Protocol):
-    """How one kind of data set is taken apart; made with its number among the data sets, and the set."""
+@dataclass(eq=False)
+class Kind(ABC):
+    """How one kind of data set is taken apart.
 
-    def ends(self) -> tuple[np.ndarray, np.ndarray]:
-        """Transmitter of each receiver and the receivers [m], shape ``(R, 3)`` each."""
+    Attributes:
+        number: index among the data sets.
+        one: the data set.
+    """
 
+    number: int
+    one: Any
+
+    @abstractmethod
     def places(self, mesh: Mesh | None, device: DeviceLike) -> list[Place]:
         """Where it was taken, checked."""
 
+    @abstractmethod
     def observe(self, place: Place, view: View) -> Observation:
         """What was read at ``place``, where ``view`` is seen."""
 
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """Transmitter of each receiver and the receivers [m], shape ``(R, 3)`` each."""
+        return self.one.transmitters, self.one.receivers
+
     def frame(self) -> Frame:
-        """What a field's spectra are made with, if it is the first."""
+        """What a field's spectra are made with, if it is the first: floor and range are those of the powers."""
+        one = self.one
+        floor = float(np.min(one.floor))
+        levels = 10.0 * float(np.log10(floor)), 10.0 * float(np.log10(np.nanmax(one.power)))
+        return Frame(
+            one.transmitters[0], one.frequency_hz, READINGS_SHAPE, floor, levels, BEAM_SIGMA_RAD, one.air
+        )
 
 
 @dataclass(eq=False)
-class _Spectra:
+class _Spectra(Kind):
     """Whole spectra: pixels through a beam."""
 
-    number: int
     one: SpectrumDataset
     _whole: dict[Any, Any] = field(default_factory=dict)
 
@@ -468,15 +484,11 @@ class _Spectra:
 
 
 @dataclass(eq=False)
-class _Tables:
+class _Tables(Kind):
     """Tables of readings: horns, power alone, taps of delay."""
 
-    number: int
     one: Readings
     _pointings: list[tuple[np.ndarray, np.ndarray] | None] = field(default_factory=list)
-
-    def ends(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.one.transmitters, self.one.receivers
 
     def places(self, mesh: Mesh | None, device: DeviceLike) -> list[Place]:
         one = self.one
@@ -522,19 +534,12 @@ class _Tables:
         huber_db = HUBER_DB if one.samples is None and not one.total else WIDE_HUBER_DB
         return replace(bare, target=target, sight=None if one.total else sight, huber_db=huber_db)
 
-    def frame(self) -> Frame:
-        return _frame_of_powers(self.one)
-
 
 @dataclass(eq=False)
-class _Arrays:
+class _Arrays(Kind):
     """Spectra of coherent arrays."""
 
-    number: int
     one: ArraySpectra
-
-    def ends(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.one.transmitters, self.one.receivers
 
     def places(self, mesh: Mesh | None, device: DeviceLike) -> list[Place]:
         one = self.one
@@ -573,11 +578,8 @@ class _Arrays:
         )
         return replace(bare, target=target.trusted(NOISE_DB / np.hypot(NOISE_DB, std_db)), robust=True)
 
-    def frame(self) -> Frame:
-        return _frame_of_powers(self.one)
 
-
-KINDS: dict[type, Any] = {SpectrumDataset: _Spectra, Readings: _Tables, ArraySpectra: _Arrays}
+KINDS: dict[type, type[Kind]] = {SpectrumDataset: _Spectra, Readings: _Tables, ArraySpectra: _Arrays}
 """How each kind of data set is taken apart."""
 
 
@@ -661,15 +663,6 @@ class Frame:
     range_db: tuple[float, float]
     beam_sigma_rad: float
     air: Air | None
-
-
-def _frame_of_powers(one: Readings | ArraySpectra) -> Frame:
-    """Floor and range are those of the powers."""
-    floor = float(np.min(one.floor))
-    levels = 10.0 * float(np.log10(floor)), 10.0 * float(np.log10(np.nanmax(one.power)))
-    return Frame(
-        one.transmitters[0], one.frequency_hz, READINGS_SHAPE, floor, levels, BEAM_SIGMA_RAD, one.air
-    )
 
 
 def frame_of(data: Sequence[Measured]) -> Frame:

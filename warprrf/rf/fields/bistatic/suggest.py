@@ -15,7 +15,8 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from warprrf.device import Progress
-from warprrf.rf.fields.bistatic.observations import NEPER, NOISE_DB, READING_ERROR_DB
+from warprrf.rf.em.waves import NEPER
+from warprrf.rf.fields.bistatic.observations import NOISE_DB, READING_ERROR_DB
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_of
 from warprrf.rf.tracing.model import Model

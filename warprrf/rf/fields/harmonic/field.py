@@ -42,7 +42,7 @@ from warprrf.geometry.splats.gaussians import Gaussians, discs_on_mesh, gaussian
 from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.fields.base import RadioField
+from warprrf.rf.fields.base import RadioField, with_settings
 from warprrf.rf.fields.harmonic.fitting import KINDS, SAVED_EVERY, Checkpoint, State, fit_layer, targets
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining, list_responses
 from warprrf.rf.fields.harmonic.options import FieldOptions, Rates, SingleBounce
@@ -81,7 +81,7 @@ class HarmonicField(RadioField):
         delay_unit: seconds per unit of the delay layer.
         air: absorption over every path's length, that of the data set it was fitted to; None for none. ``rf3dgs`` has
             lengths for an explicit line of sight alone and learns it with the gain.
-        fitted_on: receivers whose spectra it was fitted to [m], shape ``(R, 3)``; None where it is not known.
+        fitted_on: receivers whose spectra it was fitted to [m], shape ``(R, 3)``.
         report: how the fit went: seconds, pairs, losses, Gaussians seen.
     """
 
@@ -100,7 +100,7 @@ class HarmonicField(RadioField):
     gain_unit: float
     delay_unit: float
     air: Air | None = None
-    fitted_on: np.ndarray | None = field(default=None, repr=False)
+    fitted_on: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
     report: dict[str, Any] = field(default_factory=dict, repr=False)
     device: DeviceLike = field(default=None, repr=False)
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(8))
@@ -164,7 +164,7 @@ class HarmonicField(RadioField):
                 f"ds: got {type(ds).__name__}, expected a SpectrumDataset: model {model!r} is fitted to whole spectra; "
                 'a model="bistatic" takes readings and arrays too'
             )
-        chosen = FieldOptions.of(options, {**settings, "model": model})
+        chosen = with_settings(options or FieldOptions(), {**settings, "model": model})
         started = time.perf_counter()
         gaussians, mesh = _geometry(geometry)
         receivers, transmitter = check_dataset(mesh, ds, device=device)

@@ -19,6 +19,7 @@ import numpy as np
 import warp as wp
 
 from warprrf import tensor_files
+from warprrf.geometry.splats.gaussians import Y00
 from warprrf.geometry.splats.photo_loss import WRAPPED, PhotoLoss
 from warprrf.kernels.adam import build_adam, corrections
 from warprrf.kernels.radio import harmonics as _kernels
@@ -306,7 +307,6 @@ def _numbers(vectors: wp.array) -> wp.array:
     )
 
 
-Y00 = 0.28209479177387814  # harmonic of degree 0
 DARK = 0.1  # a pixel below the floor counts as this share of it where logarithms are averaged
 
 

@@ -8,8 +8,7 @@ the path's length; ``rf3dgs``, which has none, learns it with the gain.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -112,19 +111,6 @@ class FieldOptions:
         check_seed(self.seed)
         if self.train_opacity and self.transmittance != "product":
             raise ValueError(f"train_opacity: got transmittance {self.transmittance!r}, expected 'product'")
-
-    @classmethod
-    def of(cls, options: FieldOptions | None, settings: dict[str, Any]) -> FieldOptions:
-        """``options``, with ``settings`` in place of the attributes that they name.
-
-        Raises:
-            TypeError: for a setting that is no attribute.
-        """
-        known = [field.name for field in fields(cls)]
-        unknown = sorted(set(settings) - set(known))
-        if unknown:
-            raise TypeError(f"fit: got {', '.join(unknown)}, expected some of {', '.join(known)}")
-        return replace(options or cls(), **settings)
 
 
 @dataclass(frozen=True, eq=False)
