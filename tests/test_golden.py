@@ -1,4 +1,4 @@
-"""What public verbs gave on small inputs when the goldens were written (:mod:`golden.make`), it gives today."""
+"""What every public verb gave on small inputs when the goldens were written (:mod:`golden.make`), it gives today."""
 
 import numpy as np
 import pytest
@@ -21,6 +21,8 @@ def test_a_check_sees_what_it_is_there_to_see():
     assert make.BITS.failure(image, image) is None
     assert make.BITS.failure(image * (1 + 1e-15), image)
     assert make.FLOAT64.failure(image * (1 + 1e-8), image)
-    assert make.FITTED_DB.failure(image * 1.1, image)
+    assert make.EXACT.failure(image * 1.01, image)
     assert make.FITTED.failure(image * 1.1, image)
     assert make.FITTED.failure(image * 1.02, image) is None
+    assert make.PIXELS.failure(np.where(np.arange(400) < 2, 2.0, image), image) is None
+    assert make.PIXELS.failure(np.where(np.arange(400) < 3, 2.0, image), image)

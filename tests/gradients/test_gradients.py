@@ -1,5 +1,6 @@
-"""Gradients of the rasteriser's whole path (parameters, image, loss) and of rays through Gaussians, in float64: Warp's tape
-against finite differences on many random scenes, with the cutoffs of photos; what lies at a cutoff; second backward calls."""
+"""Gradients of the rasteriser's whole path (parameters, image, loss), of rays through Gaussians and of path records by
+their materials, in float64: Warp's tape against finite differences on many random scenes, with the cutoffs of photos; what
+lies at a cutoff; second backward calls."""
 
 from __future__ import annotations
 
@@ -13,6 +14,9 @@ from warprrf import device
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussian_rays import GaussianRays
 from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
+from warprrf.kernels.radio import records
+from warprrf.rf.tracing.model import Parameters
+from warprrf.rf.tracing.records import Evaluation, Records
 
 CHANNELS = 5  # take two launches
 RAYS, PLACES = 40, 3
@@ -60,6 +64,15 @@ def loss_of_rays(
         if index[i, k] >= 0:
             share = of_ray[i] / wp.float64(1 + k)
             wp.atomic_add(loss, 0, share * (weight[i, k] * t[i, k] + wp.sin(alpha[i, k]) + t[i, k] * t[i, k]))
+
+
+@wp.kernel
+def loss_of_powers(
+    power: wp.array(dtype=wp.float64), weight: wp.array(dtype=wp.float64), loss: wp.array(dtype=wp.float64)
+):
+    """Smooth and different in every power, as decibels above a floor are."""
+    i = wp.tid()
+    wp.atomic_add(loss, 0, weight[i] * wp.log(power[i] + wp.float64(0.1)))
 
 
 class WholePath:
@@ -202,6 +215,43 @@ class Rays(WholePath):
         wp.launch(loss_of_rays, dim=RAYS, inputs=inputs)
 
 
+class PathRecords(WholePath):
+    """Records of every sequence by chance: powers by the materials' lobe weights, permittivities and mirrored shares."""
+
+    SEQUENCES = ("M", "S", "MS", "SM", "MSM", "E", "EM")
+    share = 1.0
+
+    def draw(self, seed, rng):
+        kernel, self.launches = records.build(wp.float64).record_power, []
+        lobes = tuple(rng.choice(40, 3, replace=False).tolist())
+        weight, excess, mirror = (
+            rng.uniform(0.1, 1.0, (3, 3)),
+            rng.uniform(0.3, 20.0, 3),
+            rng.uniform(0.1, 1.0, 3),
+        )
+        self.values = {"weight": weight, "excess": excess, "mirror": mirror}
+        p = Parameters(np.log(weight), np.log(excess), np.log(mirror), lobes, reciprocal=seed % 2 == 1)
+        group = rng.integers(0, 3, 4)  # the material of each
+        materials = Evaluation(p, group, rng.integers(0, 4, 6), rng.uniform(0.1, 3.0, 6))
+        for name in self.SEQUENCES:
+            columns = 3 if name == "M" else len(name)
+            rough = columns if name == "M" else max(name.find("S"), name.find("E"))
+            kind = records.SCATTER if "S" in name else records.SOURCE if "E" in name else 0
+            index = rng.integers(0, 4, (9, columns)).astype(np.int32)
+            index[:, 1:][rng.random((9, columns - 1)) < 0.3] = -1 if name == "M" else 0
+            angle = rng.uniform(0.05, 1.0, (9, columns, 3))
+            one = Records(rng.uniform(0.5, 2.0, 9), np.arange(9), index, angle, rough, kind, half_width=0.01)
+            self.launches.append(
+                (kernel, *one._table(materials)[:2], wp.array(rng.normal(size=9), dtype=wp.float64))
+            )
+
+    def add_loss(self, a, loss):
+        for kernel, table, materials, weight in self.launches:
+            power = wp.empty(9, dtype=wp.float64, requires_grad=True)
+            wp.launch(kernel, dim=9, inputs=[0, table, materials, *a.values(), power])
+            wp.launch(loss_of_powers, dim=9, inputs=[power, weight, loss])
+
+
 def random_camera(rng: np.random.Generator, means: np.ndarray, *, spherical: bool) -> Camera:
     """A panorama amid the Gaussians, or a photo that shows two of their means at least."""
     if spherical:
@@ -216,12 +266,14 @@ def random_camera(rng: np.random.Generator, means: np.ndarray, *, spherical: boo
             return camera
 
 
-EVERY = pytest.mark.parametrize("kind", [Pictures, Rays])
+SCENES = {Pictures: 32, Rays: 32, PathRecords: 60}
+EVERY = pytest.mark.parametrize("kind", SCENES)
 
 
 @pytest.mark.usefixtures("device")
-@pytest.mark.parametrize("seed", range(32))
-@EVERY
+@pytest.mark.parametrize(
+    ("kind", "seed"), [(kind, k) for kind, count in SCENES.items() for k in range(count)]
+)
 def test_gradients_match_finite_differences_to_1e_6(kind, seed):
     path = kind(seed)
     assert path.share > 0.4  # most pixels or rays are away from decisions

@@ -47,16 +47,46 @@ class Link:
         return (SPEED_OF_LIGHT / self.frequency_hz / (4.0 * np.pi)) ** 2
 
 
-def mitsuba_sequences(link: Link, samples: int, runs: int = 8) -> dict[str, np.ndarray]:
-    """S, SM, MS, SS and SSS of each of ``runs`` independent runs of ``samples`` paths per pixel, shape ``(runs,)``."""
+@dataclass(frozen=True)
+class Estimate:
+    """Path gain from independent runs: before any beam, shape ``(N, H, W)``."""
+
+    runs: np.ndarray
+
+    def __sub__(self, other: "Estimate") -> "Estimate":
+        return Estimate(self.runs - other.runs)
+
+    @property
+    def image(self) -> np.ndarray:
+        return self.runs.mean(axis=0)
+
+    @property
+    def total(self) -> float:
+        return float(self.image.sum())
+
+    @property
+    def error(self) -> float:
+        """Standard error of the total."""
+        return float(self.runs.sum(axis=(1, 2)).std(ddof=1) / np.sqrt(len(self.runs)))
+
+
+def mitsuba_sequences(link: Link, samples: int, runs: int = 8) -> dict[str, Estimate]:
+    """S, SM, MS, SS and SSS, from ``runs`` times ``samples`` paths per pixel."""
     dark = replace(link, does=np.where(link.does == MIRROR, BLACK, link.does))
     with mitsuba("llvm_ad_mono") as mi:
         _register(mi)
-        one, two, three = (_traced(mi, dark, n, samples, runs) for n in (1, 2, 3))
-        seen = [_traced(mi, room, 2, 4 * samples, runs) for room in (link, dark)]
-        to_mirrors = {"integrator": "ptracer", "light": _toward_mirrors(mi, link)}
-        lit = [_traced(mi, room, 2, samples, runs, **to_mirrors) for room in (link, dark)]
-        return {"S": one, "SM": seen[0] - seen[1], "MS": lit[0] - lit[1], "SS": two - one, "SSS": three - two}
+
+        def traced(link: Link, bounces: int, times: int = 1, **how: Any) -> Estimate:
+            return _traced(mi, link, bounces, times * samples, runs, **how)
+
+        def second(times: int, **how: Any) -> Estimate:
+            """What a second bounce adds where there is one scattering."""
+            both, one = (traced(link, n, times, once=True, **how) for n in (2, 1))
+            return both - one
+
+        one, two, three = (traced(dark, n) for n in (1, 2, 3))
+        lit = second(1, integrator="ptracer", light=_toward_mirrors(mi, link))
+        return {"S": one, "SM": second(4), "MS": lit, "SS": two - one, "SSS": three - two}
 
 
 def _toward_mirrors(mi, link: Link) -> dict[str, Any]:
@@ -89,6 +119,10 @@ def _register(mi):
             ray = mi.Ray3f(self.place, mi.Vector3f(s * cos, s * sin, c), time, mi.Color0f())
             return ray, mi.Spectrum(2.0 * np.pi**2 * s)
 
+        def sample_ray_differential(self, *args):
+            ray, weight = self.sample_ray(*args)
+            return mi.RayDifferential3f(ray), weight
+
         def sample_direction(self, it, sample, active=True):
             way = self.place - it.p
             ds = dr.zeros(mi.DirectionSample3f)
@@ -103,11 +137,11 @@ def _register(mi):
             return mi.BoundingBox3f(self.place, self.place)
 
     class Lambertian(mi.BSDF):
-        """Both sides alike."""
+        """Both sides alike; ``once``: what it scatters is seen, and lights nothing else."""
 
         def __init__(self, props):
             super().__init__(props)
-            self.index = props["index"]
+            self.index, self.goes_on = props["index"], 0.0 if props["once"] else 1.0
             flag = mi.BSDFFlags
             self.m_flags = flag.DiffuseReflection | flag.FrontSide | flag.BackSide
             self.m_components = [self.m_flags]
@@ -122,13 +156,22 @@ def _register(mi):
             bs.pdf = mi.warp.square_to_cosine_hemisphere_pdf(wo)
             wo.z = dr.mulsign(wo.z, si.wi.z)
             bs.wo, bs.eta, bs.sampled_type = wo, 1.0, +self.m_flags
-            return bs, self.reflected(ctx, si, wo) & (active & (si.wi.z != 0.0))
+            return bs, self.goes_on * self.reflected(ctx, si, wo) & (active & (si.wi.z != 0.0))
 
         def pdf(self, ctx, si, wo, active=True):
             return dr.select(active & (si.wi.z * wo.z > 0.0), dr.abs(wo.z) / np.pi, 0.0)
 
         def eval(self, ctx, si, wo, active=True):
             return self.reflected(ctx, si, wo) * self.pdf(ctx, si, wo, active)
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
+
+        def traverse(self, callback):
+            pass
+
+        def to_string(self):
+            return "Lambertian[]"
 
     mi.register_sensor("panorama", Panorama)
     mi.register_bsdf("lambertian", Lambertian)
@@ -142,13 +185,14 @@ def _traced(
     runs: int,
     *,
     integrator: str = "path",
+    once: bool = False,
     light: dict[str, Any] | None = None,
-) -> np.ndarray:
-    """Paths with 1 to ``bounces`` interactions that ``integrator`` finds."""
+) -> Estimate:
+    """Paths with 1 to ``bounces`` interactions that ``integrator`` finds; ``once``: with one scattering at most."""
     point = {"type": "point", "position": link.transmitter.tolist(), "intensity": 1.0}
     index = float(np.sqrt(link.permittivity))
     bsdf = {
-        SCATTER: {"type": "lambertian", "index": index},
+        SCATTER: {"type": "lambertian", "index": index, "once": once},
         MIRROR: {"type": "twosided", "bsdf": {"type": "conductor", "eta": index, "k": 0.0}},
         BLACK: {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.0}},
     }  # fmt: skip
@@ -175,8 +219,8 @@ def _traced(
         values.update()
         scene[f"part_{kind}"] = part
     loaded = mi.load_dict(scene)
-    found = [np.array(mi.render(loaded, spp=samples, seed=seed), float).mean() for seed in range(runs)]
-    return link.friis * np.array(found)
+    found = [np.array(mi.render(loaded, spp=samples, seed=seed), float)[..., 0] for seed in range(runs)]
+    return Estimate(link.friis * np.stack(found) / found[0].size)
 
 
 def floor_and_mirror(permittivity: float = 201.0) -> Link:
