@@ -215,7 +215,7 @@ def test_light_that_mirrors_throw_has_its_images_length(dry: SpectrumDataset) ->
 
 def test_two_and_three_bounces_in_a_sphere_have_the_chords_lengths() -> None:
     """Chords of a sphere of radius R that a Lambertian surface sees are distributed as c / (2 R^2), and of them
-    exp(-a c) has the mean (1 - exp(-2 a R) (1 + 2 a R)) / (2 a^2 R^2)."""
+    exp(-a c) has the mean (1 - exp(-2 a R) (1 + 2 a R)) / (2 a^2 R^2); without air the sphere integrates."""
     radius = 2.0
     ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)
     surface = Surface.of(Mesh(ball.vertices, ball.faces[:, ::-1]))
@@ -242,6 +242,10 @@ def test_two_and_three_bounces_in_a_sphere_have_the_chords_lengths() -> None:
     ends = passed(2.0 * radius)
     assert two == pytest.approx(ends * chord, rel=0.01)
     assert three == pytest.approx(ends * chord**2, rel=0.015)
+    # Of even light each scattering keeps the share of the surface.
+    once = field.path_gains(field.view(receiver)).single.sum()
+    kept = further(field) / once, (further(thrice) - further(field)) / further(field)
+    np.testing.assert_allclose(kept, parameters.scattered_share[0], rtol=0.015)
 
 
 @pytest.mark.usefixtures("device")

@@ -1,6 +1,6 @@
 """Links of many receivers in a bistatic field, traced several at a time.
 
-Tracing takes the field's terms on few rays, several receivers in one launch, and no beam. Line of sight and mirror
+Tracing takes the field's effects on few rays, several receivers in one launch, and no beam. Line of sight and mirror
 paths are those of the full query, exactly. Scattering, whose power is a mean over rays, takes a coarser grid of them:
 20 x 40 pixels of 4 rays (3200) instead of 64,800 at 60 x 120. Against the full query at ten blocked places of a lobby,
 rms: total path gain 0.04 dB, best beam of 2 degrees 0.4 dB (30 x 60: 0.05 and 0.2 dB).
