@@ -404,14 +404,20 @@ def _described(
     normal, slab = patches.normal[patch], np.full(patch.shape, -1, np.int32)
     thickness = np.full(patch.shape, np.nan)
     if walls is not None and slabs is not None:
-        stops, columns = stops_of(source, point, receivers[row]), list[tuple[np.ndarray, ...]]()
+        mesh, stops, columns = (
+            patches.mesh,
+            stops_of(source, point, receivers[row]),
+            list[tuple[np.ndarray, ...]](),
+        )
         for k, s in enumerate(s.take(kept) for s in slabs):
             leg = stops[:, k + 1] - stops[:, k]
-            along = leg / np.maximum(np.linalg.norm(leg, axis=1, keepdims=True), 1e-12)
             for j in range(walls.most):
                 met = s.face[:, j] >= 0
-                at = stops[:, k] + np.where(met, s.range_m[:, j], np.nan)[:, None] * along
-                turned = np.where(met[:, None], patches.mesh.face_normals[s.face[:, j]], np.nan)
+                turned = np.where(met[:, None], mesh.face_normals[s.face[:, j]], np.nan)
+                corner = mesh.triangles[s.face[:, j], 0]
+                with np.errstate(invalid="ignore", divide="ignore"):  # where none is met
+                    part = ((corner - stops[:, k]) * turned).sum(axis=1) / (leg * turned).sum(axis=1)
+                at = stops[:, k] + part[:, None] * leg
                 columns.append(
                     (np.full(len(row), -1, np.int32), s.face[:, j], at, turned, s.thickness_m[:, j])
                 )

@@ -128,6 +128,7 @@ class MirrorTracer:
         self.frequency_hz = check_frequency(frequency_hz)
         self.table: SurfaceTable | None = None
         self.walls: Walls | None = None
+        self._face_material = np.zeros(0, np.int32)
         groups = None
         materials = getattr(mesh_or_scene, "materials", None)
         if materials is not None:
@@ -135,8 +136,8 @@ class MirrorTracer:
             groups = getattr(mesh_or_scene, "face_material", None)
         self.patches = planar_patches(self.mesh, groups)
         if transmissions and self.table is not None and groups is not None:
-            self._material = np.asarray(groups, np.int32)
-            known = self.table.permittivity[self._material], self.table.thickness_m[self._material]
+            self._face_material = np.asarray(groups, np.int32)
+            known = (a[self._face_material] for a in (self.table.permittivity, self.table.thickness_m))
             clearance = max(ENDPOINT_CLEARANCE, self.patches.tolerance_m)
             self.walls = Walls.of_slabs(
                 self.mesh, *known, self.wavelength_m, transmissions, clearance, device
@@ -201,7 +202,8 @@ class MirrorTracer:
         for count, own in found.by_interactions:
             patch, slab, cos = (a[own, :count] for a in (found.patch, found.slab, found.cosine))
             through = slab >= 0
-            material = np.where(through, self._material[slab], self.patches.group[patch])
+            material = self.patches.group[patch]
+            material[through] = self._face_material[slab[through]]
             eta, thickness = self.table.permittivity[material], self.table.thickness_m[material]
             fields = slab_reflection(cos, eta, thickness, self.wavelength_m)
             te, tm = (np.sqrt(1.0 - self.table.scattering[material] ** 2) * r for r in fields)
