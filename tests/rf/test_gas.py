@@ -165,7 +165,10 @@ def test_scattered_light_seen_in_a_mirror_has_all_three_legs(scene: RadioScene, 
     """And what elements send on evenly has the two from them; with one ray a pixel every ray goes on at mirrors."""
     field = BistaticField.prior(scene, dry)
     mesh, sides = field.surface.mesh, field.surface.side_group
-    views = [one.tracer().on_grid((12, 24), 1).view(SEEN, 0) for one in (field, field.with_gas())]
+    views = [
+        one.tracer().on_grid((12, 24), 1).view(SEEN, Effects(mirrors=0))
+        for one in (field, field.with_gas())
+    ]
     d = views[0].tracer.grid.directions
     first = mesh.cast(SEEN, d)
     normal = mesh.face_normals[first.face]
@@ -192,7 +195,10 @@ def test_light_that_mirrors_throw_has_its_images_length(dry: SpectrumDataset) ->
 
     mesh, part = joined(sheet(0.0, True), sheet(4.0, False))
     field = BistaticField.prior(RadioScene(mesh, part, [SlabMaterial("floor"), SlabMaterial("lid")]), dry)
-    views = [one.tracer().on_grid((16, 32), 1).view(SEEN, 0) for one in (field, field.with_gas())]
+    views = [
+        one.tracer().on_grid((16, 32), 1).view(SEEN, Effects(mirrors=0))
+        for one in (field, field.with_gas())
+    ]
     materials = Evaluation(field.parameters)
 
     def by_image(point: np.ndarray) -> np.ndarray:

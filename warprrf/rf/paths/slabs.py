@@ -50,6 +50,18 @@ class Slabs:
         """Slabs on each way, shape ``(N,)``."""
         return (self.face >= 0).sum(axis=1)
 
+    @property
+    def reversed(self) -> Slabs:
+        """The same in the other order; what is past the last comes first."""
+        return Slabs(*(getattr(self, f.name)[:, ::-1] for f in fields(self)))
+
+    @property
+    def trimmed(self) -> Slabs:
+        """The same without columns that no way uses; one at least."""
+        used = (self.face >= 0).any(axis=0)
+        used[:1] |= ~used.any()
+        return Slabs(*(getattr(self, f.name)[:, used] for f in fields(self)))
+
     def take(self, rows: np.ndarray) -> Slabs:
         """Those of the ways ``rows``."""
         return Slabs(*(getattr(self, f.name)[rows] for f in fields(self)))

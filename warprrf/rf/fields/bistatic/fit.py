@@ -42,7 +42,7 @@ from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
 from warprrf.rf.paths.blockage import Walls, past_obstacles
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings
-from warprrf.rf.tracing.model import LOBES, SETS, Effects, Model, Parameters
+from warprrf.rf.tracing.model import LOBES, SETS, Effects, Layout, Model, Parameters
 from warprrf.rf.tracing.records import Evaluation
 from warprrf.rf.tracing.render import evaluation, path_gains
 from warprrf.rf.tracing.surface import Surface
@@ -250,7 +250,7 @@ def trace(
         receivers = np.stack([places[k].receiver for k in own])
         if effects is None:
             wanted = replace(wanted, mirrors=tracer.images.affordable(receivers, wanted.mirrors))
-        found = tracer.paths(receivers, wanted.mirrors, progress)
+        found = tracer.paths(receivers, wanted, progress)
         parts = [(receivers[r], found.subset(np.flatnonzero(found.receiver == r))) for r in range(len(own))]
         for r, view in each(partial(traced, tracer.again, wanted, keeps), parts, client):
             views[own[r]] = tracer.adopted(view)
@@ -538,7 +538,10 @@ def _fitted(t: Training) -> Fit:
         t = without(t, wrong.rows)
         choice, model = everyone(t, choice, residual)
     if errors is not None:
-        errors = replace(errors, covariance=_covariance(choice.fitted, t.options.gain_offset))
+        errors = replace(
+            errors,
+            covariance=_covariance(choice.fitted, t.options.gain_offset, choice.effects.transmissions > 0),
+        )
     missed = left_out(t, model)
     t.step(last=True)
     rays = t.observations[0].view.tracer.grid.sub_pixels
@@ -656,7 +659,11 @@ def cross_validate(t: Training, choice: Choice) -> tuple[bool, ErrorModel | None
         for k, x, shape in zip(order, power[keep], shapes, strict=True)
     ]
     return keep, learn_errors(
-        images, missed, np.array(gaps), places, _covariance(choice.fitted, t.options.gain_offset)
+        images,
+        missed,
+        np.array(gaps),
+        places,
+        _covariance(choice.fitted, t.options.gain_offset, choice.effects.transmissions > 0),
     )
 
 
@@ -811,10 +818,10 @@ def side_lobes(t: Training, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
     return share, moved
 
 
-def _covariance(found: Fitted, gain: bool) -> np.ndarray:
+def _covariance(found: Fitted, gain: bool, through: bool) -> np.ndarray:
     """Of what a field keeps: parameters of materials and the common gain, if that was free."""
     p = found.parameters
-    kept = p.log_weight.size + p.log_excess.size + p.log_mirror.size + gain
+    kept = Layout(*p.log_weight.shape, through=through, gain=gain).size
     return found.covariance[:kept, :kept]
 
 
@@ -835,7 +842,8 @@ def _report(t: Training, choice: Choice, wrong: Unexplained, seconds: float) -> 
     }
     deviation = np.sqrt(np.diag(found.covariance))
     if t.options.gain_offset:
-        place = found.parameters.log_weight.size + 2 * len(found.parameters.log_excess)
+        shape, through = found.parameters.log_weight.shape, choice.effects.transmissions > 0
+        place = Layout(*shape, through=through).size
         report["gain_offset_db"] = NEPER * found.parameters.log_gain
         report["gain_offset_std_db"] = NEPER * float(deviation[place])
     known = NEPER * deviation[len(deviation) - len(t.chains) :]
