@@ -7,7 +7,7 @@ import inspect
 import numbers
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from types import EllipsisType
 from typing import Any, TypeVar
@@ -100,6 +100,13 @@ def check_count(name: str, value: object, least: int = 1, most: int = 2**31 - 1)
         limit = f"{least} to {most}" if most < 2**31 - 1 else f"at least {least}"
         raise ValueError(f"{name}: got {value!r}, expected a whole number of {limit}")
     return int(value)  # type: ignore[call-overload]
+
+
+def check_choice(name: str, value: object, allowed: Iterable[object]) -> None:
+    """Raise ValueError, naming the argument, unless ``value`` is one of those ``allowed``."""
+    known = tuple(allowed)
+    if value not in known:
+        raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(map(str, known))}")
 
 
 def check_chosen(name: str, value: ArrayLike, count: int, least: int = 0) -> np.ndarray:

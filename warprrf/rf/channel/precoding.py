@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import eigh
 
-from warprrf.checks import check_array, check_positive, checked
+from warprrf.checks import check_array, check_choice, check_positive, checked
 from warprrf.rf.channel.beams import Ends, Source, chunks, codebook_of, rays_of, squared
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.spectra.spectrum import Spectrum
@@ -95,8 +95,7 @@ def precoders(channels: ArrayLike, method: str = "slnr", *, noise: float) -> np.
         ValueError: naming the argument; for a user without power, and for "zf" with more users than elements or users
             whose channels are linearly dependent.
     """
-    if method not in METHODS:
-        raise ValueError(f"method: got {method!r}, expected one of {', '.join(METHODS)}")
+    check_choice("method", method, METHODS)
     check_positive("noise", noise, "share of the transmitted power")
     h = _checked(channels)
     if h.ndim == 2:

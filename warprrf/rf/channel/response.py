@@ -34,7 +34,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count, check_positive, check_seed
+from warprrf.checks import check_array, check_choice, check_count, check_positive, check_seed
 from warprrf.rf.channel.arrays import ISOTROPIC, SLANTS_RAD, PlanarArray
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.channel.sums import (
@@ -108,8 +108,8 @@ def frequency_response(
         raise ValueError(
             "frequencies_hz: expected at least one, all positive (absolute, not about the carrier)"
         )
-    _choice("amplitude", amplitude, ("carrier", "friis"))
-    _choice("method", method, ("auto", "dense", "grid"))
+    check_choice("amplitude", amplitude, ("carrier", "friis"))
+    check_choice("method", method, ("auto", "dense", "grid"))
     even = len(f) >= LEAST_FREQUENCIES and _evenly_spaced(f)
     if method == "grid" and not even:
         raise ValueError(
@@ -297,9 +297,9 @@ def _links(
     normalize_delays: bool = False,
 ) -> Iterator[_Link]:
     """The link of each receiver; :class:`LinkOptions` says what the options mean."""
-    _choice("wave", wave, ("plane", "spherical"))
+    check_choice("wave", wave, ("plane", "spherical"))
     if diffuse is not None:
-        _choice("diffuse", diffuse, ("random_phase", "power", "given"))
+        check_choice("diffuse", diffuse, ("random_phase", "power", "given"))
     elif (paths.valid & (paths.kind == "diffuse")).any():
         raise ValueError(
             "diffuse: got None with diffuse paths, which have no phase; expected 'random_phase' (with a seed), 'power' "
@@ -390,11 +390,6 @@ def _amplitudes(paths: PathArrays, tx: PlanarArray, rx: PlanarArray) -> np.ndarr
         )
     received, transmitted = rx.field(paths.arrival), tx.field(paths.departure)
     return np.einsum("apx,pxy,bpy->abp", received, paths.jones, transmitted)
-
-
-def _choice(name: str, value: object, allowed: tuple[str, ...]) -> None:
-    if value not in allowed:
-        raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(allowed)}")
 
 
 def _evenly_spaced(f: np.ndarray) -> bool:

@@ -66,11 +66,6 @@ class PairLengths:
         """Whether a length is that of a receiving element plus that of a transmitting one."""
         return len(self.target) == 1
 
-    @property
-    def alone(self) -> bool:
-        """Whether there is one element at either end, at the centre."""
-        return len(self.place) == 1 and len(self.extra) == 1
-
     def received(self) -> tuple[np.ndarray, np.ndarray]:
         """Of separable ones: length [m] that receiving elements add, ``(M, P)``, and factor of amplitudes."""
         if not self.spherical:
@@ -79,10 +74,7 @@ class PairLengths:
         return reach - far, far / reach
 
     def longer(self) -> tuple[np.ndarray, np.ndarray]:
-        """Added length [m] and factor of amplitudes, each ``(M, N, P)``."""
-        if self.separable:
-            added, ratio = self.received()
-            return added[:, None] + self.extra, ratio[:, None] * self.scale
+        """Of others: added length [m] and factor of amplitudes, each ``(M, N, P)``."""
         reach, far = self._reach(self.target, self.place[:, None, None])
         return self.extra + (reach - far), self.scale * (far / reach)
 
@@ -123,7 +115,7 @@ class Sum:
     @property
     def own_delays(self) -> bool:
         """Whether pairs of elements have delays of their own."""
-        return self.squint and not self.lengths.alone
+        return self.squint and self.shape != (1, 1)
 
     def blocks(self, per_pair: int) -> Iterator[tuple[slice, slice, Sum]]:
         """The sum in pieces of elements whose ``per_pair`` numbers a pair are held at once."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf import netcdf_files
-from warprrf.checks import check_array, check_number, check_positive, checked
+from warprrf.checks import check_array, check_choice, check_number, check_positive, checked
 from warprrf.files import write_bytes
 from warprrf.geometry.mesh import Mesh
 from warprrf.netcdf_files import Variable
@@ -140,8 +140,7 @@ class RadioMap:
         Raises:
             ValueError: for a quantity that is not one of :data:`QUANTITIES`.
         """
-        if quantity not in QUANTITIES:
-            raise ValueError(f"quantity: got {quantity!r}, expected one of {', '.join(QUANTITIES)}")
+        check_choice("quantity", quantity, QUANTITIES)
         value = np.asarray(getattr(self, quantity))
         if quantity == "delay_spread_s":
             return value * 1e9

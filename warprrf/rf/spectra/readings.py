@@ -23,6 +23,7 @@ from scipy.special import digamma, polygamma
 
 from warprrf.checks import (
     check_array,
+    check_choice,
     check_chosen,
     check_count,
     check_number,
@@ -178,8 +179,7 @@ class Readings:
             )
         if self.samples is not None:
             check_count("samples", self.samples)
-        if self.window not in WINDOWS:
-            raise ValueError(f"window: got {self.window!r}, expected one of {', '.join(WINDOWS)}")
+        check_choice("window", self.window, WINDOWS)
         chain = np.full(count, "") if self.chain is None else np.asarray(self.chain, dtype=object)
         if chain.shape != (count,) or not all(isinstance(name, str) for name in chain):
             raise ValueError(f"chain: got {self.chain!r:.200}, expected a name for each of {count} readings")
