@@ -76,6 +76,18 @@ def check_array(
     return array
 
 
+def check_each(name: str, value: ArrayLike, count: int, *shape: int) -> np.ndarray:
+    """``value``, one of ``shape`` for all or one for each of ``count``, as a new array ``(count, *shape)``.
+
+    Raises:
+        TypeError, ValueError: naming the argument.
+    """
+    found = check_array(name, value)
+    if found.shape not in (shape, (count, *shape)):
+        raise ValueError(f"{name}: got shape {found.shape}, expected {shape} or {(count, *shape)}")
+    return np.broadcast_to(found, (count, *shape)).copy()
+
+
 def check_alike(**arrays: ArrayLike) -> None:
     """Raise ValueError, naming the arguments, unless their shapes can be broadcast to one."""
     shapes = [np.shape(array) for array in arrays.values()]
