@@ -26,8 +26,6 @@ from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.spectra.readings import PowerTable
 
-MOST_PIXELS = 4_000_000
-"""Larger pictures are refused: NeRF2's have 32,400."""
 UP = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 """Turns an array to lie in x and y and look along z, as a gateway's does."""
 
@@ -186,12 +184,13 @@ def _number(name: str, folder: Path) -> int:
 def _picture(path: Path, shape: tuple[int, ...] | None) -> np.ndarray:
     """Grey levels of 8 bits as [0, 1]; the header is looked at before anything is decoded."""
     image = require("PIL.Image", extra="mesh")
+    most = 4_000_000  # pixels; NeRF2's have 32,400
     if not path.is_file():
         raise FileNotFoundError(f"path: {path} is missing, though an index names it")
     try:
         with image.open(path, formats=["PNG"]) as opened:
             width, height = opened.size
-            if opened.mode != "L" or width * height > MOST_PIXELS:
+            if opened.mode != "L" or width * height > most:
                 raise ValueError(
                     f"got {width} x {height} pixels of mode {opened.mode}, expected grey of 8 bits"
                 )

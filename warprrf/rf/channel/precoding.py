@@ -34,9 +34,6 @@ from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.spectra.spectrum import Spectrum
 
 METHODS = ("mr", "zf", "slnr")
-LEAST_APART = 1e-9
-"""Least singular value of unit channels, relative to the largest, for users that zero forcing can still part."""
-ROUNDING = 1e-13
 
 
 @checked
@@ -144,7 +141,7 @@ def _leakage(covariances: np.ndarray, floor: float) -> np.ndarray:
     count, size = covariances.shape[:2]
     everything = covariances.sum(axis=0)
     # Below rounding of what leaks the matrix of leakage is singular; noise so far down changes nothing.
-    floor = max(floor, ROUNDING * float(np.abs(everything).max()))
+    floor = max(floor, 1e-13 * float(np.abs(everything).max()))
     found = np.empty((count, size), dtype=complex)
     for u, own in enumerate(covariances):
         leaked = everything - own + floor * np.eye(size)
@@ -156,8 +153,9 @@ def _apart(best: np.ndarray) -> np.ndarray:
     """The unit vectors nearest to ``best`` (U, N), each orthogonal to all the others."""
     users, size = best.shape
     left, singular, right = np.linalg.svd(best.conj(), full_matrices=False)
-    if users > size or singular[-1] < LEAST_APART * singular[0]:
-        rank = int((singular >= LEAST_APART * singular[0]).sum())
+    least_apart = 1e-9  # least singular value, over the largest, of users that can still be parted
+    if users > size or singular[-1] < least_apart * singular[0]:
+        rank = int((singular >= least_apart * singular[0]).sum())
         raise ValueError(
             f"method: 'zf' cannot part {users} users by {size} elements, whose channels have rank {rank}; expected "
             "linearly independent ones, or method 'slnr'"

@@ -33,11 +33,9 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 
 TAPS = 8
 """Cells that a path is spread to."""
-OVERSAMPLING = 2
 LEAST_FREQUENCIES = 2 * TAPS
 """Fewer frequencies are summed densely: the window would wrap round the grid."""
 
-_BETA = 2.3 * TAPS  # width of the window for this oversampling: Barnett et al., eq. (1.8)
 _BLOCK = 4_000_000  # numbers that an intermediate array may hold, about
 
 
@@ -192,7 +190,8 @@ def gridded_sum(job: Sum, frequencies_hz: np.ndarray) -> np.ndarray:
     harmonic = np.arange(count) - count // 2
     middle_hz = frequencies_hz[count // 2]
     step_hz = (frequencies_hz[-1] - frequencies_hz[0]) / (count - 1)
-    cells = scipy.fft.next_fast_len(OVERSAMPLING * count)
+    oversampling = 2
+    cells = scipy.fft.next_fast_len(oversampling * count)
     amplitude = job.amplitude * carrier_phase(middle_hz - job.carrier_hz, job.tau)
     correction = 1.0 / _window_transform(harmonic / cells)
     out = np.empty((*job.shape, count), dtype=complex)
@@ -229,7 +228,8 @@ def _spread(place: np.ndarray, values: np.ndarray, cells: int) -> np.ndarray:
 def _window(x: np.ndarray) -> np.ndarray:
     """The window at ``x`` cells from its middle; nothing outside."""
     z = 1.0 - (2.0 / TAPS * x) ** 2
-    return np.where(z > 0.0, np.exp(_BETA * (np.sqrt(np.maximum(z, 0.0)) - 1.0)), 0.0)
+    beta = 2.3 * TAPS  # width of the window for this oversampling: Barnett et al., eq. (1.8)
+    return np.where(z > 0.0, np.exp(beta * (np.sqrt(np.maximum(z, 0.0)) - 1.0)), 0.0)
 
 
 def _window_transform(cycles_per_cell: np.ndarray) -> np.ndarray:

@@ -51,12 +51,7 @@ NEEDED = (*COLUMNS["transmitter"], *COLUMNS["receiver"], "power_db")
 NUMBERS = (*NEEDED, *COLUMNS["arrival"], *COLUMNS["departure"], "delay_ns", "std_db")
 NOT_MEASURED = ("", "na", "n/a", "#n/a", "<na>", "nan", "null", "none")
 """What stands in a file, in small letters, for a power that was not measured."""
-WIDEST_HORN_RAD = 2.0 * np.pi / 3.0
-"""Full width at half maximum of the widest horns; a larger number is one in degrees."""
-WEIGHTS_AT_ONCE = 1_000_000  # of readings and paths: some MB of temporary arrays
-ALIKE = 0.7  # of two names' letters: one is misspelt for the other
 WINDOWS = ("rectangular", "hann")
-STEADIEST = 1e-6  # relative variance of the power of a single wave
 
 
 @runtime_checkable
@@ -298,7 +293,7 @@ def _check_columns(names: Sequence[str]) -> None:
     """Refuse names of columns that are missing, repeated or misspelt; warn of others that are not read."""
     _check_once(names)
     known, unknown = (*NUMBERS, "chain"), [name for name in names if name not in (*NUMBERS, "chain")]
-    alike = {name: get_close_matches(name.lower(), known, 2, ALIKE) for name in unknown}
+    alike = {name: get_close_matches(name.lower(), known, 2, 0.7) for name in unknown}
     meant = [
         f"{name!r} for {' or '.join(absent)}"
         for name, near in alike.items()
@@ -402,7 +397,8 @@ def fading_db(samples: int | None, steady: ArrayLike = 0.0) -> tuple[np.ndarray,
         samples: independent ones that a reading is the mean of; None where fading is averaged out.
         steady: sum of the squared shares of single waves, 0 to 1.
     """
-    left = np.maximum(1.0 - np.asarray(steady, float), STEADIEST)
+    steadiest = 1e-6  # relative variance of the power of a single wave
+    left = np.maximum(1.0 - np.asarray(steady, float), steadiest)
     if samples is None:
         return np.zeros_like(left), np.zeros_like(left)
     shape = samples / left
@@ -426,7 +422,8 @@ def path_weights(
         delay_s: delays [s], shape ``(K,)``.
     """
     weight = np.empty((len(rows), len(delay_s)), dtype)
-    at_once = max(1, WEIGHTS_AT_ONCE // max(1, len(delay_s)))
+    weights_at_once = 1_000_000  # of readings and paths: some MB of temporary arrays
+    at_once = max(1, weights_at_once // max(1, len(delay_s)))
     for first in range(0, len(rows), at_once):
         some = rows[first : first + at_once]
         weight[first : first + at_once] = _path_weights(readings, some, arrival, departure, delay_s)
@@ -454,16 +451,16 @@ def horn(width_rad: float, floor_db: float = -60.0) -> Pattern:
     """Gain of a horn over the angle off boresight: Gaussian in the angle, lossless.
 
     Args:
-        width_rad: full width at half maximum [rad], at most :data:`WIDEST_HORN_RAD`.
+        width_rad: full width at half maximum [rad], at most 2 pi / 3, that of the widest; a larger number is one in degrees.
         floor_db: of the side lobes below the peak [dB].
 
     Raises:
         ValueError: for other numbers.
     """
     width, low = check_positive("width_rad", width_rad), check_number("floor_db", floor_db, -200.0, 0.0)
-    if width > WIDEST_HORN_RAD:
+    if width > 2.0 * np.pi / 3.0:
         raise ValueError(
-            f"width_rad: got {width:g}, expected radians, at most {WIDEST_HORN_RAD:.3g}: "
+            f"width_rad: got {width:g}, expected radians, at most 2.09: "
             f"horn(np.radians({width:g})) is {width:g} degrees wide"
         )
     angle = np.linspace(0.0, np.pi, 20_001)

@@ -48,7 +48,6 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField, with_settings
 from warprrf.rf.fields.harmonic.fitting import (
     KINDS,
-    SAVED_EVERY,
     State,
     fit_layer,
     load_states,
@@ -74,8 +73,6 @@ from warprrf.steps import digest
 
 LAYERS = {"rf3dgs+": ("gain",), "rf3dgs": ("gain", "delay", "aod_x", "aod_y", "aod_z")}
 """Layers that each model may have."""
-MOST_COEFFICIENT = 1e9
-CHANNEL_STEPS = 100  # of each delay and AoD channel: they start at means that are nearly right
 CHANNEL_RATES = Rates(constant=0.1, directional=0.05, ridge=0.02, ridge_directional=0.1)
 
 
@@ -134,7 +131,8 @@ class HarmonicField(RadioField):
             raise ValueError(
                 f"layers: got no {', '.join(sorted(lacking))}, expected the gain alone or every layer"
             )
-        table = Expected(f"N {_kernels.COEFFICIENTS}", -MOST_COEFFICIENT, MOST_COEFFICIENT)
+        most_coefficient = 1e9
+        table = Expected(f"N {_kernels.COEFFICIENTS}", -most_coefficient, most_coefficient)
         check_arrays(self.layers, dict.fromkeys(self.layers, table), N=len(self.gaussians))
         check_positive("gain_unit", self.gain_unit)
         check_number("delay_unit", self.delay_unit, 0.0, 1.0)
@@ -454,8 +452,9 @@ def _train(
     extra = np.stack([np.zeros(blank.shape) if beam is None else beam for beam in beams])
     plan, gain_unit, delay_unit = targets(options, ds, images, seen, factor, extra)
     problem = Problem(seen, batch=options.batch, seed=options.seed, device=device)
+    channel_steps = 100  # of each delay and AoD channel: they start at means that are nearly right
     steps = {
-        name: options.iterations if name == "gain" else min(CHANNEL_STEPS, options.iterations)
+        name: options.iterations if name == "gain" else min(channel_steps, options.iterations)
         for name in plan
     }
     identity = digest(options, seen, plan)
@@ -466,7 +465,7 @@ def _train(
         """What follows each step of a layer: progress, and now and then the checkpoint."""
         if progress is not None:
             progress("fit", before + done, sum(steps.values()))
-        if checkpoint is not None and (done % SAVED_EVERY == 0 or done == steps[name]):
+        if checkpoint is not None and (done % 50 == 0 or done == steps[name]):
             states[name] = state()
             save_states(checkpoint, identity, states)
 

@@ -24,7 +24,6 @@ from warprrf.geometry.splats.photo_loss import WRAPPED, PhotoLoss
 from warprrf.kernels.adam import build_adam, corrections
 from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.kernels.raster.sh import COEFFICIENTS as DEGREE_TO_COUNT
-from warprrf.rf.fields.harmonic.opacity import RATE as OPACITY_RATE
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining
 from warprrf.rf.fields.harmonic.options import FieldOptions, Rates
 from warprrf.rf.fields.harmonic.problem import Problem
@@ -33,9 +32,7 @@ from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import directions_from_angles, to_db
 
 KINDS = {"exp": _kernels.EXPONENTIAL, "linear": _kernels.CLAMPED, "signed": _kernels.SIGNED}
-FINAL_RATE = 0.05  # the learning rate falls exponentially to this share of its first value
 SSIM_SHARE = 0.2  # of 1 - SSIM in the loss of a gain, the rest is L1: as RF-3DGS publishes it
-SAVED_EVERY = 50  # steps
 CHECKPOINT = "warprrf field checkpoint 2"
 
 
@@ -272,19 +269,21 @@ def fit_layer(
         logits = None if opacity is None else opacity.state
         return State(coefficients.numpy(), first.numpy(), second.numpy(), np.array(losses), logits)
 
+    final_rate = 0.05  # the learning rate falls exponentially to this share of its first value
     for step in range(len(losses), steps):
         index = p.batch_at(step)
         losses.append(layer.step(index, coefficients))
         # one pixel's L1 pull on a neper of gain, so that the ridge counts in pixels
         pull = np.log10(math.e) * 10 / (target.high - target.low) if target.mask is None else 1.0
         ridge = firm * (pull / layer.data[index].count)
-        falling = FINAL_RATE ** (step / max(steps - 1, 1))
+        falling = final_rate ** (step / max(steps - 1, 1))
         p.launch(
             adam, len(p.seen), width, p.upload(rate * falling), *corrections(step + 1), p.upload(ridge), initial,
             *moved,
         )  # fmt: skip
         if opacity is not None:
-            opacity.step(layer.opacity_gradient, step + 1, OPACITY_RATE * falling)
+            opacity_rate = 0.05  # Adam's, of the logits, as RF-3DGS publishes it
+            opacity.step(layer.opacity_gradient, step + 1, opacity_rate * falling)
         if each is not None:
             each(step + 1, snapshot)
     return snapshot()
