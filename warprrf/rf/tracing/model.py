@@ -46,7 +46,7 @@ class Effects:
     scatterings: int = 3
     mirror_scatter: bool = True
     scatter_mirror: bool = True
-    transmissions: int = 0
+    transmissions: int = 3
     residual: bool = True
 
     def __post_init__(self) -> None:
@@ -56,11 +56,11 @@ class Effects:
 
 
 SETS = {
-    "single": Effects(mirrors=1, scatterings=1, mirror_scatter=False, scatter_mirror=False),
-    "room": Effects(scatter_mirror=False),
-    "everything": Effects(),
+    "single": Effects(mirrors=1, scatterings=1, mirror_scatter=False, scatter_mirror=False, transmissions=0),
+    "room": Effects(scatter_mirror=False, transmissions=0),
+    "everything": Effects(transmissions=0),
 }
-"""Sets of effects that a fit tries."""
+"""Sets of effects that a fit tries; it adds what passes slabs where the scene needs it."""
 
 MOST_NEPERS = 40.0  # of any logarithm: 174 dB from one, where no surface is
 _EXCESS = (0.05, 200.0)  # of epsilon_r - 1: the last reflects like metal

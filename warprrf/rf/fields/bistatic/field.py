@@ -39,13 +39,13 @@ from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.channel.array_spectra import check_steering
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Air, Gas, air_of
-from warprrf.rf.em.materials import assumed_permittivity
 from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import Data, Measured, RadioField, with_settings
 from warprrf.rf.fields.bistatic import files
 from warprrf.rf.fields.bistatic.fit import SUB_PIXELS, FitOptions, TrainingViews, fit
 from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, read
+from warprrf.rf.fields.bistatic.needs import assumed
 from warprrf.rf.fields.bistatic.observations import (
     Frame,
     Observation,
@@ -238,8 +238,8 @@ class BistaticField(RadioField):
             device=device,
         )
         places_of(data, prior.mesh, device)
-        known = [assumed_permittivity(name, prior.frequency_hz) for name in prior.surface.group_names]
-        parameters = replace(prior.parameters, log_excess=np.log(np.array(known) - 1.0))
+        own = assumed(prior.surface, prior.frequency_hz)
+        parameters = replace(prior.parameters, log_excess=own.log_excess, log_through=own.log_through)
         report = {"receivers": 0, "held_out": 0, "chains": {}, "unexplained": {}}
         return replace(prior, parameters=parameters, report=report)
 
