@@ -73,7 +73,7 @@ class Options:
     carriers_ghz: tuple[float, ...] = option((28.0, 140.0), "carriers [GHz]")
     counts: tuple[int, ...] = option((10, 50), "training receivers of both rooms")
     tests: int = option(20, "test receivers in either room")
-    samples: int = option(500_000, "rays of Sionna RT's")
+    samples: int = option(4_000_000, "rays of Sionna RT's")
 
     @property
     def inputs(self) -> list[Any]:

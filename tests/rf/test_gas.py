@@ -166,8 +166,7 @@ def test_scattered_light_seen_in_a_mirror_has_all_three_legs(scene: RadioScene, 
     field = BistaticField.prior(scene, dry)
     mesh, sides = field.surface.mesh, field.surface.side_group
     views = [
-        one.tracer().on_grid((12, 24), 1).view(SEEN, Effects(mirrors=0))
-        for one in (field, field.with_gas())
+        one.tracer().on_grid((12, 24), 1).view(SEEN, Effects(mirrors=0)) for one in (field, field.with_gas())
     ]
     d = views[0].tracer.grid.directions
     first = mesh.cast(SEEN, d)
@@ -196,8 +195,7 @@ def test_light_that_mirrors_throw_has_its_images_length(dry: SpectrumDataset) ->
     mesh, part = joined(sheet(0.0, True), sheet(4.0, False))
     field = BistaticField.prior(RadioScene(mesh, part, [SlabMaterial("floor"), SlabMaterial("lid")]), dry)
     views = [
-        one.tracer().on_grid((16, 32), 1).view(SEEN, Effects(mirrors=0))
-        for one in (field, field.with_gas())
+        one.tracer().on_grid((16, 32), 1).view(SEEN, Effects(mirrors=0)) for one in (field, field.with_gas())
     ]
     materials = Evaluation(field.parameters)
 

@@ -55,7 +55,7 @@ def test_mirrors_one_after_the_other_reflect_as_jones_matrices_say() -> None:
     ]
     scene = RadioScene(mesh, part, room)
     ds = spectra(scene, RX[None], shape=(12, 24), sigma=np.radians(10.0))
-    field = BistaticField.prior(scene, ds, effects=Effects(mirrors=2, scatterings=0))
+    field = BistaticField.prior(scene, ds, effects=Effects(mirrors=2, scatterings=0, transmissions=0))
     permittivity = np.array([m.relative_permittivity for m in room])
     mirrored = 1.0 - np.array([m.scattering for m in room]) ** 2
     p = replace(field.parameters, log_excess=np.log(permittivity - 1.0), log_mirror=np.log(mirrored))
