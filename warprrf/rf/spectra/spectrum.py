@@ -19,7 +19,15 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_number, check_positive, check_type, checked, one_line
+from warprrf.checks import (
+    check_array,
+    check_known_whole,
+    check_number,
+    check_positive,
+    check_type,
+    checked,
+    one_line,
+)
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
 
@@ -97,6 +105,7 @@ def check_pixels(path_gain: np.ndarray, delay_s: np.ndarray | None, aod: np.ndar
             "delay_s: got values that are negative or infinite, expected seconds, or NaN where empty"
         )
     if aod is not None:
+        check_known_whole("aod", aod)
         zenith, azimuth, most = aod[..., 0], aod[..., 1], np.pi + _ANGLE_ROUNDING
         if ((zenith < -_ANGLE_ROUNDING) | (zenith > most) | (azimuth < -most) | (azimuth > most)).any():
             raise ValueError(
