@@ -264,15 +264,6 @@ def test_an_even_radiance_has_the_receivers_leg(scene: RadioScene, dry: Spectrum
     assert columns.sum() * humid.floor == pytest.approx(expected, rel=1e-5)
 
 
-def test_links_with_gas_are_the_spectrums_sums(scene: RadioScene, humid: SpectrumDataset) -> None:
-    field = BistaticField.prior(scene, humid, effects=Effects(mirrors=2, scatterings=2, residual=False))
-    total = field.links(RECEIVERS[[0, 4]]).total_path_gain
-    for k, place in enumerate(RECEIVERS[[0, 4]]):
-        expected = field.spectrum(place).total_path_gain
-        assert abs(10.0 * np.log10(total[k] / expected)) < 0.15
-        assert field.with_gas(False).spectrum(place).total_path_gain > 1.1 * expected
-
-
 def test_a_fit_takes_the_air_out_of_what_it_learns(
     scene: RadioScene, dry: SpectrumDataset, humid: SpectrumDataset, tmp_path: Path
 ) -> None:

@@ -6,7 +6,6 @@ import warnings
 import numpy as np
 import pytest
 from radio_scenes import box_mesh, joined, tube
-from told import check_told
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
@@ -92,19 +91,6 @@ def test_a_search_without_end_is_refused_before_it_begins():
         trace_paths(mesh, receivers=[1.0, 0.2, 0.1], mirror_order=12, **words)
     with pytest.raises(ValueError, match="expected at most 10:.*max_chains"):
         MirrorTracer(mesh, max_chains=10, **words).find(np.array([[1.0, 0.2, 0.1]]), 1)
-
-
-def test_progress_of_a_search_in_blocks_goes_from_patches_to_the_end_of_the_mirrors(monkeypatch):
-    monkeypatch.setattr(images_module, "MOST_KEPT", 0)
-    monkeypatch.setattr(images_module, "_FIRST", 3)
-    told = []
-    points = np.random.default_rng(9).normal(0, 1.5, (2, 3))
-    trace_paths(
-        shards(2, 40), transmitter=TX, receivers=points, frequency_hz=3e9, mirror_order=3,
-        progress=lambda *words: told.append(words),
-    )  # fmt: skip
-    check_told(told, ["patches", "mirrors"])
-    assert told[-1][1:] == (1000, 1000) and len(set(told)) > 10
 
 
 def test_soft_blocking_finds_what_hard_blocking_does_where_zones_are_free():
