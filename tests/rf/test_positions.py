@@ -180,6 +180,24 @@ def test_a_room_of_solid_walls_has_its_air_between_them():
         np.testing.assert_array_equal(is_free(mesh, places, known)[clear], ~held[clear])
 
 
+def test_places_round_open_walls_and_lone_boxes_pass_and_in_a_box_do_not():
+    rng = np.random.default_rng(4)
+    for side in range(6):  # a room without it
+        vertices, faces = box_mesh(LOW, HIGH, inward=side % 2 > 0)
+        without = Mesh(vertices, np.delete(faces, [2 * side, 2 * side + 1], axis=0))
+        check_positions(without, AIR, rng.uniform(LOW - 2, HIGH + 2, (30, 3)), WAVELENGTH)
+    walls = joined(
+        *(wall(rng, x, 0.0) for x in (1, 2.5, 4)), sheet([1, 2, 0], [4, 2, 0], [4, 2, 3], [1, 2, 3])
+    )[0]
+    check_positions(walls, AIR, rng.uniform(LOW, HIGH, (60, 3)), WAVELENGTH)
+    box, around = joined(box_mesh(*CUPBOARD))[0], rng.uniform(CUPBOARD[0] - 3, CUPBOARD[1] + 3, (60, 3))
+    inside = ((around > CUPBOARD[0]) & (around < CUPBOARD[1])).all(axis=1)
+    check_positions(box, TX, around[~inside], WAVELENGTH)
+    check_positions(box, IN_CUPBOARD, around[inside], WAVELENGTH)
+    with pytest.raises(ValueError, match=r"receivers\[0\].*inside a solid"):
+        check_positions(box, TX, np.array([IN_CUPBOARD, TX - 1]), WAVELENGTH)
+
+
 @pytest.mark.parametrize("name", ["box", "box_one_screen", "box_two_screens"])
 def test_sionnas_boxes_of_sheets_are_rooms(name):
     rt = pytest.importorskip("sionna.rt")

@@ -12,6 +12,7 @@ from warprrf.kernels.ssim import RADIUS, WINDOW
 from warprrf.rf.fields.harmonic.field import HarmonicField
 from warprrf.rf.fields.harmonic.fitting import Layer, Target, fit_layer
 from warprrf.rf.fields.harmonic.opacity import Listed, OpacityTraining, list_responses
+from warprrf.rf.fields.harmonic.options import Rates
 from warprrf.rf.fields.harmonic.problem import Problem
 from warprrf.rf.fields.harmonic.transport import Transport, transport
 from warprrf.rf.spectra.spectrum import pixel_directions
@@ -141,6 +142,20 @@ def test_gradient_does_not_depend_on_how_launches_are_split(monkeypatch: pytest.
     assert np.array_equal(results[0][1], results[1][1])
 
 
+@pytest.mark.usefixtures("device")
+def test_adams_first_step_is_the_learning_rate_against_the_gradients_sign() -> None:
+    """Kingma and Ba 2015: after bias correction the first update is rate * g / |g|."""
+    problem = Problem(synthetic_transport(), batch=3, precision=np.float64)
+    target = gain_target(problem)
+    layer = Layer(problem, target)
+    start = np.zeros((len(problem.seen), 16))
+    layer.step(0, problem.upload(start, problem.kernels.vec16))
+    gradient = layer.gradient.numpy()
+    state = fit_layer(problem, target, steps=1, rates=Rates(0.3, 0.01, 0.0, 0.0))
+    assert state.coefficients[:, 0] == pytest.approx(-0.3 * np.sign(gradient[:, 0]), rel=1e-6)
+    assert state.coefficients[:, 1:] == pytest.approx(-0.01 * np.sign(gradient[:, 1:]), rel=1e-6)
+
+
 @pytest.mark.parametrize(("degree", "count"), [(0, 1), (1, 4), (2, 9), (3, 16)])
 def test_coefficients_above_the_degree_stay_zero(degree: int, count: int) -> None:
     problem = Problem(synthetic_transport(), batch=3)
@@ -150,6 +165,23 @@ def test_coefficients_above_the_degree_stay_zero(degree: int, count: int) -> Non
 
 
 RANGE_DB = (-60.0, 0.0)
+
+
+def test_the_ridge_holds_a_gaussian_at_its_start() -> None:
+    problem = Problem(synthetic_transport(), batch=3)
+    target = gain_target(problem)
+    free, held = (
+        fit_layer(problem, target, steps=60, rates=Rates(0.05, 0.05, ridge, ridge)).coefficients
+        for ridge in (0.0, 1e6)
+    )
+    assert np.abs(free).max() > 0.5
+    assert np.abs(held).max() < 0.1 * np.abs(free).max()
+
+
+def test_a_pixels_weight_is_the_sum_of_its_pairs_and_zero_without_any() -> None:
+    seen = synthetic_transport()
+    expected = np.bincount(seen.pixel, seen.weight, 3 * SHAPE[0] * SHAPE[1]).reshape(3, *SHAPE)
+    assert np.allclose(seen.pixel_weight, expected, rtol=1e-12, atol=0)
 
 
 def shell(count: int = 250, seed: int = 0) -> Gaussians:
