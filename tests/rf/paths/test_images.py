@@ -11,7 +11,7 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.rf.paths import images as images_module
 from warprrf.rf.paths.images import MirrorImages
-from warprrf.rf.paths.mirror_paths import exact_paths, zone_paths
+from warprrf.rf.paths.mirror_paths import exact_paths
 from warprrf.rf.paths.trace import MirrorTracer, trace_paths
 
 TX = np.array([0.2, -0.1, 0.3])
@@ -91,21 +91,6 @@ def test_a_search_without_end_is_refused_before_it_begins():
         trace_paths(mesh, receivers=[1.0, 0.2, 0.1], mirror_order=12, **words)
     with pytest.raises(ValueError, match="expected at most 10:.*max_chains"):
         MirrorTracer(mesh, max_chains=10, **words).find(np.array([[1.0, 0.2, 0.1]]), 1)
-
-
-def test_soft_blocking_finds_what_hard_blocking_does_where_zones_are_free():
-    mesh = Mesh(*box_mesh([-3, -2, -1], [4, 3, 2], inward=True))
-    patches = planar_patches(mesh)
-    points = np.random.default_rng(7).uniform([-2.5, -1.5, -0.5], [3.5, 2.5, 1.5], (6, 3))
-    images = MirrorImages(patches, TX, slack_m=0.1)
-    hard, soft = exact_paths(images, points, 2), zone_paths(images, points, 2, 1e-5, 1e-4)
-    whole = soft.subset(np.flatnonzero(soft.share == 1.0))
-    assert len(whole) >= 0.95 * len(hard)
-
-    def rows(paths):
-        return {(int(r), *p.tolist()) for r, p in zip(paths.receiver, paths.patch, strict=True)}
-
-    assert rows(whole) <= rows(hard) <= rows(soft)
 
 
 def test_patches_with_a_back_mirror_on_their_front_alone():
