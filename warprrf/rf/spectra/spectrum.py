@@ -19,7 +19,15 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_number, check_positive, check_type, checked, one_line
+from warprrf.checks import (
+    check_array,
+    check_known_whole,
+    check_number,
+    check_positive,
+    check_type,
+    checked,
+    one_line,
+)
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
 
@@ -87,6 +95,7 @@ def check_pixels(path_gain: np.ndarray, delay_s: np.ndarray | None, aod: np.ndar
         1e-3  # radians by which angles of departure may lie out of range: what compact files round
     )
     if aod is not None:
+        check_known_whole("aod", aod)
         zenith, azimuth, most = aod[..., 0], aod[..., 1], np.pi + angle_rounding
         if ((zenith < -angle_rounding) | (zenith > most) | (azimuth < -most) | (azimuth > most)).any():
             raise ValueError(

@@ -38,7 +38,7 @@ least width holds up to 7500 m^2 of surfaces (a hall's), the largest up to 19 km
 LEAST_ELEMENTS = 300
 CELLS = 3  # along an element
 LARGEST_FACE = 1.2  # elements' widths; longer edges are split, so that elements can be small
-MIN_MIRROR_M2 = 0.05  # smaller patches reflect too little to search for
+MIN_MIRROR = 0.2  # of an element's area in a room: smaller patches reflect too little to search for
 POSITION_ERROR_M = 0.02  # of a reconstructed surface: shadow rays end so far before it
 TRUE_ERROR_M = 1e-4
 LOSSY = 4.0 * (1.0 - 0.06j)
@@ -201,7 +201,8 @@ class Surface:
             normal, error_m = _on_patches(patches, mesh.face_normals), max(TRUE_ERROR_M, patches.tolerance_m)
         patch, planes = patches.face_patch, (patches.normal, patches.offset)
         if patches.two_sided:
-            patch, planes = _mirrors(_apart(patches, alike[group]))
+            least_m2 = MIN_MIRROR * min(element_m, ELEMENT_M) ** 2
+            patch, planes = _mirrors(_apart(patches, alike[group]), least_m2)
         sides = patches.two_sided
         mesh, parent = _split_long(mesh, np.flatnonzero(patches.once), LARGEST_FACE * element_m)
         group, patch = group[parent].astype(np.int32), patch[parent].astype(np.int32)
@@ -394,12 +395,12 @@ def _element_width(mesh: Mesh) -> float:
     return width_m
 
 
-def _mirrors(patches: PlanarPatches) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Patches large enough to mirror, those of one group in one plane as one: patch of each face, -1 for none, and planes.
+def _mirrors(patches: PlanarPatches, least_m2: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Patches of at least ``least_m2``, those of one group in one plane as one: patch of each face, -1 for none, and planes.
 
     Faces that overlap in a plane, or sheets closer than the tolerance, would mirror twice.
     """
-    large = np.flatnonzero(patches.area >= MIN_MIRROR_M2)
+    large = np.flatnonzero(patches.area >= least_m2)
     middle = patches.mesh.center
     height = patches.offset[large] - patches.normal[large] @ middle
     reach = 0.5 * float(np.linalg.norm(np.ptp(patches.mesh.bounds, axis=0)))
