@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.checks import check_count, check_number, check_positive, check_type, checked
+from warprrf.checks import check_choice, check_count, check_number, check_positive, check_type, checked
 from warprrf.files import read_json
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 
@@ -114,7 +114,7 @@ class Material:
         name: the material's name.
         bands: permittivity rows; the first whose band holds the frequency counts. Without any it is a name alone, as a
             mesh file gives: it tells a radio field which surfaces are alike, and every question about it is an error.
-        thickness_m: slab thickness [m]; ``inf`` for a half-space.
+        thickness_m: slab thickness [m], by default Sionna RT's; ``inf`` for a half-space.
         roughness_m: rms height of the surface sigma_h [m]; gives the scattering coefficient.
         scattering: scattering coefficient S in [0, 1] at every frequency, instead of one from ``roughness_m``.
         pattern: ``"lambertian"`` or ``"directive"``.
@@ -151,8 +151,7 @@ class Material:
         check_number("roughness_m" + of, self.roughness_m, 0.0, ROUGHEST_M)
         if self.scattering is not None:
             check_number("scattering" + of, self.scattering, 0.0, 1.0)
-        if self.pattern not in PATTERNS:
-            raise ValueError(f"pattern{of}: got {self.pattern!r}, expected one of {', '.join(PATTERNS)}")
+        check_choice("pattern" + of, self.pattern, PATTERNS)
         check_count("alpha_r" + of, self.alpha_r, 1, NARROWEST_LOBE)
         check_number("xpd" + of, self.xpd, 0.0, 1.0)
 
@@ -422,9 +421,6 @@ def load_materials(path: str | os.PathLike[str]) -> dict[str, Material]:
     return found
 
 
-DEFAULT_THICKNESS_M = 0.1  # of a surface whose scene says nothing of it, as in Sionna RT
-
-
 def _rows(edition: int, *rows: tuple[float, float, float, float, float, float]) -> tuple[Band, ...]:
     source = f"ITU-R P.2040-{edition}, table 3"
     return tuple(Band(low * 1e9, high * 1e9, a, b, c, d, source) for low, high, a, b, c, d in rows)
@@ -486,7 +482,7 @@ def itu_material(
     itu: str,
     *,
     name: str | None = None,
-    thickness_m: float = DEFAULT_THICKNESS_M,
+    thickness_m: float = Material.thickness_m,
     scattering: float = 0.0,
     pattern: str = "lambertian",
     alpha_r: int = 4,

@@ -65,8 +65,8 @@ def check_range_db(range_db: Sequence[float]) -> tuple[float, float]:
         TypeError, ValueError: if it is not two finite numbers, or the first lies above the second.
     """
     low, high = (float(value) for value in check_array("range_db", range_db, (2,)))
-    if low > high:
-        raise ValueError(f"range_db: got {low:g} to {high:g}, expected the lowest value first")
+    if not -1e4 <= low <= high <= 1e4:
+        raise ValueError(f"range_db: got {low:g} to {high:g}, expected decibels, the lowest value first")
     return low, high
 
 
