@@ -21,12 +21,8 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.netcdf_files import Variable
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.maps.links import LinkOptions, Links
-from warprrf.rf.positions import (
-    NEAR_FIELD,
-    check_positions,
-    ground_height,
-    is_free,
-)
+from warprrf.rf.positions import NEAR_FIELD, check_positions, ground_height, is_free
+from warprrf.rf.spectra.spectrum import to_db
 
 _FORMAT = "warprrf radio map 1"
 _LAYERS = {
@@ -126,9 +122,7 @@ class RadioMap:
     @property
     def best_beam_snr_db(self) -> np.ndarray:
         """Signal-to-noise ratio of the best beam [dB], shape ``(Y, X)``; another budget shifts it by a constant."""
-        with np.errstate(divide="ignore"):
-            gain = 10.0 * np.log10(self.best_beam_gain)
-        return self.transmit_power_dbm + gain - self.noise_power_dbm
+        return self.transmit_power_dbm + to_db(self.best_beam_gain) - self.noise_power_dbm
 
     def plot_values(self, quantity: str) -> np.ndarray:
         """``quantity`` as it is drawn: gains in dB, delay spread in ns, shape ``(Y, X)``.
@@ -140,10 +134,7 @@ class RadioMap:
         value = np.asarray(getattr(self, quantity))
         if quantity == "delay_spread_s":
             return value * 1e9
-        if quantity.endswith("_db"):
-            return value
-        with np.errstate(divide="ignore"):
-            return np.asarray(10.0 * np.log10(value))
+        return value if quantity.endswith("_db") else to_db(value)
 
     def plot(self, quantity: str = "total_path_gain", ax: Any = None, **options: Any) -> Any:
         """Draw one quantity over the floor plan into ``ax`` (a new one by default); returns the axes.
