@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -61,11 +62,12 @@ def paths_of(view: View, *, beam_sigma_rad: float, frequency_hz: float, max_path
         line_of_sight = total  # nothing else has power
     delay = np.full(len(diffuse), np.nan) if spectrum.delay_s is None else spectrum.delay_s[row, column]
     aod = np.full((len(diffuse), 2), np.nan) if spectrum.aod is None else spectrum.aod[row, column]
-    parts = [diffuse, delay, toward[row, column], aod, view.points[row, column], ["diffuse"] * len(diffuse)]
+    kinds = ["diffuse"] * len(diffuse)
+    parts: list[Any] = [diffuse, delay, toward[row, column], aod, view.points[row, column], kinds]
     if line_of_sight > 0:
         departure = np.stack(angles_from_directions(outward[None]), axis=-1)
         flight, nowhere = distance / SPEED_OF_LIGHT, np.full((1, 3), np.nan)
-        direct = [[line_of_sight], [flight], -outward[None], departure, nowhere, ["los"]]
+        direct: list[Any] = [[line_of_sight], [flight], -outward[None], departure, nowhere, ["los"]]
         parts = [np.concatenate(pair) for pair in zip(parts, direct, strict=True)]
     amplitude = np.sqrt(parts[0])
     order = np.argsort(-amplitude, kind="stable")[:max_paths]
