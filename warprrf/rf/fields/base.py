@@ -134,9 +134,7 @@ class RadioField(ABC):
             ValueError: if it is corrupt, or no radio field (of this model).
         """
         tensors, header = tensor_files.read(path)
-        found = cls.models[
-            "bistatic" if header.get("model") == "bistatic" else "rf3dgs+"
-        ]  # which reads rf3dgs too
+        found = cls.models.get(str(header.get("model")), cls.models["rf3dgs+"])
         if not issubclass(found, cls):
             raise ValueError(f"{os.fspath(path)}: holds a {found.__name__}, expected a {cls.__name__}")
         with tensor_files.named(path, "corrupt, or no radio field of this version"):
@@ -427,11 +425,7 @@ class RadioField(ABC):
         ends = self.check_positions(receivers, transmitter)
         rows, found = np.zeros(0, int), []
         for source, own in ends.groups():
-            tell = (
-                None
-                if progress is None
-                else partial(_progress_after, progress, len(rows), len(ends.receivers))
-            )
+            tell = progress and partial(_progress_after, progress, len(rows), len(ends.receivers))
             options = LinkOptions(beam_sigma_rad, shape, mirror_order, client, tell)
             found.append(self.trace_links(ends.receivers[own], source, options))
             rows = np.concatenate([rows, own])
