@@ -321,15 +321,20 @@ def _number(entry: object, key: str, where: str) -> float:
     return check_number(f"{where}: {key!r}", _mapping(entry, where).get(key))
 
 
+def _band(row: Any, where: str) -> Band:
+    ends = (1e9 * _number(row, key, where) for key in ("low_ghz", "high_ghz"))
+    law = (_number(row, key, where) for key in "abcd")
+    return Band(*ends, *law, source=str(row.get("source", "assumed")))
+
+
 def _material(entry: object, where: str) -> Material:
     entry = _mapping(entry, where)
     name = entry.get("name")
     if not isinstance(name, str):
         raise ValueError(f"{where} has no 'name'")
     where = f"{where}, material {name!r}"
-    for key in ("permittivity", "thickness_m", "pattern"):
-        if key not in entry:
-            raise ValueError(f"{where} has no {key!r}")
+    if lacking := [key for key in ("permittivity", "thickness_m", "pattern") if key not in entry]:
+        raise ValueError(f"{where} has no {lacking[0]!r}")
     if "roughness_m" not in entry and "scattering" not in entry:
         raise ValueError(f"{where} has neither 'roughness_m' nor 'scattering', expected one of them")
     if not isinstance(entry["permittivity"], list) or not entry["permittivity"]:
@@ -340,30 +345,16 @@ def _material(entry: object, where: str) -> Material:
     if not isinstance(reciprocal, bool):
         raise ValueError(f"{where}: 'reciprocal' is {reciprocal!r}, expected true or false")
     try:
-        bands = tuple(
-            Band(
-                low_hz=_number(row, "low_ghz", where) * 1e9,
-                high_hz=_number(row, "high_ghz", where) * 1e9,
-                a=_number(row, "a", where),
-                b=_number(row, "b", where),
-                c=_number(row, "c", where),
-                d=_number(row, "d", where),
-                source=str(row.get("source", "assumed")),
-            )
-            for row in entry["permittivity"]
-        )
+        numbers: Any = {key: _number(part, "value", where) for key, part in parts.items() if key != "pattern"}
         return Material(
             name=name,
-            bands=bands,
-            thickness_m=_number(parts["thickness_m"], "value", where),
-            roughness_m=_number(parts["roughness_m"], "value", where) if "roughness_m" in parts else 0.0,
-            scattering=_number(parts["scattering"], "value", where) if "scattering" in parts else None,
+            bands=tuple(_band(row, where) for row in entry["permittivity"]),
             pattern=str(parts["pattern"].get("value")),
             alpha_r=alpha_r,
             itu=entry.get("itu"),
             sources={key: str(part.get("source", "assumed")) for key, part in parts.items()},
             reciprocal=reciprocal,
-            xpd=_number(parts["xpd"], "value", where) if "xpd" in parts else 0.0,
+            **numbers,
         )
     except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: {error}") from error
