@@ -715,16 +715,15 @@ class Unexplained:
 
 def unexplained(t: Training, model: Model) -> Unexplained:
     """What ``model`` cannot explain."""
-    rows, left = [], dict[str, list[float]]()
-    predicted = t.predicted(model, range(len(t.observations)))
-    for o, power in zip(t.observations, predicted, strict=True):
-        wrong, target = np.zeros(0, int), o.target
-        if isinstance(o.measured, WeighedPaths) and target.trust is not None and target.censored is not None:
+    rows, left = [np.zeros(0, int) for _ in t.observations], dict[str, list[float]]()
+    tables = [k for k, o in enumerate(t.observations) if isinstance(o.measured, WeighedPaths)]
+    for k, power in zip(tables, t.predicted(model, tables), strict=True):
+        o, target = t.observations[k], t.observations[k].target
+        if target.trust is not None and target.censored is not None:
             error = target.error(power)
-            wrong = np.flatnonzero(np.abs(error) > UNEXPLAINED * NOISE_DB)
+            rows[k] = np.flatnonzero(np.abs(error) > UNEXPLAINED * NOISE_DB)
             clear = ~target.censored & (target.db > CLEAR_DB)
             left.setdefault(t.names[o.place.data], []).extend((error / target.trust)[clear])
-        rows.append(wrong)
     noise = {
         name: NORMAL_MEDIAN * float(np.median(np.abs(errors))) for name, errors in left.items() if errors
     }
