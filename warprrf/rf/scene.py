@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,7 +22,7 @@ from warprrf.geometry.mesh_files import MeshOptions, is_mesh_file
 from warprrf.rf.em.materials import Material
 from warprrf.rf.positions import is_free
 from warprrf.rf.scene_parts import MaterialChoice, Materials, ScenePart, read_mesh_scene
-from warprrf.rf.scene_sionna import SIONNA_FREQUENCY_HZ, parts_of, to_sionna_scene
+from warprrf.rf.scene_sionna import parts_of, to_sionna_scene
 from warprrf.rf.scene_xml import read_scene_xml
 
 T = TypeVar("T")
@@ -130,7 +131,7 @@ class Scene:
         if is_mesh_file(path):
             found = read_mesh_scene(path, choice, MeshOptions(unit, up, simplify, allow_outside))
             choice.check_used()
-            return cls(**vars(found))
+            return cls(**found)
         if (unit, up, simplify) != (None, None, None):
             raise ValueError(f"unit, up, simplify: {path} is no mesh file; its units are metres, z up")
         parts = read_scene_xml(path, choice, allow_outside=allow_outside)
@@ -178,7 +179,7 @@ class Scene:
             **options,
         )
 
-    def to_sionna(self, *, frequency_hz: float = SIONNA_FREQUENCY_HZ) -> Any:
+    def to_sionna(self, *, frequency_hz: float = 3.5e9) -> Any:
         """The scene as a ``sionna.rt.Scene``, with scattering patterns, transmitters and receivers.
 
         Objects keep their names (with ``_`` for ``.``) and are not merged; one of several materials becomes one object
@@ -220,16 +221,9 @@ class Scene:
         materials = _named_list("materials", materials, Material)
         if len(materials) != len(self.materials):
             raise ValueError(f"materials: got {len(materials)}, expected {len(self.materials)}, one for each")
-        return Scene(
-            self.mesh,
-            materials,
-            self.face_material,
-            face_object=self.face_object,
-            object_names=self.object_names,
-            xml_path=self.xml_path,
-            transmitters=self.transmitters,
-            receivers=self.receivers,
-        )
+        other = copy(self)
+        other.materials = materials
+        return other
 
     @property
     def bounds(self) -> np.ndarray:

@@ -27,14 +27,6 @@ from warprrf.rf.em.materials import Band, Material, itu_material
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.scene_parts import MaterialChoice, ScenePart
 
-SIONNA_FREQUENCY_HZ = 3.5e9  # that a scene of Sionna RT has before it is set
-
-NARROWEST_SIONNA_LOBE = 127
-"""Largest exponent of a lobe that Sionna RT can normalise: it divides by 2^alpha_r in single precision."""
-
-MIN_LLVM = 17
-"""Oldest LLVM whose code generator has what Dr.Jit 1.5 asks for ("Cannot select ... fminimum" before)."""
-
 _FOLDERS = (
     "/usr/lib/x86_64-linux-gnu",
     "/usr/lib/aarch64-linux-gnu",
@@ -182,10 +174,12 @@ def to_sionna_scene(
 def _radio_material(rt: Any, material: Material, name: str, frequency: float) -> Any:
     """Sionna's material of ours at this frequency."""
     directive = material.pattern == "directive"
-    if directive and material.alpha_r > NARROWEST_SIONNA_LOBE:
+    # Largest exponent of a lobe that Sionna RT can normalise: it divides by 2^alpha_r in single precision
+    narrowest_sionna_lobe = 127
+    if directive and material.alpha_r > narrowest_sionna_lobe:
         raise ValueError(
             f"material {material.name!r}: alpha_r is {material.alpha_r}, but in Sionna's single precision a lobe of more "
-            f'than {NARROWEST_SIONNA_LOBE} scatters nothing; take engine="exact" or a wider lobe'
+            f'than {narrowest_sionna_lobe} scatters nothing; take engine="exact" or a wider lobe'
         )
     if not np.isfinite(material.thickness_m):
         raise ValueError(
@@ -246,14 +240,16 @@ def select_llvm() -> Path | None:
     if chosen:
         return Path(chosen)
     found = installed_llvm()
-    usable = [version for version in found if version >= MIN_LLVM]
+    # Oldest LLVM whose code generator has what Dr.Jit 1.5 asks for ("Cannot select ... fminimum" before)
+    min_llvm = 17
+    usable = [version for version in found if version >= min_llvm]
     if usable:
         os.environ["DRJIT_LIBLLVM_PATH"] = str(found[max(usable)])
         return found[max(usable)]
     if found:
         versions = ", ".join(str(v) for v in sorted(found))
         raise ImportError(
-            f"Dr.Jit needs LLVM {MIN_LLVM} or newer, but only {versions} is installed and would abort the process: "
+            f"Dr.Jit needs LLVM {min_llvm} or newer, but only {versions} is installed and would abort the process: "
             "apt-get install libllvm19 (Debian, Ubuntu), or set DRJIT_LIBLLVM_PATH"
         )
     return None

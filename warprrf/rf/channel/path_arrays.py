@@ -238,14 +238,17 @@ class PathArrays:
         kind: NDArray[np.str_],
         frequency_hz: float,
         jones: np.ndarray | None = None,
+        excess_m: np.ndarray | float = 0.0,
     ) -> Self:
-        """:meth:`from_points` of arrays that fit each other; ``jones`` (L, 2, 2) is complex, before exp(-j 2 pi f tau) too."""
+        """:meth:`from_points` of arrays that fit each other; ``jones`` (L, 2, 2) is complex, before exp(-j 2 pi f tau) too;
+        slabs make paths longer than they are by ``excess_m`` (L,)."""
         count, depth = vertices.shape[:2]
         bounces = np.isfinite(vertices[..., 0]).sum(axis=1)
         points = points_along(transmitter, vertices, receiver)
         each = np.arange(count)
         steps = np.linalg.norm(np.diff(points, axis=1), axis=2)
-        tau = np.where(np.arange(depth + 1) <= bounces[:, None], steps, 0.0).sum(axis=1) / SPEED_OF_LIGHT
+        length = np.where(np.arange(depth + 1) <= bounces[:, None], steps, 0.0).sum(axis=1)
+        tau = (length + excess_m) / SPEED_OF_LIGHT
         theta_r, phi_r = angles_from_directions(points[each, bounces] - receiver)
         theta_t, phi_t = angles_from_directions(points[:, 1] - transmitter)
         turned = carrier_phase(frequency_hz, tau)

@@ -22,9 +22,6 @@ from warprrf.files import write_arrays, write_text
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.scene import Scene
 
-REFLECTION, SCATTERING = 1, 3
-"""DeepMIMO's codes of interactions; a path's code is the string of its digits, 0 for line of sight."""
-
 _VERSION = "4.0.5"  # of the format
 _FORBIDDEN = set('/\\:*?"<>|\n') | {"'"}
 
@@ -141,9 +138,11 @@ def _matrices(paths: Paths, coefficient: np.ndarray, max_paths: int | None) -> d
 
     deep = max(1, int(bounces.max(initial=0)))
     index = order[:, :, None, None]
-    # Codes read from the transmitter: a diffuse path scatters last.
+    # A path's code is the string of its interactions' digits, 0 for line of sight, read from the transmitter: a diffuse
+    # path scatters last.
+    reflection, scattering = 1, 3
     ones = (10.0**bounces - 1.0) / 9.0
-    codes = ones + np.where((paths.kind == "diffuse") & (bounces > 0), SCATTERING - REFLECTION, 0)
+    codes = ones + np.where((paths.kind == "diffuse") & (bounces > 0), scattering - reflection, 0)
     return {
         "rx_pos": np.asarray(paths.receiver, dtype=np.float32).reshape(-1, 3),
         "tx_pos": np.asarray(paths.transmitter, dtype=np.float32).reshape(1, 3),

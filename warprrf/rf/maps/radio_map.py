@@ -15,7 +15,7 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf import netcdf_files
-from warprrf.checks import check_array, check_number, check_positive, checked
+from warprrf.checks import check_array, check_choice, check_number, check_positive, checked
 from warprrf.files import write_bytes
 from warprrf.geometry.mesh import Mesh
 from warprrf.netcdf_files import Variable
@@ -27,10 +27,6 @@ from warprrf.rf.positions import (
     ground_height,
     is_free,
 )
-
-BOLTZMANN = 1.380649e-23  # SI [J/K]
-ROOM_TEMPERATURE_K = 290.0  # at which noise figures are stated (ITU-R P.372)
-MOST_CELLS = 2_000_000
 
 _FORMAT = "warprrf radio map 1"
 _LAYERS = {
@@ -140,8 +136,7 @@ class RadioMap:
         Raises:
             ValueError: for a quantity that is not one of :data:`QUANTITIES`.
         """
-        if quantity not in QUANTITIES:
-            raise ValueError(f"quantity: got {quantity!r}, expected one of {', '.join(QUANTITIES)}")
+        check_choice("quantity", quantity, QUANTITIES)
         value = np.asarray(getattr(self, quantity))
         if quantity == "delay_spread_s":
             return value * 1e9
@@ -267,7 +262,9 @@ class MapOptions(LinkOptions):
     @property
     def noise_power_dbm(self) -> float:
         """Of the receiver, k T B F [dBm]."""
-        noise_w = BOLTZMANN * ROOM_TEMPERATURE_K * self.bandwidth_hz
+        boltzmann = 1.380649e-23  # SI [J/K]
+        room_temperature_k = 290.0  # at which noise figures are stated (ITU-R P.372)
+        noise_w = boltzmann * room_temperature_k * self.bandwidth_hz
         return float(10.0 * np.log10(noise_w) + 30.0 + self.noise_figure_db)
 
 
@@ -364,9 +361,10 @@ def _centres(mesh: Mesh, cell: float, bounds: Any) -> tuple[np.ndarray, np.ndarr
     if not (low < high).all():
         raise ValueError(f"bounds: got {bounds!r}, expected lowest x and y, then higher x and y")
     counts = np.maximum(np.ceil((high - low) / cell - 1e-6), 1.0)
-    if counts.prod() > MOST_CELLS:
+    most_cells = 2_000_000
+    if counts.prod() > most_cells:
         raise ValueError(
-            f"cell: got {cell!r} m, which makes {counts.prod():.0f} cells; expected at most {MOST_CELLS}: give wider "
+            f"cell: got {cell!r} m, which makes {counts.prod():.0f} cells; expected at most {most_cells}: give wider "
             "cells, or bounds of a part"
         )
     x, y = (start + cell * (np.arange(int(n)) + 0.5) for start, n in zip(low, counts, strict=True))

@@ -11,8 +11,6 @@ from warprrf.cache import Cache, cached_property
 from warprrf.device import DeviceLike
 from warprrf.rf.spectra.spectrum import spread, sub_pixel_directions
 
-EVEN_SUB_PIXELS = 4  # square root of the directions that stand for a whole pixel's even power
-
 
 class BeamOperator:
     """The receiver beam as a linear map of images: a pixel's power, even over the pixel, spread over the grid.
@@ -23,7 +21,8 @@ class BeamOperator:
 
     def __init__(self, shape: tuple[int, int], sigma: float, *, device: DeviceLike = None) -> None:
         rows, columns = self.shape = shape
-        directions = sub_pixel_directions(shape, EVEN_SUB_PIXELS)[0].reshape(rows, columns, -1, 3)[:, 0]
+        even_sub_pixels = 4  # square root of the directions that stand for a whole pixel's even power
+        directions = sub_pixel_directions(shape, even_sub_pixels)[0].reshape(rows, columns, -1, 3)[:, 0]
         even = np.full(directions.shape[1], 1.0 / directions.shape[1])
         # what row i of column 0 gives to each pixel, shape (row, column, i)
         self._kernel = np.stack([spread(d, even, shape, sigma, device=device) for d in directions], axis=-1)

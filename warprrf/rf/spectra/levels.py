@@ -20,7 +20,6 @@ MARGIN_DB = 18.0
 give 16.4 dB, two in a furnished room of them 10.3 dB, a lobby of building materials 3.9 dB."""
 FADING_DB = 10.0
 """By how much a power at one place may exceed the mean of its fading: 1 in 20,000 does, if it is Rayleigh's."""
-_FAINT_DB = 150.0  # below line of sight nothing is measured
 
 
 def free_space_gain(transmitters: np.ndarray, receivers: np.ndarray, frequency_hz: float) -> np.ndarray:
@@ -83,5 +82,6 @@ def _likely_unit(level_db: np.ndarray, line_of_sight_db: np.ndarray) -> str:
             "decibels, their minus signs lost, given as linear": -(10.0 ** (level_db / 10.0)),
         }
     away = {unit: float(np.nanmax(db - line_of_sight_db, initial=-np.inf)) for unit, db in readings.items()}
-    fits = {unit: abs(excess) for unit, excess in away.items() if -_FAINT_DB < excess <= MARGIN_DB}
+    faint_db = 150.0  # below line of sight nothing is measured
+    fits = {unit: abs(excess) for unit, excess in away.items() if -faint_db < excess <= MARGIN_DB}
     return f"; they look like {min(fits, key=lambda unit: fits[unit])}" if fits else ""

@@ -24,7 +24,9 @@ from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh, components, smoot
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.scans import is_scan, scanned_patches
 from warprrf.geometry.splats.gaussians import gaussians_of
-from warprrf.rf.em.materials import is_name_alone
+from warprrf.rf.em.materials import is_name_alone, itu_material, itu_name
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.paths.slabs import Walls
 from warprrf.rf.tracing.colours import Colours, colour_groups
 from warprrf.rf.tracing.shapes import SHAPES, shape_groups
 
@@ -39,6 +41,10 @@ LARGEST_FACE = 1.2  # elements' widths; longer edges are split, so that elements
 MIN_MIRROR_M2 = 0.05  # smaller patches reflect too little to search for
 POSITION_ERROR_M = 0.02  # of a reconstructed surface: shadow rays end so far before it
 TRUE_ERROR_M = 1e-4
+LOSSY = 4.0 * (1.0 - 0.06j)
+"""Permittivity of walls of unknown material: the loss tangent of plasterboard and wood at 300 GHz (ITU-R P.2040-4, table 3)."""
+ASSUMED_THICKNESS_M = 0.0125  # of walls of unknown thickness: a plasterboard
+MOST_ABSORBED = 30.0  # nepers
 _UNIT = Expected("F 3", -1.001, 1.001)
 ARRAYS = {
     "normal": _UNIT,
@@ -229,6 +235,36 @@ class Surface:
             return flat, wp.array(self.normal, dtype=wp.types.vector(3, real), device=where)
 
         return self._uploaded.get((str(where), real), upload)
+
+    def slabs(self, frequency_hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What each group lets through before any measurement: complex permittivity by the name of its material (ITU-R P.2040-4),
+        0 where that or the thickness is not known; thickness in wavelengths; and, where it is not known, ln of the share of
+        power that is not absorbed, by an assumed one, else 0; shape ``(G,)`` each."""
+        known = [itu_name(name) for name in self.group_names]
+        eta = np.array(
+            [
+                LOSSY if name is None else itu_material(name).extrapolated().permittivity(frequency_hz)
+                for name in known
+            ]
+        )
+        wavelength_m, named = SPEED_OF_LIGHT / frequency_hz, np.array([name is not None for name in known])
+        known_slab = named & ~np.isnan(self.thickness_m)
+        thickness = np.where(np.isnan(self.thickness_m), ASSUMED_THICKNESS_M, self.thickness_m) / wavelength_m
+        absorbed = 4.0 * np.pi * thickness * np.sqrt(eta).imag
+        return (
+            np.where(known_slab, eta, 0.0),
+            thickness,
+            np.where(known_slab, 0.0, np.maximum(absorbed, -MOST_ABSORBED)),
+        )
+
+    def walls(self, frequency_hz: float, most: int, device: DeviceLike = None) -> Walls:
+        """Its faces that may be passed, as far as :meth:`slabs` tells, up to ``most`` on one way."""
+        eta, thickness, absorbed = self.slabs(frequency_hz)
+        wavelength_m, known = SPEED_OF_LIGHT / frequency_hz, np.abs(eta) > 0
+        permittivity = np.where(known, eta, 1.0 - 0.5j * absorbed / (2.0 * np.pi * thickness))[self.group]
+        return Walls.of_slabs(
+            self.mesh, permittivity, (wavelength_m * thickness)[self.group], wavelength_m, most, self.position_error_m, device
+        )  # fmt: skip
 
     @cached_property
     def patches(self) -> PlanarPatches:

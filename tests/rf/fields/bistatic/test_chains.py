@@ -8,6 +8,7 @@ from furnished import RECEIVERS, ROOM, TX, F, spectra
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths
 
 from warprrf.geometry.mesh import Mesh
+from warprrf.kernels.radio.records import MIRROR
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.paths.trace import MirrorTracer
@@ -40,8 +41,8 @@ def reflected(excess: np.ndarray, cosine: np.ndarray, turn: np.ndarray) -> np.nd
     none = np.zeros(excess.size)
     p = Parameters(none[:, None], np.log(np.where(excess > 0, excess, 1.0)).ravel(), none, (0,))
     angle = np.stack([cosine, turn, 0.0 * turn], axis=2)
-    ones, mirrors = np.ones(len(excess)), excess.shape[1]
-    return Records(ones, np.arange(len(excess)), index, angle, mirrors).powers(Evaluation(p))
+    kind = np.full((1, excess.shape[1]), MIRROR, np.int32)
+    return Records(np.ones(len(excess)), np.arange(len(excess)), index, angle, kind).powers(Evaluation(p))
 
 
 @pytest.mark.usefixtures("device")

@@ -156,7 +156,7 @@ def test_errors_of_a_fit_have_the_slopes_of_differences(
 def taped(records: Records, materials: Evaluation) -> np.ndarray:
     """What a row of a Jacobian is, of the sum of all powers, by Warp's tape."""
     table, m, _ = records._table(materials)
-    given = [wp.clone(array, requires_grad=True) for array in (m.weight, m.excess, m.mirror)]
+    given = [wp.clone(array, requires_grad=True) for array in (m.weight, m.excess, m.mirror, m.through)]
     power = wp.empty(len(records), dtype=wp.float64, requires_grad=True)
     with wp.Tape() as tape:
         kernel = build(wp.float64).record_power
@@ -176,7 +176,7 @@ def test_slopes_of_records_of_every_sequence_are_those_of_differences(
     view, side = field.view(RX), field.surface.side_group
     got = irradiance(view.tracer, field.parameters, EVERYTHING)
     groups, lobes = field.parameters.log_weight.shape
-    layout = Layout(groups, lobes)
+    layout = Layout(groups, lobes, through=True)
     x = layout.pack(field.parameters) + np.random.default_rng(1).normal(0.0, 0.3, layout.size)
 
     def materials(x: np.ndarray) -> Evaluation:

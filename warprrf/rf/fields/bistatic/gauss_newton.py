@@ -30,8 +30,9 @@ from warprrf.rf.tracing.model import ROUGHNESS, Effects, Layout, Model, Paramete
 from warprrf.rf.tracing.records import Evaluation
 from warprrf.rf.tracing.render import evaluation
 
-WEIGHT, EXCESS, MIRROR = 2.0, 0.8, 1.5
-"""Standard deviations a priori of lobe weights, permittivity less one and mirrored share from where a fit starts [nepers]."""
+WEIGHT, EXCESS, MIRROR, THROUGH = 2.0, 0.8, 1.5, 1.5
+"""Standard deviations a priori of lobe weights, permittivity less one, mirrored share and share let through from where a fit
+starts [nepers]."""
 ENERGY = 0.25
 """That of scattered and mirrored shares from a sum of one."""
 GAIN, CHAIN = 1.0, 10.0
@@ -97,8 +98,9 @@ class Problem:
         for o, columns in zip(self.observations, self.by_materials, strict=True):
             if o.ratio not in known:
                 known[o.ratio] = Evaluation(
-                    p.at_ratio(o.ratio), self.material, device=o.view.tracer.grid.device
-                )
+                    p.at_ratio(o.ratio), self.material, slabs=o.view.tracer.slabs(self.effects.transmissions),
+                    device=o.view.tracer.grid.device,
+                )  # fmt: skip
             here = known[o.ratio].parameters
             power = here.gain * (columns.power(here) + o.direct(self.effects, known[o.ratio]))
             yield o, columns, known[o.ratio], power
@@ -166,7 +168,8 @@ def layout_of(problem: Problem, start: Parameters) -> Layout:
     """What is free."""
     carriers = {o.ratio for o in problem.observations}
     return Layout(
-        *start.log_weight.shape, gain=problem.gain_offset, roughness=bool(carriers - {1.0}), chains=len(start.log_gains)
+        *start.log_weight.shape, through=problem.effects.transmissions > 0, gain=problem.gain_offset,
+        roughness=bool(carriers - {1.0}), chains=len(start.log_gains),
     )  # fmt: skip
 
 
@@ -185,6 +188,8 @@ def priors(p: Parameters, start: Parameters, layout: Layout, energy: float) -> t
         add((p.log_weight[:, j] - start.log_weight[:, j]) / WEIGHT, places, 1.0 / WEIGHT)
     add((p.log_excess - start.log_excess) / EXCESS, layout.excess(own), 1.0 / EXCESS)
     add((p.log_mirror - start.log_mirror) / MIRROR, layout.mirror(own), 1.0 / MIRROR)
+    if layout.through:
+        add((p.log_through - start.log_through) / THROUGH, layout.passage(own), 1.0 / THROUGH)
     if layout.gain:
         add(np.array([p.log_gain / GAIN]), np.array([layout.common_gain]), 1.0 / GAIN)
     if layout.roughness:

@@ -23,12 +23,6 @@ from warprrf.kernels.radio import opacity as _kernels
 from warprrf.rf.fields.harmonic.problem import Problem
 from warprrf.rf.fields.harmonic.transport import Transport, cutoffs
 
-THINNED = 0.5  # of each opacity, while lists are made
-LISTED = 32  # Gaussians kept per pixel
-THINNED_LEFT = 1e-4  # transmittance at which a thinned list ends: float32 weights give alpha to 0.1 % there
-RATE = 0.05  # Adam rate of the logits, as RF-3DGS publishes it
-LEAST, MOST = 1e-4, 1 - 1e-6  # opacities that logits are made of
-
 
 @dataclass(frozen=True)
 class Listed:
@@ -58,7 +52,7 @@ def list_responses(
     seen: Transport,
     range_db: tuple[float, float],
     *,
-    top_k: int = LISTED,
+    top_k: int = 32,
     device: DeviceLike = None,
     progress: Progress | None = None,
 ) -> Listed:
@@ -71,8 +65,12 @@ def list_responses(
         top_k: Gaussians kept per pixel, those of largest thinned weight.
     """
     rules = cutoffs(range_db)
-    thin = replace(gaussians, opacities=(THINNED * gaussians.opacities).astype(np.float32))
-    blending = Blending(THINNED * rules.alpha_min, rules.alpha_max, THINNED_LEFT, "product")
+    share = 0.5  # of each opacity
+    thin = replace(gaussians, opacities=(share * gaussians.opacities).astype(np.float32))
+    thinned_left = (
+        1e-4  # transmittance at which a thinned list ends: float32 weights give alpha to 0.1 % there
+    )
+    blending = Blending(share * rules.alpha_min, rules.alpha_max, thinned_left, "product")
     counts, indices, responses = [], [], []
     rows, columns = seen.shape
     for k, receiver in enumerate(seen.receivers):
@@ -118,7 +116,9 @@ class OpacityTraining:
     ) -> None:
         self.problem, self.kernels = problem, _kernels.build(problem.real)
         self.alpha_max = problem.real(listed.alpha_max)
-        first = np.clip(np.asarray(opacities, np.float64)[problem.seen], LEAST, MOST)
+        limits = np.array([1e-4, 1 - 1e-6])  # opacities that logits are made of
+        self._limits = np.log(limits / (1 - limits))
+        first = np.clip(np.asarray(opacities, np.float64)[problem.seen], *limits)
         self.state = np.stack([np.log(first / (1 - first)), np.zeros_like(first), np.zeros_like(first)])
         if state is not None:
             self.state = np.array(state, np.float64)
@@ -169,6 +169,5 @@ class OpacityTraining:
         first = FIRST_DECAY * first + (1 - FIRST_DECAY) * slope
         second = SECOND_DECAY * second + (1 - SECOND_DECAY) * slope**2
         logits = logits - rate * unbias1 * first / (np.sqrt(unbias2 * second) + EPSILON)
-        low, high = np.log(LEAST / (1 - LEAST)), np.log(MOST / (1 - MOST))
-        self.state = np.stack([np.clip(logits, low, high), first, second])
+        self.state = np.stack([np.clip(logits, *self._limits), first, second])
         self._opacity = self.problem.upload(self.opacities)

@@ -31,8 +31,6 @@ from warprrf.rf.spectra.spectrum import check_shape, pixel_directions
 
 TRANSMITTANCE = ("product", "exp")
 TOP_K = 16  # Gaussians kept per pixel
-ALPHA_MIN = 1e-3  # a fainter layer changes what lies behind it by less than 0.005 dB
-MIN_WEIGHT = 1e-4  # smaller shares of a pixel's weight are given to the others: 0.0004 dB
 
 
 @dataclass(frozen=True)
@@ -111,11 +109,11 @@ def cutoffs(range_db: tuple[float, float], rule: str = "product") -> Blending:
     """How to blend for images that span ``range_db`` (lowest, highest) [dB].
 
     A wall may leak no more than the floor of the range, and blending stops when no more than that is left. An alpha
-    below :data:`ALPHA_MIN` is left out.
+    below 1e-3 is left out: it changes what lies behind it by less than 0.005 dB.
     """
     depth = 10 ** (-(float(range_db[1]) - float(range_db[0])) / 10)
     leak = min(max(depth, 1e-6), 1e-2)
-    return Blending(alpha_min=ALPHA_MIN, alpha_max=1.0 - leak, transmittance_min=leak, rule=rule)
+    return Blending(alpha_min=1e-3, alpha_max=1.0 - leak, transmittance_min=leak, rule=rule)
 
 
 def transport(
@@ -173,7 +171,8 @@ def _kept(seen: BlendWeights) -> tuple[np.ndarray, ...]:
     weight, index = np.asarray(seen.weight, dtype=np.float64), np.asarray(seen.index)
     listed = (index >= 0) & (weight > 0)
     total = np.sum(weight, axis=-1, where=listed, initial=0.0)
-    keep = listed & (weight > MIN_WEIGHT * total[..., None])
+    min_weight = 1e-4  # smaller shares of a pixel's weight are given to the others: 0.0004 dB
+    keep = listed & (weight > min_weight * total[..., None])
     kept = np.sum(weight, axis=-1, where=keep, initial=0.0)
     scale = np.divide(
         total + np.asarray(seen.dropped, np.float64), kept, out=np.zeros_like(kept), where=kept > 0
