@@ -21,6 +21,7 @@ edge ("soft": zero on a conductor), p that of the magnetic field along it ("hard
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -125,7 +126,7 @@ def boundary_fields(rays: EdgeRays) -> np.ndarray:
 
 
 def diffraction_matrices(
-    rays: EdgeRays, reflected: tuple[Pair, Pair], through: tuple[Pair, Pair] | None = None
+    rays: EdgeRays, reflected: Sequence[Pair], through: Sequence[Pair] | None = None
 ) -> np.ndarray:
     """What an edge makes of a field: matrices ``(..., 2, 2)`` from (b, p) of the incident to that of the diffracted ray.
 
@@ -142,7 +143,7 @@ def diffraction_matrices(
     result = np.zeros((*terms.shape[1:], 2, 2), complex)
     for k in range(2):
         turned, crossed = _turned(slants[k], cosine)
-        passed = (0.0, 0.0) if through is None else through[k]
+        passed = (np.zeros(()), np.zeros(())) if through is None else through[k]
         mean, half = 0.5 * (passed[0] + passed[1]), 0.5 * (passed[0] - passed[1])
         result[..., 0, 0] += terms[k] * (1.0 - mean - half * turned)
         result[..., 1, 1] += terms[k] * (1.0 - mean + half * turned)

@@ -20,6 +20,7 @@ from warprrf.device import Progress
 from warprrf.geometry.edges import Edges, mesh_edges
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
 from warprrf.geometry.planar_patches import PlanarPatches
+from warprrf.rf.channel.path_arrays import EDGE, MIRROR
 from warprrf.rf.em.diffraction import EdgeRays, Pair, boundary_fields, diffraction_matrices
 from warprrf.rf.em.fresnel import SurfaceTable, slab_reflection
 from warprrf.rf.paths.images import EdgeLeaves, MirrorImages
@@ -29,8 +30,6 @@ from warprrf.rf.spectra.spectrum import transverse_basis
 
 LEAST_DB = -80.0
 """Paths that are weaker than this, over an unobstructed straight path between the ends, are left out [dB]."""
-MIRROR, EDGE = 1, 8
-"""Codes of interactions, Sionna RT's."""
 
 Through = Callable[[np.ndarray, np.ndarray], Pair]
 """Transmission (TE, TM) of sheets: of materials ``(L,)`` (indices) at cosines of incidence ``(L,)``."""
@@ -53,7 +52,8 @@ class EdgePaths:
         matrix: From the field along the zenith and azimuth unit vectors of departure to that along those of arrival, complex,
             shape ``(L, 2, 2)``: times the wavelength over 4 pi length, and the phase of the length, it is the Jones matrix.
             Conductors without polarisation (a bare mesh) have one number, the "hard" coefficient, on its diagonal.
-        power: Path gain [linear], shape ``(L,)``: half the squared Frobenius norm, spreading included.
+        amplitude: Its modulus squared is the path gain, half the squared Frobenius norm, spreading included; its phase that of
+            the field along the edge, of TE at a mirror, of the one number where there is one. Complex, shape ``(L,)``.
     """
 
     receiver: np.ndarray
@@ -66,7 +66,12 @@ class EdgePaths:
     departure: np.ndarray
     arrival: np.ndarray
     matrix: np.ndarray
-    power: np.ndarray
+    amplitude: np.ndarray
+
+    @property
+    def power(self) -> np.ndarray:
+        """Path gain [linear], shape ``(L,)``."""
+        return np.abs(self.amplitude) ** 2
 
     def __len__(self) -> int:
         return len(self.receiver)
@@ -191,7 +196,8 @@ class EdgeFinder:
     def _rays(self, ways: _Ways) -> EdgeRays:
         e = ways.edge
         cosine = (ways.direction[:, 0] * self.edges.along[e]).sum(axis=1)
-        return EdgeRays(self.edges.n[e], *ways.angle.T, cosine, *ways.leg.T, self.wavelength_m)
+        angle, leg = ways.angle.T, ways.leg.T
+        return EdgeRays(self.edges.n[e], angle[0], angle[1], cosine, leg[0], leg[1], self.wavelength_m)
 
     def _reflection(self, patch: np.ndarray, cosine: np.ndarray) -> Pair:
         """TE and TM of mirrors and faces of the patches ``(L,)``."""
@@ -207,17 +213,15 @@ class EdgeFinder:
     def _described(self, ways: _Ways, receiver: np.ndarray) -> EdgePaths:
         edges, patches, rays = self.edges.take(ways.edge), self.images.patches, self._rays(ways)
         faces, cosines = patches.face_patch[edges.face], rays.incidence_cosines()
-        reflected = tuple(self._reflection(faces[:, j], cosines[2 + j]) for j in range(2))
+        reflected = [self._reflection(faces[:, j], cosines[2 + j]) for j in range(2)]
         through = None
         if self.through is not None:
-            open_ = edges.n > 1.99  # a sheet's border
-            through = tuple(
-                tuple(np.where(open_, t, 0.0) for t in self.through(patches.group[faces[:, j]], cosines[j]))
-                for j in range(2)
-            )
+            ends = edges.n > 1.99  # of sheets
+            passed = [self.through(patches.group[faces[:, j]], cosines[j]) for j in range(2)]
+            through = [(np.where(ends, te, 0.0), np.where(ends, tm, 0.0)) for te, tm in passed]
         bent = diffraction_matrices(rays, reflected, through)
-        ends = [_edge_basis(edges.along, ways.direction[:, j]) for j in range(2)]
-        field = np.swapaxes(ends[1], 1, 2) @ bent @ ends[0]
+        before, behind = (_edge_basis(edges.along, ways.direction[:, j]) for j in range(2))
+        field, sign = np.swapaxes(behind, 1, 2) @ bent @ before, bent[:, 0, 0].copy()
         outer = ways.direction.copy()
         for j in range(2):
             own = np.flatnonzero(ways.patch[:, j] >= 0)
@@ -225,6 +229,7 @@ class EdgeFinder:
             cosine = (inner * normal).sum(axis=1)
             outer[own, j] = inner - 2.0 * cosine[:, None] * normal
             te, tm = self._reflection(ways.patch[own, j], np.abs(cosine))
+            sign[own] *= te
             if j == 0:
                 field[own] = field[own] @ _mirror(normal, outer[own, 0], inner, te, tm)
             else:
@@ -232,13 +237,15 @@ class EdgeFinder:
         departure, arrival, length = outer[:, 0], -outer[:, 1], ways.leg.sum(axis=1)
         matrix = transverse_basis(arrival) @ field @ np.swapaxes(transverse_basis(departure), 1, 2)
         if self.table is None:
-            matrix = bent[:, 1, 1, None, None] * np.eye(2)
-        friis = self.wavelength_m / (4.0 * np.pi * length)
+            sign, matrix = bent[:, 1, 1], bent[:, 1, 1, None, None] * np.eye(2)
+        size = (
+            self.wavelength_m / (4.0 * np.pi * length) * np.sqrt(0.5 * (np.abs(matrix) ** 2).sum(axis=(1, 2)))
+        )
         code, point = ways.stops()
         return EdgePaths(
             receiver, ways.edge, ways.patch, code, point, length,
             length - np.linalg.norm(ways.end[:, 1] - ways.end[:, 0], axis=1), departure, arrival, matrix,
-            0.5 * friis**2 * (np.abs(matrix) ** 2).sum(axis=(1, 2)),
+            size * sign / np.maximum(np.abs(sign), 1e-300),
         )  # fmt: skip
 
 
@@ -317,7 +324,8 @@ class _Ways:
         code = np.column_stack([all_codes[:, 0], np.full(len(self.edge), EDGE), all_codes[:, 1]])
         point = np.stack([self.mirror[:, 0], self.point, self.mirror[:, 1]], axis=1)
         order = np.argsort(code == 0, axis=1, kind="stable")[:, :2]
-        return np.take_along_axis(code, order, axis=1), np.take_along_axis(point, order[..., None], axis=1)
+        code = np.take_along_axis(code, order, axis=1).astype(np.int8)
+        return code, np.take_along_axis(point, order[..., None], axis=1)
 
 
 def _edge_basis(along: np.ndarray, direction: np.ndarray) -> np.ndarray:
