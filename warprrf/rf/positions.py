@@ -297,6 +297,7 @@ def warn_of_unmodelled(
     *,
     frequency_hz: float,
     transmission: bool = False,
+    diffraction: bool = False,
     device: DeviceLike = None,
 ) -> None:
     """Warn, where the user's code calls, of what is left out and matters: below 100 GHz, and outdoors.
@@ -305,7 +306,7 @@ def warn_of_unmodelled(
         mesh: The scene's; None if there is none.
         transmitter, receivers: Positions [m], shapes ``(3,)``, and ``(3,)`` or ``(R, 3)``.
         frequency_hz: Carrier frequency [Hz].
-        transmission: Whether transmission through walls is modelled.
+        transmission, diffraction: Whether transmission through walls is modelled, and diffraction.
         device: Where rays are cast.
     """
     least_hz = 100e9  # below it walls let much through, and waves bend round edges, indoors too
@@ -313,9 +314,10 @@ def warn_of_unmodelled(
     some = np.concatenate([transmitter[None], np.reshape(receivers, (-1, 3))])[:_DIRECTIONS]
     if mesh is not None and (_sky_over(mesh, some, device).any() or is_open_air(mesh, device=device)):
         reasons.append("outdoors (under the sky)")
-    if not reasons:
+    lacking = ["diffraction"] * (not diffraction) + ["transmission through walls"] * (not transmission)
+    if not reasons or not lacking:
         return
-    what = "diffraction is" if transmission else "diffraction and transmission through walls are"
+    what = f"{' and '.join(lacking)} {'are' if len(lacking) > 1 else 'is'}"
     warnings.warn(
         f"{frequency_hz / 1e9:g} GHz: {what} not modelled, which matters {' and '.join(reasons)}: receivers without line "
         "of sight may get more power than is found here; warprrf.relevance estimates how much",
