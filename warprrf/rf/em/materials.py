@@ -322,9 +322,9 @@ def _number(entry: object, key: str, where: str) -> float:
 
 
 def _band(row: Any, where: str) -> Band:
-    ends = (1e9 * _number(row, key, where) for key in ("low_ghz", "high_ghz"))
-    law = (_number(row, key, where) for key in "abcd")
-    return Band(*ends, *law, source=str(row.get("source", "assumed")))
+    low_hz, high_hz = (1e9 * _number(row, key, where) for key in ("low_ghz", "high_ghz"))
+    law = {key: _number(row, key, where) for key in "abcd"}
+    return Band(low_hz, high_hz, **law, source=str(row.get("source", "assumed")))
 
 
 def _material(entry: object, where: str) -> Material:
