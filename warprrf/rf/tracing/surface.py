@@ -256,7 +256,7 @@ class Surface:
                 eta[g], known[g] = itu_material(name).extrapolated().permittivity(frequency_hz), True
         known_slab = known & ~np.isnan(self.thickness_m)
         thickness = np.where(np.isnan(self.thickness_m), ASSUMED_THICKNESS_M, self.thickness_m) / wavelength_m
-        absorbed = 4.0 * np.pi * thickness * np.sqrt(eta).imag
+        absorbed = 4.0 * np.pi * np.where(known_slab, 0.0, thickness) * np.sqrt(eta).imag
         return (
             np.where(known_slab, eta, 0.0),
             thickness,
