@@ -43,9 +43,14 @@ NAMES = {
         "receivers that the field suggests beside random ones, from none to ten",
     ),
     "times": ("benchmarks.times", "what each verb takes in the lobby or in a city: seconds and memory"),
+    "measured": (
+        "benchmarks.measured.command",
+        "a measured place: links held out, fields beside simple rivals and the measurement's noise",
+    ),
+    "office": ("benchmarks.office", "two rooms parted by glass and plasterboard: a field behind the walls"),
     "outside": (
         "benchmarks.outside",
-        "measurements by others: an array's pictures, received power in a furnished flat",
+        "measurements by others: an array's pictures over carriers",
     ),
 }
 """Benchmarks: name to the module that has it in ``BENCHMARKS``, and a line about it."""

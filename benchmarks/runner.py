@@ -59,7 +59,14 @@ class Benchmark:
     out: str = ""
 
 
-def option(default: Any, text: str, *, choices: tuple[str, ...] | None = None, kind: Any = None) -> Any:
+def option(
+    default: Any,
+    text: str,
+    *,
+    choices: tuple[str, ...] | None = None,
+    kind: Any = None,
+    positional: bool = False,
+) -> Any:
     """A field of a benchmark's options that its command has too, as ``--name-of-the-field``.
 
     Args:
@@ -67,8 +74,10 @@ def option(default: Any, text: str, *, choices: tuple[str, ...] | None = None, k
         text: one line of help.
         choices: what is allowed.
         kind: type of a value where the default does not tell (None, or an empty tuple); text by default.
+        positional: a word of the command without a name before it.
     """
-    return field(default=default, metadata={"help": text, "choices": choices, "kind": kind})
+    known = {"help": text, "choices": choices, "kind": kind, "positional": positional}
+    return field(default=default, metadata=known)
 
 
 def execute(benchmark: Benchmark, config: Any, job: Job) -> dict[str, Any]:
@@ -98,7 +107,11 @@ def add_options(parser: argparse.ArgumentParser, benchmark: Benchmark) -> None:
         if default is not None and default != () and not isinstance(default, bool):
             shown = " ".join(map(str, default)) if isinstance(default, tuple) else default
             named["help"] += f" (default {shown})"
-        parser.add_argument(f"--{one.name.replace('_', '-')}", **named)
+        if one.metadata["positional"]:
+            del named["dest"]
+            parser.add_argument(one.name, nargs="?", **named)
+        else:
+            parser.add_argument(f"--{one.name.replace('_', '-')}", **named)
 
 
 def run_command(benchmark: Benchmark, args: argparse.Namespace, out: Output) -> None:

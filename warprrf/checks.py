@@ -7,7 +7,7 @@ import inspect
 import numbers
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from types import EllipsisType
 from typing import Any, TypeVar
@@ -76,6 +76,18 @@ def check_array(
     return array
 
 
+def check_each(name: str, value: ArrayLike, count: int, *shape: int) -> np.ndarray:
+    """``value``, one of ``shape`` for all or one for each of ``count``, as a new array ``(count, *shape)``.
+
+    Raises:
+        TypeError, ValueError: naming the argument.
+    """
+    found = check_array(name, value)
+    if found.shape not in (shape, (count, *shape)):
+        raise ValueError(f"{name}: got shape {found.shape}, expected {shape} or {(count, *shape)}")
+    return np.broadcast_to(found, (count, *shape)).copy()
+
+
 def check_alike(**arrays: ArrayLike) -> None:
     """Raise ValueError, naming the arguments, unless their shapes can be broadcast to one."""
     shapes = [np.shape(array) for array in arrays.values()]
@@ -100,6 +112,13 @@ def check_count(name: str, value: object, least: int = 1, most: int = 2**31 - 1)
         limit = f"{least} to {most}" if most < 2**31 - 1 else f"at least {least}"
         raise ValueError(f"{name}: got {value!r}, expected a whole number of {limit}")
     return int(value)  # type: ignore[call-overload]
+
+
+def check_choice(name: str, value: object, allowed: Iterable[object]) -> None:
+    """Raise ValueError, naming the argument, unless ``value`` is one of those ``allowed``."""
+    known = tuple(allowed)
+    if value not in known:
+        raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(map(str, known))}")
 
 
 def check_chosen(name: str, value: ArrayLike, count: int, least: int = 0) -> np.ndarray:

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from warprrf.rf.channel.band_plan import HIGH_HZ, LOW_HZ, THZ_CHANNELS, UNIT_HZ, thz_channel
+from warprrf.rf.channel.band_plan import THZ_CHANNELS, thz_channel
+
+LOW_HZ, HIGH_HZ, UNIT_HZ = 252.72e9, 321.84e9, 2.16e9
 
 
 def test_69_channels_of_eight_bandwidths_lie_in_the_band_side_by_side():

@@ -48,7 +48,9 @@ def db(ratio: np.ndarray) -> np.ndarray:
 
 def test_an_empty_room_of_line_of_sight_alone_is_friis() -> None:
     room = Mesh(*box_mesh([0, 0, 0], [5, 4, 3], inward=True))
-    m = prior(room, Effects(mirrors=0, scatterings=0)).radio_map(1.5, 0.4, transmit_power_dbm=10.0)
+    m = prior(room, Effects(mirrors=0, scatterings=0, transmissions=0)).radio_map(
+        1.5, 0.4, transmit_power_dbm=10.0
+    )
     length = np.linalg.norm(m.positions - TX, axis=-1)
     friis = (WAVELENGTH / (4.0 * np.pi * length)) ** 2
     assert m.free.sum() == 12 * 10  # the thirteenth column's centre is at the wall

@@ -30,9 +30,6 @@ from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.waves import carrier_phase
 from warprrf.rf.spectra.spectrum import Spectrum, directions_from_angles, pixel_directions
 
-MAX_ROUNDS = 20  # of the multi-user search, which ends by itself once no user gains; a few are usual
-_TERMS = 1 << 18  # numbers held at once while paths are summed: what fits a cache
-
 
 @checked
 @dataclass(frozen=True, eq=False)
@@ -344,7 +341,8 @@ def _search(gains: list[np.ndarray], noise: float) -> dict[int, tuple[int, int]]
     """Receiving and transmitting beam of each user, by ascent on the sum of rates."""
     served: dict[int, tuple[int, int]] = {}
     order = sorted(range(len(gains)), key=lambda u: -gains[u].max())
-    for _ in range(1 + MAX_ROUNDS):
+    max_rounds = 20  # of the multi-user search, which ends by itself once no user gains; a few are usual
+    for _ in range(1 + max_rounds):
         before = dict(served)
         for u in order:
             others = {v: pair for v, pair in served.items() if v != u}
@@ -460,5 +458,6 @@ def squared(values: np.ndarray) -> np.ndarray:
 
 def chunks(count: int, width: int) -> Iterator[slice]:
     """Stretches of ``count`` paths whose ``width`` numbers each fit a cache together."""
-    step = max(1, _TERMS // max(width, 1))
+    terms = 1 << 18  # numbers held at once while paths are summed: what fits a cache
+    step = max(1, terms // max(width, 1))
     return (slice(k, k + step) for k in range(0, count, step))

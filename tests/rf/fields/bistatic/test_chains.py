@@ -8,6 +8,7 @@ from furnished import RECEIVERS, ROOM, TX
 from radio_scenes import joined, mirror_paths
 
 from warprrf.geometry.mesh import Mesh
+from warprrf.kernels.radio.records import MIRROR
 from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.tracing.model import Parameters
 from warprrf.rf.tracing.records import Evaluation, Records
@@ -38,8 +39,8 @@ def reflected(excess: np.ndarray, cosine: np.ndarray, turn: np.ndarray) -> np.nd
     none = np.zeros(excess.size)
     p = Parameters(none[:, None], np.log(np.where(excess > 0, excess, 1.0)).ravel(), none, (0,))
     angle = np.stack([cosine, turn, 0.0 * turn], axis=2)
-    ones, mirrors = np.ones(len(excess)), excess.shape[1]
-    return Records(ones, np.arange(len(excess)), index, angle, mirrors).powers(Evaluation(p))
+    kind = np.full((1, excess.shape[1]), MIRROR, np.int32)
+    return Records(np.ones(len(excess)), np.arange(len(excess)), index, angle, kind).powers(Evaluation(p))
 
 
 def test_a_mirror_met_head_on_has_no_plane_of_incidence() -> None:

@@ -1,0 +1,105 @@
+"""Received power of links between fixed ends and cells of a floor: means, their noise, and what is held out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+import warprrf as wr
+from benchmarks.fits import rms
+
+
+@dataclass(frozen=True)
+class Links:
+    """Means over the readings of a link, L of them.
+
+    Attributes:
+        senders: position of the fixed end [m], shape ``(L, 3)``.
+        receivers: mean position of the readings [m], shape ``(L, 3)``.
+        level_db: mean of their power [dB], shape ``(L,)``.
+        anchor: number of the fixed end, shape ``(L,)``.
+        cell: number of the cell, shape ``(L,)``.
+        room: name of the room of the cell, shape ``(L,)``.
+        walls: how many walls of each kind the straight way crosses, shape ``(L, kinds)``.
+    """
+
+    senders: np.ndarray
+    receivers: np.ndarray
+    level_db: np.ndarray
+    anchor: np.ndarray
+    cell: np.ndarray
+    room: np.ndarray
+    walls: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.level_db)
+
+    @property
+    def behind(self) -> np.ndarray:
+        """Whether a wall stands between, shape ``(L,)``, bool."""
+        return np.asarray(self.walls.sum(axis=1) > 0)
+
+    @property
+    def distance_m(self) -> np.ndarray:
+        """Between the ends [m], shape ``(L,)``."""
+        return np.linalg.norm(self.senders - self.receivers, axis=1)
+
+    def subset(self, chosen: np.ndarray) -> Links:
+        """The links named by a mask."""
+        return replace(self, **{name: values[chosen] for name, values in vars(self).items()})
+
+    def held_out(self, kinds: Sequence[str]) -> Iterator[tuple[str, str, np.ndarray]]:
+        """What is held out together: its kind, "anchor" or "room", which one, and a mask of its links."""
+        for kind in kinds:
+            own = getattr(self, kind)
+            for one in np.unique(own):
+                yield kind, str(one), own == one
+
+
+def mean_db(power_db: np.ndarray) -> float:
+    """Mean of power, in dB as it comes and goes."""
+    return float(10.0 * np.log10(np.mean(10.0 ** (power_db / 10.0))))
+
+
+def noise_db(readings: list[np.ndarray], seed: int) -> dict[str, float]:
+    """Noise of means [dB] from halves: half the rms difference of the means of the halves.
+
+    Args:
+        readings: of each link, in the order in which they were read [dB].
+        seed: of halves by chance.
+
+    Returns:
+        ``halves_by_time``: the first half against the second, so that what drifts counts as noise (the antenna's heading, people,
+        where in its cell a receiver is); ``halves_by_chance``: without that; ``single_reading``: spread of one.
+    """
+    rng = np.random.default_rng(seed)
+
+    def split(orders: list[np.ndarray]) -> float:
+        halves = [(one[: len(one) // 2], one[len(one) // 2 :]) for one in orders]
+        return 0.5 * rms(np.array([mean_db(a) - mean_db(b) for a, b in halves]))
+
+    return {
+        "halves_by_time": split(readings),
+        "halves_by_chance": split([rng.permutation(one) for one in readings]),
+        "single_reading": rms(np.array([np.std(one, ddof=1) for one in readings])),
+    }
+
+
+def crossings(scene: wr.Scene, start: np.ndarray, end: np.ndarray, kind: np.ndarray) -> np.ndarray:
+    """How many surfaces of each kind lie between ``start`` and ``end`` (L, 3), shape ``(L, kinds)``.
+
+    ``kind`` is that of each face, shape ``(F,)``.
+    """
+    a, b, c = np.moveaxis(scene.mesh.triangles, 1, 0)
+    normal, found = np.cross(b - a, c - a), np.zeros((len(start), kind.max() + 1), int)
+    for link, (p, q) in enumerate(zip(start, end, strict=True)):
+        along = normal @ (q - p)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = np.einsum("fi,fi->f", normal, a - p) / along
+        at = p + np.where(np.isfinite(t), t, 0.0)[:, None] * (q - p)
+        sides = [np.einsum("fi,fi->f", np.cross(v - u, at - u), normal) for u, v in ((a, b), (b, c), (c, a))]
+        met = (t > 0) & (t < 1) & (sides[0] >= 0) & (sides[1] > 0) & (sides[2] > 0)
+        found[link] = np.bincount(kind[met], minlength=found.shape[1])
+    return found
