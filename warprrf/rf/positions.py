@@ -279,12 +279,6 @@ def ground_height(mesh: Mesh, x: np.ndarray, y: np.ndarray, *, device: DeviceLik
     return np.where(np.isfinite(up), low + up, np.nan).reshape(np.shape(x))
 
 
-def sees_sky(mesh: Mesh, *points: np.ndarray, device: DeviceLike = None) -> bool:
-    """Whether there is sky over any of the first ``points``, each (3,) or (N, 3) [m]."""
-    places = np.concatenate([np.reshape(p, (-1, 3)) for p in points])[:_DIRECTIONS]
-    return bool(_sky_over(mesh, places, device).any())
-
-
 def is_open_air(mesh: Mesh, *, device: DeviceLike = None) -> bool:
     """Whether most of a scene is ground under the sky: a street or a city, not a room or a corridor, torn as its mesh
     may be."""
@@ -303,6 +297,7 @@ def warn_of_unmodelled(
     *,
     frequency_hz: float,
     transmission: bool = False,
+    diffraction: bool = False,
     device: DeviceLike = None,
 ) -> None:
     """Warn, where the user's code calls, of what is left out and matters: below 100 GHz, and outdoors.
@@ -311,18 +306,18 @@ def warn_of_unmodelled(
         mesh: The scene's; None if there is none.
         transmitter, receivers: Positions [m], shapes ``(3,)``, and ``(3,)`` or ``(R, 3)``.
         frequency_hz: Carrier frequency [Hz].
-        transmission: Whether transmission through walls is modelled.
+        transmission, diffraction: Whether transmission through walls is modelled, and diffraction.
         device: Where rays are cast.
     """
     least_hz = 100e9  # below it walls let much through, and waves bend round edges, indoors too
     reasons = [f"below {least_hz / 1e9:g} GHz"] if frequency_hz < least_hz else []
-    if mesh is not None and (
-        sees_sky(mesh, transmitter, receivers, device=device) or is_open_air(mesh, device=device)
-    ):
+    some = np.concatenate([transmitter[None], np.reshape(receivers, (-1, 3))])[:_DIRECTIONS]
+    if mesh is not None and (_sky_over(mesh, some, device).any() or is_open_air(mesh, device=device)):
         reasons.append("outdoors (under the sky)")
-    if not reasons:
+    lacking = ["diffraction"] * (not diffraction) + ["transmission through walls"] * (not transmission)
+    if not reasons or not lacking:
         return
-    what = "diffraction is" if transmission else "diffraction and transmission through walls are"
+    what = f"{' and '.join(lacking)} {'are' if len(lacking) > 1 else 'is'}"
     warnings.warn(
         f"{frequency_hz / 1e9:g} GHz: {what} not modelled, which matters {' and '.join(reasons)}: receivers without line "
         "of sight may get more power than is found here; warprrf.relevance estimates how much",

@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.device import DeviceLike
+from warprrf.geometry.edges import mesh_edges
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.fresnel import slab_transmission
 from warprrf.rf.spectra.spectrum import pixel_of
 
-LEAST_TURN = np.cos(np.radians(20.0))  # faces that meet at a smaller angle make no edge
+LEAST_BEND_RAD = np.radians(20.0)  # faces that are bent less, by a scanner's errors say, make no edge
 MOST_EDGES = 400  # of a receiver, those of least detour: the others are weaker
 MOST_CROSSINGS = 32  # faces on a ray; one that meets more brings nothing
 LIFT_M = 1e-3  # edges are looked at from this far off
@@ -110,7 +111,8 @@ def diffracted(
     transmitter and receiver. Its loss is that of a knife edge, v = 2 sqrt(detour / wavelength), which for small angles
     is ITU-R P.526-15, eq. (26).
     """
-    start, along, length, outward = _edges(mesh)
+    edges = mesh_edges(mesh, least_bend_rad=LEAST_BEND_RAD)
+    start, along, length, outward = edges.start, edges.along, edges.length, edges.outward
     parts: list[tuple[np.ndarray, ...]] = []
     source_at, source_off = _on_line(transmitter, start, along)
     for r, receiver in enumerate(receivers):
@@ -175,34 +177,6 @@ def transmitted(
     share[open_rays] = 0.0
     power = (wavelength_m / (4.0 * np.pi * distance)) ** 2 * share
     return SidePaths(np.arange(len(receivers)), power, toward, distance)
-
-
-def _edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Bent and open edges: start (E, 3), unit direction (E, 3), length (E,), unit vector off the surface (E, 3), on the
-    side where faces bend away, however they are wound."""
-    corner = mesh.welded_faces
-    sides = np.sort(corner[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    face = np.repeat(np.arange(len(corner)), 3)
-    opposite = mesh.triangles[:, [2, 0, 1]].reshape(-1, 3)
-    ends = mesh.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2, 3)
-    index, count = np.unique(sides, axis=0, return_inverse=True, return_counts=True)[1:]
-    order = np.argsort(index.reshape(-1), kind="stable")
-    first = np.concatenate([[0], np.cumsum(count)[:-1]])
-    a, b = order[first], order[np.minimum(first + 1, len(order) - 1)]
-    normal = mesh.face_normals
-    na, nb = normal[face[a]], normal[face[b]]
-    start, span = ends[a, 0], ends[a, 1] - ends[a, 0]
-    length = np.linalg.norm(span, axis=1)
-    along = span / np.maximum(length, 1e-12)[:, None]
-    alone = count == 1
-    bent = (count == 2) & ((na * nb).sum(axis=1) < LEAST_TURN)
-    outer = ((opposite[b] - start) * na).sum(axis=1) < 0
-    inward = opposite[a] - start
-    inward = inward - (inward * along).sum(axis=1, keepdims=True) * along
-    outward = np.where(alone[:, None], -inward, np.where(outer[:, None], na + nb, -na - nb))
-    size = np.linalg.norm(outward, axis=1)
-    keep = (alone | bent) & (length > 0) & (size > 1e-9)
-    return start[keep], along[keep], length[keep], outward[keep] / size[keep, None]
 
 
 def _on_line(point: np.ndarray, start: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

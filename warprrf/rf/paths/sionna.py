@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,12 +18,10 @@ from numpy.typing import ArrayLike
 from warprrf import device as _device
 from warprrf.checks import check_array, check_count, checked, one_line
 from warprrf.rf.channel.arrays import PlanarArray
-from warprrf.rf.channel.path_arrays import PathArrays
+from warprrf.rf.channel.path_arrays import EDGE, SCATTER, SLAB, PathArrays
 from warprrf.rf.channel.response import channel_taps, frequency_response, impulse_response
 from warprrf.rf.em.waves import carrier_phase, check_frequency
 
-SPECULAR, DIFFUSE = 1, 2
-"""``sionna.rt.InteractionType``."""
 MOST_TIME_STEPS = 1_000_000
 
 
@@ -37,9 +35,10 @@ class SionnaPaths:
         tau: Delays [s], shape ``(R, 1, L)``; -1 where there is no path.
         theta_t, phi_t, theta_r, phi_r: Angles of departure and arrival [rad], shape ``(R, 1, L)``; 0 where none.
         valid: Shape ``(R, 1, L)``, bool.
-        interactions: ``sionna.rt.InteractionType`` (1 specular, 2 diffuse, 0 none), shape ``(depth, R, 1, L)``.
+        interactions: ``sionna.rt.InteractionType`` (1 specular, 2 diffuse, 4 refraction, 8 diffraction, 0 none), shape
+            ``(depth, R, 1, L)``.
         vertices: Interaction points [m], shape ``(depth, R, 1, L, 3)``; 0 where none.
-        synthetic_array: True.
+        synthetic_array: always True.
     """
 
     __repr__ = one_line
@@ -53,7 +52,7 @@ class SionnaPaths:
     valid: np.ndarray
     interactions: np.ndarray
     vertices: np.ndarray
-    synthetic_array: bool
+    synthetic_array: ClassVar[bool] = True
     _paths: PathArrays
     _options: dict[str, Any]
 
@@ -145,9 +144,6 @@ def to_sionna(
         valid &= several.kind != "diffuse"
     passband = coefficient * carrier_phase(-several.carrier_hz, np.where(valid, tau, 0.0))[:, None, None]
     there = np.isfinite(several.vertices[..., 0]) & valid[..., None]
-    depth = np.arange(several.vertices.shape[-2])
-    last = depth == there.sum(axis=-1, keepdims=True) - 1
-    kinds = np.where(last & (several.kind == "diffuse")[..., None], DIFFUSE, SPECULAR)
 
     def angle(values: np.ndarray) -> np.ndarray:
         return np.where(valid, values, 0.0)[:, None]
@@ -160,9 +156,8 @@ def to_sionna(
         theta_r=angle(several.theta_r),
         phi_r=angle(several.phi_r),
         valid=valid[:, None],
-        interactions=np.moveaxis(np.where(there, kinds, 0), -1, 0)[:, :, None],
+        interactions=np.moveaxis(np.where(there, several.interactions, 0).astype(int), -1, 0)[:, :, None],
         vertices=np.moveaxis(np.where(there[..., None], several.vertices, 0.0), -2, 0)[:, :, None],
-        synthetic_array=True,
         _paths=several,
         _options=options,
     )
@@ -208,12 +203,14 @@ def by_delay(paths: Any, carrier: float, transmitter: int, drop_repeated: bool) 
         here[tied] = here[tied][np.lexsort(keys)]
         bounce = np.moveaxis(kinds[:, r, here], 0, -1)  # (L, depth)
         count = (bounce != 0).sum(axis=1)
-        kind = np.where(count == 0, "los", np.where((bounce == DIFFUSE).any(axis=1), "diffuse", "mirror"))
+        has = [(bounce == code).any(axis=1) for code in (SCATTER, EDGE, SLAB)]
+        kind = np.select([count == 0, *has], ["los", "diffuse", "edge", "slab"], "mirror")
         turned = carrier_phase(carrier, own["tau"][r, here])
         jones = np.moveaxis(a[r][:, :, here], -1, 0) * turned[:, None, None]
         found = PathArrays(
             gain=np.sqrt(0.5 * (np.abs(jones) ** 2).sum(axis=(1, 2))) * turned,
             vertices=np.where((bounce != 0)[..., None], points[r, here], np.nan),
+            interactions=bounce.astype(np.int8),
             kind=kind.astype("<U7"),
             valid=np.ones(len(here), dtype=bool),
             jones=jones,

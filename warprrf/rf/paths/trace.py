@@ -6,6 +6,8 @@ Angles: arrival points from the receiver to the last interaction, departure from
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -13,9 +15,11 @@ from warprrf.checks import check_array, check_count, checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, GeometryLike, as_mesh
 from warprrf.geometry.planar_patches import planar_patches
+from warprrf.rf.channel.path_arrays import MIRROR, SLAB
 from warprrf.rf.em.absorption import Gas
 from warprrf.rf.em.fresnel import SurfaceTable, slab_passage, slab_reflection, surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
+from warprrf.rf.paths.edge_paths import EdgeFinder, EdgePaths
 from warprrf.rf.paths.images import MOST_CHAINS, MirrorImages
 from warprrf.rf.paths.mirror_paths import MirrorPaths, exact_paths, stops_of
 from warprrf.rf.paths.path_set import Paths
@@ -33,6 +37,7 @@ def trace_paths(
     frequency_hz: float,
     mirror_order: int = 1,
     transmissions: int = 0,
+    diffractions: int = 0,
     gas: Gas = False,
     progress: Progress | None = None,
     device: DeviceLike = None,
@@ -50,18 +55,25 @@ def trace_paths(
     two faces at most :data:`~warprrf.rf.paths.slabs.THICKEST_M` apart, as thick as it is. Sionna RT takes each face for
     a slab of its own.
 
+    Over the edge of a wedge or a sheet, paths of kind ``"edge"`` go round: one edge, and one mirror before or behind it if
+    mirrors are asked for (:mod:`~warprrf.rf.em.diffraction`, :mod:`~warprrf.rf.paths.edge_paths`). Fields add up: with them the sum
+    of ``jones``, or of a bare mesh's ``gain``, is continuous where line of sight and mirror paths end. A bare mesh's edges
+    are conductors' of hard polarisation, which has no sign change. The phase of ``gain`` is that of the field along the edge.
+
     Args:
         mesh_or_scene: A :class:`Mesh` or anything with a ``mesh``; a scene has ``face_material`` and ``materials`` too.
         transmitter, receivers: Positions [m], shapes ``(3,)`` or ``(R, 3)``, row by row.
         frequency_hz: Carrier frequency [Hz].
         mirror_order: Most reflections on one path: 0 and up.
         transmissions: Most slabs that one path passes, 0 to 3. Of a bare mesh nothing is known to let through.
+        diffractions: Most edges on one path, 0 or 1.
         gas: Absorption of the air in every gain: see :meth:`Paths.with_gas`.
         progress: Called with the stages ``"patches"``, in which the mesh's planes are found, and ``"mirrors"``.
         device: Where chains are tried and rays cast.
 
     Returns:
-        Arrays ``(L,)`` for one receiver and transmitter, else ``(R, L)``; line of sight first, then by order, then by delay.
+        Arrays ``(L,)`` for one receiver and transmitter, else ``(R, L)``; line of sight first, then by order, then by delay;
+        then paths over edges.
 
     Raises:
         ValueError: on a position that is NaN, outside a closed room, inside a solid, or within the reactive near
@@ -70,7 +82,7 @@ def trace_paths(
             (:class:`MirrorTracer` takes another limit).
 
     Warns:
-        UserWarning: below 100 GHz and outdoors, of diffraction, and of transmission if none is asked for.
+        UserWarning: below 100 GHz and outdoors, of diffraction and transmission if not asked for.
     """
     ends, frequency = Ends.of(receivers, transmitter), check_frequency(frequency_hz)
     mesh, wavelength_m = as_mesh(mesh_or_scene), SPEED_OF_LIGHT / frequency
@@ -78,19 +90,19 @@ def trace_paths(
     for source, own in ends.groups():
         points = ends.shaped(ends.receivers[own])
         check_positions(mesh, source, points, wavelength_m, on_surfaces=True, device=device)
-        warn_of_unmodelled(
-            mesh, source, points, frequency_hz=frequency, transmission=transmissions > 0, device=device
-        )
-    order, most = (
-        check_count("mirror_order", mirror_order, 0),
-        check_count("transmissions", transmissions, 0, 3),
-    )
+        modelled = {"transmission": transmissions > 0, "diffraction": diffractions > 0}
+        warn_of_unmodelled(mesh, source, points, frequency_hz=frequency, device=device, **modelled)
+    order = check_count("mirror_order", mirror_order, 0)
+    most = {
+        "transmissions": check_count("transmissions", transmissions, 0, 3),
+        "diffractions": check_count("diffractions", diffractions, 0, 1),
+    }
     tell: Progress = progress or (lambda stage, done, total: None)
     found: dict[int, Paths] = {}
     for source, own in ends.groups():
         tell("patches", 0, 1)
         tracer = MirrorTracer(
-            mesh_or_scene, transmitter=source, frequency_hz=frequency, transmissions=most, device=device
+            mesh_or_scene, transmitter=source, frequency_hz=frequency, device=device, **most
         )
         tell("patches", 1, 1)
         found |= zip(own.tolist(), tracer.trace_each(ends.receivers[own], order, progress), strict=True)
@@ -111,6 +123,7 @@ class MirrorTracer:
         images: Images of the transmitter in them.
         table: Radio properties of the scene's materials; None for a bare mesh.
         walls: What may be passed, if anything.
+        edges: Paths over edges, if asked for.
     """
 
     def __init__(
@@ -120,6 +133,7 @@ class MirrorTracer:
         transmitter: ArrayLike,
         frequency_hz: float,
         transmissions: int = 0,
+        diffractions: int = 0,
         max_chains: float = MOST_CHAINS,
         device: DeviceLike = None,
     ) -> None:
@@ -143,6 +157,12 @@ class MirrorTracer:
                 self.mesh, *known, self.wavelength_m, transmissions, clearance, device
             )
         self.images = MirrorImages(self.patches, self.transmitter, max_chains=max_chains, device=device)
+        self.edges: EdgeFinder | None = None
+        if diffractions:
+            through = None
+            if self.walls is not None and self.table is not None:
+                through = partial(self._through_sheets, self.table)
+            self.edges = EdgeFinder(self.images, self.wavelength_m, self.table, through=through)
 
     @property
     def wavelength_m(self) -> float:
@@ -160,6 +180,8 @@ class MirrorTracer:
         found = self.find(receivers, mirror_order, progress)
         points = np.asarray(receivers, float)
         jones, amplitude, excess_m = self._passed_on(found, points)
+        codes = np.where(found.slab >= 0, SLAB, np.where(found.patch >= 0, MIRROR, 0)).astype(np.int8)
+        over = None if self.edges is None else self.edges.find(points, min(mirror_order, 1), progress)
         ends = np.searchsorted(found.receiver, np.arange(len(points) + 1))
         result = []
         for k, point in enumerate(points):
@@ -169,10 +191,31 @@ class MirrorTracer:
             result.append(
                 Paths._from_points(
                     self.transmitter, point, found.point[own], amplitude[own], kind.astype("<U7"), self.frequency_hz,
-                    None if jones is None else jones[own], excess_m[own],
+                    None if jones is None else jones[own], excess_m[own], interactions=codes[own],
                 )
             )  # fmt: skip
+            if over is not None:
+                result[-1] = Paths.concatenate([result[-1], self._over(over, k, point)])
         return result
+
+    def _over(self, found: EdgePaths, k: int, point: np.ndarray) -> Paths:
+        """The paths over edges of receiver ``k``, at ``point``."""
+        own = found.take(np.flatnonzero(found.receiver == k))
+        jones = (self.wavelength_m / (4.0 * np.pi * own.length_m))[:, None, None] * own.matrix
+        kind = np.full(len(own), "edge", "<U7")
+        return Paths._from_points(
+            self.transmitter, point, own.point, own.amplitude, kind, self.frequency_hz,
+            None if self.table is None else jones, interactions=own.code,
+        )  # fmt: skip
+
+    def _through_sheets(
+        self, table: SurfaceTable, material: np.ndarray, cosine: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What a sheet makes of a field that passes it, over that of the way in air."""
+        eta, thickness = table.permittivity[material], table.thickness_m[material]
+        te, tm, longer = slab_passage(cosine, eta, thickness, self.wavelength_m)
+        late = np.exp(-2j * np.pi / self.wavelength_m * longer)
+        return te * late, tm * late
 
     def find(
         self, receivers: ArrayLike, mirror_order: int = 1, progress: Progress | None = None

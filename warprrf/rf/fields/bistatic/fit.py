@@ -23,7 +23,7 @@ from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import Data, Measured
-from warprrf.rf.fields.bistatic.gauss_newton import Fitted, Problem, gauss_newton, layout_of
+from warprrf.rf.fields.bistatic.gauss_newton import THROUGH, Fitted, Problem, gauss_newton, layout_of
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, WeighedPaths, read
 from warprrf.rf.fields.bistatic.merging import BY_SHAPE, Merging, merge
 from warprrf.rf.fields.bistatic.needs import MOST_BLOCKED, slabs_needed
@@ -832,10 +832,16 @@ def side_lobes(t: Training, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _covariance(found: Fitted, gain: bool, through: bool) -> np.ndarray:
-    """Of what a field keeps: parameters of materials and the common gain, if that was free."""
-    p = found.parameters
-    kept = Layout(*p.log_weight.shape, through=through, gain=gain).size
-    return found.covariance[:kept, :kept]
+    """Of what a field keeps: parameters of materials, with what they let through as it is known before where that was not free;
+    and the common gain, if that was."""
+    layout, whole = (
+        Layout(*found.parameters.log_weight.shape, through=t, gain=gain) for t in (through, True)
+    )
+    free = np.ones(whole.size, bool)
+    free[whole.passage(np.arange(whole.groups))] = through
+    covariance = np.where(free, 0.0, THROUGH**2) * np.eye(whole.size)
+    covariance[np.ix_(free, free)] = found.covariance[: layout.size, : layout.size]
+    return covariance
 
 
 def _report(t: Training, choice: Choice, wrong: Unexplained, seconds: float) -> dict[str, Any]:
