@@ -76,7 +76,9 @@ class View:
         paths: line of sight and mirror paths, L in all.
         records: tables by sequence, of those that were asked for; of line of sight and mirrors under :data:`SPECULAR`, one row
             for each of ``paths``.
-        keeps: whether what is made when it is first asked for is kept; tables of single bounces are in any case.
+        keeps: whether what is made when it is first asked for is kept.
+        lit: where it is not, rays that the transmitter lights, as bits, once that is known: the table of single bounces is
+            made of them without casting rays.
     """
 
     tracer: Tracer
@@ -85,6 +87,7 @@ class View:
     paths: MirrorPaths
     records: dict[str, Records] = field(repr=False)
     keeps: bool = True
+    lit: list[np.ndarray] = field(default_factory=list, repr=False)
     _beams: list[np.ndarray] = field(init=False, repr=False, default_factory=list)
 
     @property
@@ -119,11 +122,13 @@ class View:
         wanted = (SPECULAR, *sequences(effects))
         missing = [name for name in wanted if name not in self.records]
         made = self.tracer.trace(self, missing) if missing else {}
-        if made:
+        if made and self.keeps:
             with making:
-                self.records.update(
-                    {name: table for name, table in made.items() if self.keeps or name == "S"}
-                )
+                self.records.update(made)
+        elif "S" in made and not self.lit:
+            bits = np.zeros(len(self.hits.face), bool)
+            bits[made["S"].ray] = True
+            self.lit[:] = [np.packbits(bits)]
         return {name: made[name] if name in made else self.records[name] for name in wanted}
 
     def kept_paths(self, effects: Effects) -> np.ndarray:
@@ -311,7 +316,10 @@ class Tracer:
                 seen[last] = (
                     self._turned(view) if last == "M" else self.behind(first, most) if last == "T" else first
                 )
-            made[name] = self._trace(sequence, seen[last], most)
+            if name == "S" and view.lit:
+                made[name] = self.lit(first, np.flatnonzero(np.unpackbits(view.lit[0], count=len(first.ray))))
+            else:
+                made[name] = self._trace(sequence, seen[last], most)
         return made
 
     def _trace(self, sequence: str, rays: Rays, most: int) -> Records:
@@ -335,8 +343,11 @@ class Tracer:
         row = np.arange(len(p), dtype=np.int32)
         return Records(power, row, group.astype(np.int32), angle, kind.astype(np.int32))
 
-    def lit(self, rays: Rays) -> Records:
-        """What rays see of surfaces that the transmitter lights."""
+    def lit(self, rays: Rays, row: np.ndarray | None = None) -> Records:
+        """What rays see of surfaces that the transmitter lights: the rays ``row``, if that is known."""
+        if row is not None:
+            light = self.grid.light_through(rays.hits, self.transmitter, row)
+            return self.scattered(rays, row, light.strength, light.angle)
         light = self.grid.light(rays.hits, self.transmitter)
         row = np.flatnonzero(light.strength > 0)
         return self.scattered(rays, row, light.strength[row], light.angle[row])

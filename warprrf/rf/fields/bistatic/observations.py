@@ -136,17 +136,6 @@ class Target:
     trust: np.ndarray | None = None
     censored: np.ndarray | None = None
 
-    @classmethod
-    def joined(cls, targets: Sequence[Target]) -> Target:
-        """All readings of ``targets``, one after another."""
-        trust = [np.ones(len(t.db)) if t.trust is None else t.trust for t in targets]
-        censored = [np.zeros(len(t.db), bool) if t.censored is None else t.censored for t in targets]
-        return cls(
-            np.concatenate([t.db for t in targets]),
-            np.concatenate(trust) if any(t.trust is not None for t in targets) else None,
-            np.concatenate(censored) if any(t.censored is not None for t in targets) else None,
-        )
-
     def part(self, index: np.ndarray) -> Target:
         """Some of the readings."""
         return Target(*(None if a is None else a[index] for a in (self.db, self.trust, self.censored)))  # type: ignore[arg-type]
