@@ -50,7 +50,7 @@ NAMES = {
     "office": ("benchmarks.office", "two rooms parted by glass and plasterboard: a field behind the walls"),
     "outside": (
         "benchmarks.outside",
-        "measurements by others: an array's pictures, received power in a furnished flat",
+        "measurements by others: an array's pictures over carriers",
     ),
 }
 """Benchmarks: name to the module that has it in ``BENCHMARKS``, and a line about it."""

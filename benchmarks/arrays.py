@@ -76,7 +76,7 @@ def heard(
     for place in places:
         paths = engine.solve(place)
         random = np.exp(2j * np.pi * rng.random(len(paths.tau)))
-        amplitude = paths.jones[:, 0, 0] * np.where(paths.kind == "diffuse", random, 1.0)
+        amplitude = np.asarray(paths.jones)[:, 0, 0] * np.where(paths.kind == "diffuse", random, 1.0)
         found.append(np.abs(steering @ (ARRAY.response(paths.arrival, 1.0).T @ amplitude)) ** 2)
     return np.asarray(np.round(255.0 * normalised(np.stack(found))), np.uint8)
 

@@ -32,12 +32,11 @@ examples:
 Corner = tuple[float, float, float]
 SIZE, SHEET_X = (8.0, 6.0, 3.0), 5.0
 TRANSMITTER = (1.0, 5.2, 2.6)
-SCATTERING = 0.4
 MATERIALS = {
-    "concrete": {"thickness_m": 0.2}, "ceiling_board": {"thickness_m": 0.02}, "brick": {"thickness_m": 0.2},
-    "plasterboard": {"thickness_m": 0.025}, "glass": {"thickness_m": 0.01, "scattering": 0.1}, "wood": {"thickness_m": 0.03},
-    "chipboard": {"thickness_m": 0.03},
+    "concrete": (0.2, 0.4), "ceiling_board": (0.02, 0.4), "brick": (0.2, 0.4), "plasterboard": (0.025, 0.4), "glass": (0.01, 0.1),
+    "wood": (0.03, 0.4), "chipboard": (0.03, 0.4),
 }  # fmt: skip
+"""Thickness [m] and scattering coefficient by P.2040's names."""
 SHELL = ("brick", "brick", "brick", "brick", "concrete", "ceiling_board")
 SHEETS = (
     ("plasterboard", (0.0, 0.7), (0.0, 3.0)), ("plasterboard", (0.7, 1.6), (2.1, 3.0)), ("plasterboard", (1.6, 2.4), (0.0, 3.0)),
@@ -73,7 +72,7 @@ class Options:
     carriers_ghz: tuple[float, ...] = option((28.0, 140.0), "carriers [GHz]")
     counts: tuple[int, ...] = option((10, 50), "training receivers of both rooms")
     tests: int = option(20, "test receivers in either room")
-    samples: int = option(500_000, "rays of Sionna RT's")
+    samples: int = option(4_000_000, "rays of Sionna RT's")
 
     @property
     def inputs(self) -> list[Any]:
@@ -107,7 +106,8 @@ def _sides(low: Corner, high: Corner) -> np.ndarray:
 
 def material(name: str) -> Material:
     """One of :data:`MATERIALS`."""
-    known = itu_material(name, **{"scattering": SCATTERING, **MATERIALS[name]})
+    thickness, scattering = MATERIALS[name]
+    known = itu_material(name, thickness_m=thickness, scattering=scattering)
     return replace(known.extrapolated(), name=name)
 
 

@@ -279,6 +279,17 @@ def check_arrays(
     return sizes
 
 
+def check_known_whole(name: str, array: np.ndarray, axes: int = 1) -> None:
+    """Raise ValueError, naming the array, unless NaN is in all or none of the numbers along each row of its last ``axes``.
+
+    A point, a direction, a matrix is known whole or not at all.
+    """
+    unknown, last = np.isnan(array), tuple(range(-axes, 0))
+    some = int((unknown.any(last) != unknown.all(last)).sum())
+    if some:
+        raise ValueError(f"{name}: got {some} that are NaN in part, expected each known whole or not at all")
+
+
 def index_to(size: str, shape: str, least: int = 0) -> Expected:
     """Whole numbers that are indices to what there are ``size`` of."""
     return Expected(shape, least, index=size, kind="iu")

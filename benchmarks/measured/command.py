@@ -48,11 +48,15 @@ class Options:
     Attributes:
         place: which.
         source: folder of its files.
+        hold_out: what is held out, one at a time.
         noise_alone: write the noise of the means, and fit nothing.
     """
 
     place: str = option("flat", "which place", choices=tuple(PLACES), positional=True)
     source: str = option("external/ble_flat", "folder of its files")
+    hold_out: tuple[str, ...] = option(
+        ("anchor", "room"), "what is held out, one at a time", choices=("anchor", "room")
+    )
     noise_alone: bool = option(False, "write the noise of the means, and fit nothing")
 
 
@@ -138,7 +142,7 @@ def run(options: Options, job: Job) -> Report:
     with Steps(job.out, fresh=job.fresh, progress=job.progress) as steps:
         for model, predict in models.items():
             error: dict[str, np.ndarray] = {}
-            for kind, which, out in links.held_out():
+            for kind, which, out in links.held_out(options.hold_out):
                 step = f"{model} {kind} {which}"
                 file = "".join(c if c.isalnum() else "-" for c in step)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,12 +50,12 @@ class Links:
         """The links named by a mask."""
         return replace(self, **{name: values[chosen] for name, values in vars(self).items()})
 
-    def held_out(self) -> Iterator[tuple[str, str, np.ndarray]]:
-        """What is held out together: "anchor" or "room", which, and a mask of its links."""
-        for anchor in np.unique(self.anchor):
-            yield "anchor", str(anchor), self.anchor == anchor
-        for room in np.unique(self.room):
-            yield "room", str(room), self.room == room
+    def held_out(self, kinds: Sequence[str]) -> Iterator[tuple[str, str, np.ndarray]]:
+        """What is held out together: its kind, "anchor" or "room", which one, and a mask of its links."""
+        for kind in kinds:
+            own = getattr(self, kind)
+            for one in np.unique(own):
+                yield kind, str(one), own == one
 
 
 def mean_db(power_db: np.ndarray) -> float:

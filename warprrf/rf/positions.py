@@ -279,12 +279,6 @@ def ground_height(mesh: Mesh, x: np.ndarray, y: np.ndarray, *, device: DeviceLik
     return np.where(np.isfinite(up), low + up, np.nan).reshape(np.shape(x))
 
 
-def sees_sky(mesh: Mesh, *points: np.ndarray, device: DeviceLike = None) -> bool:
-    """Whether there is sky over any of the first ``points``, each (3,) or (N, 3) [m]."""
-    places = np.concatenate([np.reshape(p, (-1, 3)) for p in points])[:_DIRECTIONS]
-    return bool(_sky_over(mesh, places, device).any())
-
-
 def is_open_air(mesh: Mesh, *, device: DeviceLike = None) -> bool:
     """Whether most of a scene is ground under the sky: a street or a city, not a room or a corridor, torn as its mesh
     may be."""
@@ -317,9 +311,8 @@ def warn_of_unmodelled(
     """
     least_hz = 100e9  # below it walls let much through, and waves bend round edges, indoors too
     reasons = [f"below {least_hz / 1e9:g} GHz"] if frequency_hz < least_hz else []
-    if mesh is not None and (
-        sees_sky(mesh, transmitter, receivers, device=device) or is_open_air(mesh, device=device)
-    ):
+    some = np.concatenate([transmitter[None], np.reshape(receivers, (-1, 3))])[:_DIRECTIONS]
+    if mesh is not None and (_sky_over(mesh, some, device).any() or is_open_air(mesh, device=device)):
         reasons.append("outdoors (under the sky)")
     lacking = ["diffraction"] * (not diffraction) + ["transmission through walls"] * (not transmission)
     if not reasons or not lacking:

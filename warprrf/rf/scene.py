@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_number, check_type, checked
+from warprrf.checks import check_array, check_arrays, check_number, check_type, checked, index_to
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import MeshOptions, is_mesh_file
@@ -68,14 +68,8 @@ class Scene:
         self.receivers = _positions("receivers", receivers)
         if len(set(self.object_names)) < len(self.object_names):
             raise ValueError("object_names: got a name twice, expected each once")
-        for name, index, table in (
-            ("face_material", self.face_material, self.materials),
-            ("face_object", self.face_object, self.object_names),
-        ):
-            if faces and (index.min() < 0 or index.max() >= len(table)):
-                raise ValueError(
-                    f"{name}: got indices {index.min()} to {index.max()}, expected 0 to {len(table) - 1}"
-                )
+        known = {"face_material": index_to("materials", "F"), "face_object": index_to("objects", "F")}
+        check_arrays(vars(self), known, materials=len(self.materials), objects=len(self.object_names))
 
     def __repr__(self) -> str:
         return (

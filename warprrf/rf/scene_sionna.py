@@ -129,23 +129,20 @@ def to_sionna_scene(
     frequency = check_frequency(frequency_hz)
     rt = sionna_rt()
     mi = select_variant()
-    taken = set(transmitters) | set(receivers)
-    names = []
-    for part in parts:
-        name = part.name.replace(".", "_")  # Mitsuba parts its paths by it
+    taken = {*transmitters, *receivers}  # Sionna's objects, materials and devices share one set of names
+
+    def free(name: str, end: str) -> str:
         while name in taken:
-            name += "_"
+            name += end
         taken.add(name)
-        names.append(name)
-    radio: dict[int, Any] = {}
-    for part in parts:
-        material = part.material
-        if id(material) not in radio:
-            name = material.name
-            while name in taken:  # Sionna's objects, materials and devices share one set of names
-                name = f"{name}-material"
-            taken.add(name)
-            radio[id(material)] = _radio_material(rt, material, name, frequency)
+        return name
+
+    names = [free(part.name.replace(".", "_"), "_") for part in parts]  # Mitsuba parts its paths by dots
+    materials = {id(part.material): part.material for part in parts}
+    radio = {
+        key: _radio_material(rt, one, free(one.name, "-material"), frequency)
+        for key, one in materials.items()
+    }
     shapes: dict[str, Any] = {"type": "scene"}
     for part, name in zip(parts, names, strict=True):
         properties = mi.Properties()
@@ -160,14 +157,11 @@ def to_sionna_scene(
         shapes[name] = mesh
     scene = rt.Scene(mi.load_dict(shapes, optimize=False))
     scene.frequency = frequency
-    for material in {id(part.material): part.material for part in parts}.values():
-        _follow_frequency(
-            radio[id(material)], material
-        )  # not before: a new scene has Sionna's default frequency
-    for name, position in transmitters.items():
-        scene.add(rt.Transmitter(name, position=np.asarray(position, float).tolist()))
-    for name, position in receivers.items():
-        scene.add(rt.Receiver(name, position=np.asarray(position, float).tolist()))
+    for key, material in materials.items():  # not before: a new scene has Sionna's default frequency
+        _follow_frequency(radio[key], material)
+    for kind, places in ((rt.Transmitter, transmitters), (rt.Receiver, receivers)):
+        for name, position in places.items():
+            scene.add(kind(name, position=np.asarray(position, float).tolist()))
     return scene
 
 

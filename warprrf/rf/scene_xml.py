@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from warprrf.checks import LARGEST_M
 from warprrf.geometry.mesh_content import Folder
 from warprrf.geometry.mesh_files import read_mesh
-from warprrf.rf.em.materials import DEFAULT_THICKNESS_M, ITU_BANDS, Material, itu_material, itu_name
+from warprrf.rf.em.materials import ITU_BANDS, Material, itu_material, itu_name
 from warprrf.rf.scene_parts import MaterialChoice, ScenePart
 
 MOST_NESTED = 50  # elements within each other; expat and Python take thousands
@@ -285,7 +285,7 @@ def _radio_material(element: Element, label: str) -> Material | None:
     """
     kind, identifier = element.get("type"), element.get("id") or ""
     common: dict[str, Any] = {
-        "thickness_m": _value(element, "thickness", DEFAULT_THICKNESS_M),
+        "thickness_m": _value(element, "thickness", Material.thickness_m),
         "scattering": _value(element, "scattering_coefficient", 0.0),
         "xpd": _value(element, "xpd_coefficient", 0.0),
         "pattern": _text(element, "scattering_pattern") or "lambertian",

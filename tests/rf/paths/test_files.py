@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import xarray
 from path_makers import random_paths
 
 from warprrf.rf.paths.path_set import Paths
@@ -27,3 +28,28 @@ def test_nothing_is_lost(tmp_path, jones):
         p.save(tmp_path / f"{k}.nc")
         same(p, Paths.load(tmp_path / f"{k}.nc"))
     assert sorted(f.name for f in tmp_path.iterdir()) == ["0.nc", "1.nc", "2.nc"]  # no temporary files left
+
+
+@pytest.mark.parametrize("filled", [("jones_imag",), ("jones_real", "jones_imag")])
+def test_a_jones_matrix_is_known_whole_or_not_at_all(tmp_path, filled):
+    paths = random_paths(4, jones=True)
+    paths.jones[:, 0, 1] = 0.0
+    paths.save(tmp_path / "a.nc")
+    with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf", decode_cf=False) as opened:
+        data = opened.load()
+    for name in filled:
+        data[name].attrs["_FillValue"] = 0.0
+    data.to_netcdf(tmp_path / "b.nc", engine="h5netcdf")
+    with pytest.raises(ValueError, match=r"b\.nc: .*jones: got 4 .*in part"):
+        Paths.load(tmp_path / "b.nc")
+
+
+def test_a_heap_in_which_hdf5_would_go_round_for_ever_is_refused(tmp_path):
+    path = tmp_path / "a.nc"
+    random_paths(4).save(path)
+    data = bytearray(path.read_bytes()).partition(b"\nwarprrf sha256 ")[0]
+    at = data.index(b"GCOL") + 16
+    data[at : at + 16] = bytes(16)  # free space of no size comes first
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"a\.nc: damaged.*heap"):
+        Paths.load(path)

@@ -21,7 +21,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from warprrf.checks import check_count
+from warprrf.checks import check_choice, check_count
 from warprrf.device import Progress, require
 from warprrf.geometry.photos.config import LENSES, ReconstructionConfig
 from warprrf.geometry.photos.photo_files import (
@@ -104,8 +104,7 @@ def structure_from_motion(
     config = config or ReconstructionConfig()
     lens, pairs = config.lens, config.pairs
     for name, value, known_values in (("lens", lens, LENSES), ("pairs", pairs, ("auto", "exhaustive"))):
-        if value not in known_values:
-            raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(known_values)}")
+        check_choice(name, value, known_values)
     max_features = check_count("max_features", config.max_features, 100)
     max_pixels = check_count("max_pixels", config.max_pixels, LEAST_PIXELS)
     everything = named = find_photos(photos)

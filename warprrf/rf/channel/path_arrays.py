@@ -29,7 +29,7 @@ MIRROR, SCATTER, SLAB, EDGE = 1, 2, 4, 8
 _LAST = {"diffuse": SCATTER, "slab": SLAB, "edge": EDGE}
 MOST_PATHS = 10_000_000
 """Longest list that is asked for: 2 GB of a receiver."""
-_PADDING: dict[str, Any] = {
+PADDING: dict[str, Any] = {
     "gain": 0.0, "tau": np.nan, "theta_r": np.nan, "phi_r": np.nan, "theta_t": np.nan, "phi_t": np.nan,
     "vertices": np.nan, "kind": "", "valid": False, "jones": 0.0, "interactions": 0,
 }  # fmt: skip
@@ -150,7 +150,7 @@ class PathArrays:
 
     def _taken(self, index: int | slice | np.ndarray) -> Self:
         """Every array at ``index``."""
-        arrays: dict[str, Any] = {name: getattr(self, name) for name in _PADDING}
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in PADDING}
         taken: dict[str, Any] = {name: None if v is None else v[index] for name, v in arrays.items()}
         return replace(self, **taken)
 
@@ -310,7 +310,7 @@ class PathArrays:
         _check_parts(parts)
         length = max(check_count("length", length, 0, MOST_PATHS), *(len(p.gain) for p in parts))
         stacked: dict[str, Any] = {
-            name: np.stack([_padded(a, 0, length, _PADDING[name]) for a in arrays])
+            name: np.stack([_padded(a, 0, length, PADDING[name]) for a in arrays])
             for name, arrays in _columns(parts).items()
         }
         receiver = None
@@ -344,7 +344,7 @@ def _check_parts(parts: Sequence[PathArrays]) -> None:
 
 def _columns(parts: Sequence[PathArrays]) -> dict[str, list[np.ndarray]]:
     """The arrays of all parts by name, equally deep; without ``jones`` if no part has it, NaN for those that lack it."""
-    columns = {name: [getattr(p, name) for p in parts] for name in _PADDING}
+    columns = {name: [getattr(p, name) for p in parts] for name in PADDING}
     depth = max((v.shape[1] for v in columns["vertices"]), default=1)
     for name in ("vertices", "interactions"):
         columns[name] = [_padded(v, 1, depth, _PADDING[name]) for v in columns[name]]

@@ -45,7 +45,14 @@ from warprrf.rf.positions import Ends, check_positions
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.readings import Readings
-from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectra, Spectrum, check_beam, check_shape
+from warprrf.rf.spectra.spectrum import (
+    BEAM_SIGMA_RAD,
+    Spectra,
+    Spectrum,
+    check_beam,
+    check_range_db,
+    check_shape,
+)
 from warprrf.steps import digest
 
 _PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
@@ -127,9 +134,7 @@ class RadioField(ABC):
             ValueError: if it is corrupt, or no radio field (of this model).
         """
         tensors, header = tensor_files.read(path)
-        found = cls.models[
-            "bistatic" if header.get("model") == "bistatic" else "rf3dgs+"
-        ]  # which reads rf3dgs too
+        found = cls.models.get(str(header.get("model")), cls.models["rf3dgs+"])
         if not issubclass(found, cls):
             raise ValueError(f"{os.fspath(path)}: holds a {found.__name__}, expected a {cls.__name__}")
         with tensor_files.named(path, "corrupt, or no radio field of this version"):
@@ -420,11 +425,7 @@ class RadioField(ABC):
         ends = self.check_positions(receivers, transmitter)
         rows, found = np.zeros(0, int), []
         for source, own in ends.groups():
-            tell = (
-                None
-                if progress is None
-                else partial(_progress_after, progress, len(rows), len(ends.receivers))
-            )
+            tell = progress and partial(_progress_after, progress, len(rows), len(ends.receivers))
             options = LinkOptions(beam_sigma_rad, shape, mirror_order, client, tell)
             found.append(self.trace_links(ends.receivers[own], source, options))
             rows = np.concatenate([rows, own])
@@ -526,9 +527,7 @@ class RadioField(ABC):
         check_number("frequency_hz", self.frequency_hz, *CARRIERS_HZ)
         check_shape(self.shape)
         check_positive("floor", self.floor, "linear noise floor")
-        low, high = (check_number("range_db", value, -1e4, 1e4) for value in self.range_db)
-        if not low <= high:
-            raise ValueError(f"range_db: got {self.range_db}, expected the lower end first")
+        check_range_db(self.range_db)
         check_beam(self.beam_sigma_rad)
         known = check_array("fitted_on", self.fitted_on, (None, 3))
         if self.fitted_under is not None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import os
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,7 @@ def write_deepmimo(
         )
     carrier = paths.carrier_hz
     coefficient, _ = paths.cir(diffuse=diffuse if scattered else None, seed=seed)
-    several = paths if paths.batched else Paths.stack([paths])
+    several = paths.as_several()
     coefficient = coefficient.reshape(several.gain.shape)
     matrices = _matrices(several, coefficient, max_paths)
     for key, values in matrices.items():
@@ -79,21 +80,16 @@ def write_deepmimo(
         "version": _VERSION,
         "rt_params": {
             "raytracer_name": "warprrf",
-            "raytracer_version": _warprrf_version(),
+            "raytracer_version": version("warprrf"),
             "frequency": carrier,
             "max_path_depth": int(bounces.max(initial=0)),
             "max_reflections": int(mirrors),
-            "max_diffractions": 0,
             "max_scattering": int(scattered),
-            "max_transmissions": 0,
-            "diffuse_reflections": 0,
-            "diffuse_diffractions": 0,
-            "diffuse_transmissions": 0,
+            **{f"max_{kind}": 0 for kind in ("diffractions", "transmissions")},
+            **{f"diffuse_{kind}": 0 for kind in ("reflections", "diffractions", "transmissions")},
             "diffuse_final_interaction_only": True,
             "diffuse_random_phases": diffuse == "random_phase",
-            "terrain_reflection": False,
-            "terrain_diffraction": False,
-            "terrain_scattering": False,
+            **{f"terrain_{kind}": False for kind in ("reflection", "diffraction", "scattering")},
             "num_rays": 0,
             "ray_casting_method": "image method",
             "synthetic_array": True,
@@ -221,9 +217,3 @@ def _material(k: int, material: Any, carrier: float) -> dict[str, Any]:
         "roughness": float(material.roughness_m),
         "thickness": float(material.thickness_m),
     }
-
-
-def _warprrf_version() -> str:
-    from warprrf import __version__
-
-    return __version__

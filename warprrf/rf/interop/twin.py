@@ -70,8 +70,8 @@ class Reflection:
 
 
 @dataclass(frozen=True)
-class TwinGroup:
-    """One material of a twin.
+class TwinGroup(Reflection):
+    """One material of a twin; its relative permittivity and errors are those of :class:`Reflection`.
 
     Attributes:
         name: its largest group's name in the field.
@@ -79,10 +79,7 @@ class TwinGroup:
         material: what it became.
         permittivity: complex relative permittivity at the carrier.
         thickness_m: of the slab [m]; inf where it stands for a half-space.
-        scattering: scattering coefficient S.
         alpha_r: exponent of its lobe, 0 for Lambertian.
-        scattering_error_db: error of the power that it scatters, rms over incidence [dB].
-        mirror_error_db: error of the power that it mirrors, rms over incidence [dB].
         lobe_error_db: what one lobe misses of the fitted mix, rms over both directions [dB].
     """
 
@@ -91,10 +88,7 @@ class TwinGroup:
     material: Material = dataclasses.field(repr=False)
     permittivity: complex
     thickness_m: float
-    scattering: float
     alpha_r: int
-    scattering_error_db: float
-    mirror_error_db: float
     lobe_error_db: float
 
 
@@ -353,15 +347,13 @@ def _project(field: BistaticField, g: int, name: str, area: float, thickness_m: 
         },
     )
     return TwinGroup(
+        **vars(reflection),
         name=field.surface.group_names[g],
         area_m2=area,
         material=material,
         permittivity=material.permittivity(frequency),
         thickness_m=thickness_m if known else np.inf,
-        scattering=material.scattering_coefficient(frequency),
         alpha_r=alpha_r,
-        scattering_error_db=reflection.scattering_error_db,
-        mirror_error_db=reflection.mirror_error_db,
         lobe_error_db=lobe_error,
     )
 

@@ -21,12 +21,9 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.netcdf_files import Variable
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.maps.links import LinkOptions, Links
-from warprrf.rf.positions import (
-    NEAR_FIELD,
-    check_positions,
-    ground_height,
-    is_free,
-)
+from warprrf.rf.positions import NEAR_FIELD, check_positions, ground_height, is_free
+from warprrf.rf.spectra.spectrum import to_db
+from warprrf.tensor_files import named
 
 _FORMAT = "warprrf radio map 1"
 _LAYERS = {
@@ -86,28 +83,24 @@ class RadioMap:
 
     def __post_init__(self) -> None:
         """Check shapes and values; ValueError or TypeError names the field."""
-        x, y = (check_array(name, getattr(self, name), (None,)) for name in ("x", "y"))
-        fields: dict[str, Any] = {
-            "x": x,
-            "y": y,
-            "transmitter": check_array("transmitter", self.transmitter, (3,)),
-            "outline": check_array("outline", self.outline, (None, 2, 2)),
-        }
-        for name in _PLAIN:
-            fields[name] = check_number(name, getattr(self, name))
+        fields: dict[str, Any] = {name: check_number(name, getattr(self, name)) for name in _PLAIN}
+        shapes = {"x": (None,), "y": (None,), "transmitter": (3,), "outline": (None, 2, 2)}
+        for name, shape in shapes.items():
+            fields[name] = check_array(name, getattr(self, name), shape)
+        cells = len(fields["y"]), len(fields["x"])
         for name in ("cell_m", "frequency_hz", "beam_sigma_rad"):
             check_positive(name, fields[name])
         for name in ("x", "y"):
             if not (np.abs(np.diff(fields[name]) - self.cell_m) < 1e-3 * self.cell_m).all():
                 raise ValueError(f"{name}: got {fields[name]}, expected steps of cell_m, {self.cell_m:g} m")
         for name in _LAYERS:
-            fields[name] = check_array(name, getattr(self, name), (len(y), len(x)), finite=False)
+            fields[name] = check_array(name, getattr(self, name), cells, finite=False)
             if not (np.isnan(fields[name]) | (fields[name] >= 0) & np.isfinite(fields[name])).all():
                 raise ValueError(
                     f"{name}: got negative or infinite values, expected none, or NaN outside the air"
                 )
         if self.ground_m is not None:
-            fields["ground_m"] = check_array("ground_m", self.ground_m, (len(y), len(x)), finite=False)
+            fields["ground_m"] = check_array("ground_m", self.ground_m, cells, finite=False)
         for name, value in fields.items():
             object.__setattr__(self, name, value)
 
@@ -126,9 +119,7 @@ class RadioMap:
     @property
     def best_beam_snr_db(self) -> np.ndarray:
         """Signal-to-noise ratio of the best beam [dB], shape ``(Y, X)``; another budget shifts it by a constant."""
-        with np.errstate(divide="ignore"):
-            gain = 10.0 * np.log10(self.best_beam_gain)
-        return self.transmit_power_dbm + gain - self.noise_power_dbm
+        return self.transmit_power_dbm + to_db(self.best_beam_gain) - self.noise_power_dbm
 
     def plot_values(self, quantity: str) -> np.ndarray:
         """``quantity`` as it is drawn: gains in dB, delay spread in ns, shape ``(Y, X)``.
@@ -140,10 +131,7 @@ class RadioMap:
         value = np.asarray(getattr(self, quantity))
         if quantity == "delay_spread_s":
             return value * 1e9
-        if quantity.endswith("_db"):
-            return value
-        with np.errstate(divide="ignore"):
-            return np.asarray(10.0 * np.log10(value))
+        return value if quantity.endswith("_db") else to_db(value)
 
     def plot(self, quantity: str = "total_path_gain", ax: Any = None, **options: Any) -> Any:
         """Draw one quantity over the floor plan into ``ax`` (a new one by default); returns the axes.
@@ -211,7 +199,7 @@ class RadioMap:
             ValueError: naming it, if it is damaged, or holds something else.
         """
         arrays, attributes = netcdf_files.read(path, _VARIABLES, {})
-        try:
+        with named(path, "damaged, or no radio map"):
             if attributes.get("format") != _FORMAT:
                 raise ValueError(f"it holds {attributes.get('format')!r}, expected {_FORMAT!r}")
             for axis, name in enumerate(("y", "x")):
@@ -220,8 +208,6 @@ class RadioMap:
                     arrays[held] = arrays[held].take(order, axis=min(axis, arrays[held].ndim - 1))
             fields: dict[str, Any] = {**arrays, **{name: attributes[name] for name in _PLAIN}}
             return cls(**fields)
-        except (KeyError, IndexError, TypeError, ValueError) as error:
-            raise ValueError(f"{os.fspath(path)}: damaged, or no radio map: {error}") from error
 
 
 _PLAIN = ("height_m", "cell_m", "frequency_hz", "beam_sigma_rad", "transmit_power_dbm", "noise_power_dbm")

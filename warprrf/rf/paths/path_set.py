@@ -17,12 +17,20 @@ from typing import Any
 import numpy as np
 
 from warprrf import netcdf_files
-from warprrf.checks import Expected, check_arrays, check_positive, checked, lengths, one_line
+from warprrf.checks import (
+    Expected,
+    check_arrays,
+    check_known_whole,
+    check_positive,
+    checked,
+    lengths,
+    one_line,
+)
 from warprrf.netcdf_files import Variable
 from warprrf.rf.channel import dispersion as dispersions
 from warprrf.rf.channel import response
 from warprrf.rf.channel.arrays import PlanarArray
-from warprrf.rf.channel.path_arrays import PathArrays
+from warprrf.rf.channel.path_arrays import PADDING, PathArrays
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.paths import sionna
 from warprrf.tensor_files import named
@@ -204,16 +212,25 @@ def read_paths(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bool]:
             raise ValueError(f"it holds {attributes.get('format')!r}, expected {_FORMAT!r}")
         check_arrays(held, {name: wanted for name, wanted in _ARRAYS.items() if name in held})
         carrier = attributes.get("frequency_hz")
+        there = {"jones_real", "jones_imag"} & held.keys()
         fields: dict[str, Any] = {
             "gain": held["gain_real"] + 1j * held["gain_imag"],
             "vertices": held["vertices"],
             "kind": np.array(KINDS, dtype="<U7")[held["kind"].astype(int)],
             "valid": held["valid"].astype(bool),
-            "jones": held["jones_real"] + 1j * held["jones_imag"] if "jones_real" in held else None,
+            "jones": held["jones_real"] + 1j * held["jones_imag"] if there else None,
             "frequency_hz": None if carrier is None else check_positive("frequency_hz", carrier),
             "transmitter": held.get("transmitter_position", held.get("transmitter_positions")),
             "receiver": held.get("receiver_position"),
             "air": Air.from_attributes(attributes),
             **{name: held[name] for name in (*_UNITS, "interactions") if name in held},
         }
+        for name, empty in PADDING.items():
+            if fields[name] is not None:
+                fields[name][~fields["valid"]] = empty
+        check_known_whole("vertices", fields["vertices"])
+        for way, angles in (("arrival", ("theta_r", "phi_r")), ("departure", ("theta_t", "phi_t"))):
+            check_known_whole(way, np.stack([fields[name] for name in angles], axis=-1))
+        if there:
+            check_known_whole("jones", fields["jones"], axes=2)
         return fields, bool(attributes["single_receiver"])

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,7 +38,7 @@ class SionnaPaths:
         interactions: ``sionna.rt.InteractionType`` (1 specular, 2 diffuse, 4 refraction, 8 diffraction, 0 none), shape
             ``(depth, R, 1, L)``.
         vertices: Interaction points [m], shape ``(depth, R, 1, L, 3)``; 0 where none.
-        synthetic_array: True.
+        synthetic_array: always True.
     """
 
     __repr__ = one_line
@@ -52,7 +52,7 @@ class SionnaPaths:
     valid: np.ndarray
     interactions: np.ndarray
     vertices: np.ndarray
-    synthetic_array: bool
+    synthetic_array: ClassVar[bool] = True
     _paths: PathArrays
     _options: dict[str, Any]
 
@@ -158,7 +158,6 @@ def to_sionna(
         valid=valid[:, None],
         interactions=np.moveaxis(np.where(there, several.interactions, 0).astype(int), -1, 0)[:, :, None],
         vertices=np.moveaxis(np.where(there[..., None], several.vertices, 0.0), -2, 0)[:, :, None],
-        synthetic_array=True,
         _paths=several,
         _options=options,
     )

@@ -1,6 +1,6 @@
 """The full model of a scene at a few receivers, with any of its effects left out.
 
-All that a bistatic field can model is switched on; air, edges and walls are added as estimates. A reduced model is the
+All that a bistatic field can model is switched on; air and edges are added as estimates. A reduced model is the
 same field with fewer effects; path gains add up by sequence of interactions, so what has been computed is kept.
 """
 
@@ -160,13 +160,15 @@ class FullModel:
             self.views.append(field.view(receiver))
             field.path_gains(self.views[-1])
             progress("relevance", r + 1, len(receivers) + 1)
-        self.blocked = np.array([not (v.paths.order == 0).any() for v in self.views])
+        self.blocked = np.array([not ((v.paths.order == 0) & (v.paths.slabs == 0)).any() for v in self.views])
         which = np.flatnonzero(self.blocked)
         past = past_obstacles(
             walls, field.transmitter, receivers[which], field.wavelength_m,
             position_error_m=field.surface.position_error_m, device=field.device
         )  # fmt: skip
-        self.side = {name: replace(found, receiver=which[found.receiver]) for name, found in past.items()}
+        self.side = {
+            "diffraction": replace(past["diffraction"], receiver=which[past["diffraction"].receiver])
+        }
         residual = ("residual",) if field.effects.residual else ()
         self.effects = (*NAMES, *residual, *map(lobe_name, field.parameters.lobes), "gas", *self.side)
         self.all = frozenset(self.effects)
@@ -247,6 +249,7 @@ class FullModel:
 
 NAMES = (
     "line_of_sight", "mirrors_1", "mirrors_2", "scatterings_1", "mirror_scatter", "scatter_mirror", "scatterings_2",
+    "transmission",
 )  # fmt: skip
 """Effects of every model, in the order of the table."""
 
@@ -260,6 +263,7 @@ def effects_of(kept: frozenset[str]) -> Effects:
         scatterings=scattering * (3 if "scatterings_2" in kept else 1),
         mirror_scatter=scattering and "mirror_scatter" in kept,
         scatter_mirror=scattering and "scatter_mirror" in kept,
+        transmissions=3 if "transmission" in kept else 0,
         residual="residual" in kept,
     )
 

@@ -45,7 +45,7 @@ TITLES = {
     "diffraction": "diffraction (knife edge, ITU-R P.526)",
     "transmission": "transmission through walls (ITU-R P.2040)",
 }
-OUTSIDE = ("diffraction", "transmission")
+OUTSIDE = ("diffraction",)
 """Effects that a bistatic field does not model."""
 ALIKE_DB = 0.01  # losses that round to the same hundredth of a dB are alike: then cost decides
 NEEDS = {

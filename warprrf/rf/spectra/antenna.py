@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias, TypedDict, Unpack
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,16 +34,6 @@ FIXED = "fixed antenna: divided by its gain in each direction"
 
 Pattern: TypeAlias = Callable[[np.ndarray], ArrayLike] | Sequence[float] | np.ndarray
 """Power gain [linear]: a function of the angle off boresight [rad], or samples of it from 0 to pi."""
-
-
-class DeembedOptions(TypedDict, total=False):
-    """Options by the kind of antenna: ``limit_db`` for a fixed one, the others (:class:`Scan`) for a scanned one."""
-
-    snapshots: int
-    iterations: int
-    tolerance: float
-    device: DeviceLike
-    limit_db: float
 
 
 @dataclass(frozen=True)
@@ -103,11 +93,12 @@ def deembed(
     boresight_gain_dbi: float | None = None,
     noise: float = 0.0,
     progress: _device.Progress | None = None,
-    **options: Unpack[DeembedOptions],
+    **options: Any,
 ) -> Deembedded:
     """``path_gain`` (R, H, W) without the antenna; see :meth:`warprrf.SpectrumDataset.deembed`.
 
-    A pattern ``(H, W)`` is a fixed antenna's, any other a scanned one's.
+    A pattern ``(H, W)`` is a fixed antenna's, which takes the option ``limit_db``; any other a scanned one's, with those
+    of :class:`Scan`.
 
     Raises:
         TypeError: for an option of the other kind of antenna.
@@ -120,11 +111,11 @@ def deembed(
         pattern = check_array("pattern", pattern, finite=False)
     if callable(pattern) or pattern.ndim != 2:
         kernel = scanned_kernel(pattern, check_shape(power.shape[1:]), boresight_gain_dbi)
-        return _deembed_scanned(power, kernel, beam_sigma_rad, Scan(noise=noise, **options), progress)  # type: ignore[misc]
+        return _deembed_scanned(power, kernel, beam_sigma_rad, Scan(noise=noise, **options), progress)
     if noise != 0.0:
         raise ValueError("noise: a fixed antenna's spectra are divided as they are; take the noise off first")
     gain = _gains(check_array("pattern", pattern, power.shape[1:]), boresight_gain_dbi)
-    return _deembed_fixed(power, gain, **options)  # type: ignore[misc]
+    return _deembed_fixed(power, gain, **options)
 
 
 def scanned_kernel(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, Unpack, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +17,7 @@ from warprrf.device import DeviceLike
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra import dataset_files
-from warprrf.rf.spectra.antenna import DeembedOptions, Pattern, deembed
+from warprrf.rf.spectra.antenna import Pattern, deembed
 from warprrf.rf.spectra.levels import free_space_gain, question_levels
 from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
@@ -379,7 +379,7 @@ class SpectrumDataset:
         boresight_gain_dbi: float | None = None,
         noise: float = 0.0,
         progress: _device.Progress | None = None,
-        **options: Unpack[DeembedOptions],
+        **options: Any,
     ) -> SpectrumDataset:
         """These spectra without the antenna that measured them.
 

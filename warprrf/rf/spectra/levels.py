@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from warprrf.checks import some_of, users_level
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.spectra.spectrum import to_db
 
 MARGIN_DB = 18.0
 """By how much all paths together may exceed line of sight: three mirror reflections in a corridor of perfect conductors
@@ -46,9 +47,7 @@ def question_levels(
     Warns:
         UserWarning: naming rows that are further above line of sight, and the likely unit.
     """
-    with np.errstate(divide="ignore"):
-        level_db = 10.0 * np.log10(np.nan_to_num(power, posinf=1e300))
-    line_of_sight_db = 10.0 * np.log10(free_space)
+    level_db, line_of_sight_db = to_db(np.nan_to_num(power, posinf=1e300)), to_db(free_space)
     above = level_db - line_of_sight_db
     wrong = np.flatnonzero(above > margin_db)
     impossible = np.flatnonzero(level_db >= 0.0)

@@ -120,14 +120,7 @@ def mean(train: SpectrumDataset) -> Lookup:
 
 
 def _nearest(receivers: np.ndarray, train: SpectrumDataset, receiver: np.ndarray) -> Spectrum:
-    i = int(np.argmin(np.linalg.norm(receivers - receiver, axis=-1)))
-    return Spectrum(
-        path_gain=np.array(train.path_gain[i], dtype=np.float32),
-        delay_s=np.array(train.delay_s[i]),
-        aod=np.array(train.aod[i]),
-        floor=float(train.floor),
-        range_db=train.range_db,
-    )
+    return train[int(np.argmin(np.linalg.norm(receivers - receiver, axis=-1)))]
 
 
 def _idw(

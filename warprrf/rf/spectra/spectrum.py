@@ -19,7 +19,15 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_number, check_positive, check_type, checked, one_line
+from warprrf.checks import (
+    check_array,
+    check_known_whole,
+    check_number,
+    check_positive,
+    check_type,
+    checked,
+    one_line,
+)
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
 
@@ -65,8 +73,8 @@ def check_range_db(range_db: Sequence[float]) -> tuple[float, float]:
         TypeError, ValueError: if it is not two finite numbers, or the first lies above the second.
     """
     low, high = (float(value) for value in check_array("range_db", range_db, (2,)))
-    if low > high:
-        raise ValueError(f"range_db: got {low:g} to {high:g}, expected the lowest value first")
+    if not -1e4 <= low <= high <= 1e4:
+        raise ValueError(f"range_db: got {low:g} to {high:g}, expected decibels, the lowest value first")
     return low, high
 
 
@@ -87,6 +95,7 @@ def check_pixels(path_gain: np.ndarray, delay_s: np.ndarray | None, aod: np.ndar
         1e-3  # radians by which angles of departure may lie out of range: what compact files round
     )
     if aod is not None:
+        check_known_whole("aod", aod)
         zenith, azimuth, most = aod[..., 0], aod[..., 1], np.pi + angle_rounding
         if ((zenith < -angle_rounding) | (zenith > most) | (azimuth < -most) | (azimuth > most)).any():
             raise ValueError(
@@ -184,9 +193,10 @@ def pixel_of(directions: ArrayLike, shape: tuple[int, int]) -> tuple[np.ndarray,
     return row, np.floor((azimuth + np.pi) * columns / (2.0 * np.pi)).astype(np.int64) % columns
 
 
-def to_db(path_gain: ArrayLike, floor: float) -> np.ndarray:
-    """10 log10(P + N0) [dB], of linear path gain and the noise floor N0."""
-    return 10.0 * np.log10(np.asarray(path_gain, dtype=np.float64) + floor)
+def to_db(path_gain: ArrayLike, floor: float = 0.0) -> np.ndarray:
+    """10 log10(P + N0) [dB], of linear path gain and the noise floor N0; minus infinity of nothing."""
+    with np.errstate(divide="ignore"):
+        return 10.0 * np.log10(np.asarray(path_gain, dtype=np.float64) + floor)
 
 
 def default_floor(path_gain: np.ndarray) -> float:
@@ -523,8 +533,7 @@ class Spectrum:
     @property
     def path_gain_db(self) -> np.ndarray:
         """10 log10(P + N0) [dB], shape of ``path_gain``."""
-        with np.errstate(divide="ignore"):
-            return to_db(self.path_gain, self.floor)
+        return to_db(self.path_gain, self.floor)
 
     @property
     def total_path_gain(self) -> Any:

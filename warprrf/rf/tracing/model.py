@@ -262,6 +262,14 @@ class Layout:
         """Places of what each of ``group`` lets through, if that is free."""
         return self.stride * group + self.lobes + 2
 
+    def columns(self, groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where the parameters of each group begin in a table of those of ``groups`` alone, shape ``(G,)`` int32, and the places of
+        its columns in the vector."""
+        own = np.unique(groups)
+        place = np.zeros(self.groups, np.int32)
+        place[own] = self.stride * np.arange(len(own))
+        return place, (self.stride * own[:, None] + np.arange(self.stride)).ravel()
+
     def pack(self, p: Parameters) -> np.ndarray:
         """Vector of ``p``."""
         columns = [p.log_excess, p.log_mirror, *[p.log_through] * self.through]

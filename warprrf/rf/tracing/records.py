@@ -8,6 +8,7 @@ Mirrors and line of sight, paths of one direction each, are the table ``"specula
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Any
@@ -65,6 +66,23 @@ class Records:
         """Whether elements send."""
         return bool((self.kind[:1] == kernels.SOURCE).any())
 
+    @classmethod
+    def joined(cls, tables: Sequence[Records]) -> Records:
+        """Tables of one sequence one after another, each with kinds of its own; shorter records meet nothing at their end."""
+        most = max(table.index.shape[1] for table in tables)
+
+        def column(name: str, nothing: int) -> np.ndarray:
+            arrays = [getattr(table, name) for table in tables]
+            more = [[(0, 0), (0, most - a.shape[1]), (0, 0)][: a.ndim] for a in arrays]
+            return np.concatenate(
+                [np.pad(a, pad, constant_values=nothing) for a, pad in zip(arrays, more, strict=True)]
+            )
+
+        power, ray = (np.concatenate([getattr(table, name) for table in tables]) for name in ("power", "ray"))
+        return replace(
+            tables[0], power=power, ray=ray, index=column("index", -1), angle=column("angle", 0), kind=column("kind", 0)
+        )  # fmt: skip
+
     def take(self, rows: np.ndarray) -> Records:
         """The records ``rows``."""
         kind = self.kind if len(self.kind) == 1 else self.kind[rows]
@@ -109,6 +127,12 @@ class Records:
         self._add(
             "bin_slopes", materials, bins, [wp.array(place, dtype=wp.int32, device=materials.device)], slopes
         )
+
+    def slopes(self, materials: Evaluation, place: np.ndarray, count: int) -> np.ndarray:
+        """Those of each record, shape ``(N, count)``."""
+        found = np.zeros((len(self), count))
+        self.add_slopes(materials, Bins.of(np.arange(len(self)), len(self)), place, found)
+        return found
 
     def components(self, materials: Evaluation, bins: Bins) -> tuple[np.ndarray, np.ndarray]:
         """What groups scatter into each bin at unit weight: the groups that do, shape ``(A,)``, and sums by lobe and

@@ -127,8 +127,10 @@ class View:
 
     def kept_paths(self, effects: Effects) -> np.ndarray:
         """Which line of sight and mirror paths count, shape ``(L,)`` bool."""
-        order, few = self.paths.order, self.paths.slabs <= effects.transmissions
-        return np.asarray(few & (order <= effects.mirrors) & ((order > 0) | effects.line_of_sight))
+        order, slabs = self.paths.order, self.paths.slabs
+        sight = (order == 0) & (slabs == 0)
+        few = (order <= effects.mirrors) & (slabs <= effects.transmissions)
+        return np.asarray(few & (~sight | effects.line_of_sight))
 
 
 @dataclass(frozen=True)

@@ -133,7 +133,7 @@ class BistaticField(RadioField):
             raise ValueError(
                 f"material: got {np.unique(self.material)}, expected all of 0 to {materials - 1}"
             )
-        known = Layout(materials, sizes["L"], through=self.effects.transmissions > 0).size
+        known = Layout(materials, sizes["L"], through=True).size
         if self.errors is not None and len(self.errors.covariance) not in (known, known + 1):
             raise ValueError(
                 f"errors: got a covariance of {len(self.errors.covariance)} parameters, expected {known}, or one more for a "
@@ -535,7 +535,7 @@ class BistaticField(RadioField):
         rows = np.unique(self.material, return_index=True)[1]
         lit = self.evaluation(view.tracer)
         materials = lit.by_materials(self.parameters.take(rows), self.material)
-        layout = Layout(len(rows), len(self.parameters.lobes), through=self.effects.transmissions > 0)
+        layout = Layout(len(rows), len(self.parameters.lobes), through=True)
         place = Place(
             0, rows[:1], view.tracer.transmitter, view.receivers[0], self.frequency_hz, self.shape, self.air
         )

@@ -23,7 +23,7 @@ from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import Data, Measured
-from warprrf.rf.fields.bistatic.gauss_newton import Fitted, Problem, gauss_newton, layout_of
+from warprrf.rf.fields.bistatic.gauss_newton import THROUGH, Fitted, Problem, gauss_newton, layout_of
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, WeighedPaths, read
 from warprrf.rf.fields.bistatic.merging import BY_SHAPE, Merging, merge
 from warprrf.rf.fields.bistatic.needs import MOST_BLOCKED, slabs_needed
@@ -715,16 +715,15 @@ class Unexplained:
 
 def unexplained(t: Training, model: Model) -> Unexplained:
     """What ``model`` cannot explain."""
-    rows, left = [], dict[str, list[float]]()
-    predicted = t.predicted(model, range(len(t.observations)))
-    for o, power in zip(t.observations, predicted, strict=True):
-        wrong, target = np.zeros(0, int), o.target
-        if isinstance(o.measured, WeighedPaths) and target.trust is not None and target.censored is not None:
+    rows, left = [np.zeros(0, int) for _ in t.observations], dict[str, list[float]]()
+    tables = [k for k, o in enumerate(t.observations) if isinstance(o.measured, WeighedPaths)]
+    for k, power in zip(tables, t.predicted(model, tables), strict=True):
+        o, target = t.observations[k], t.observations[k].target
+        if target.trust is not None and target.censored is not None:
             error = target.error(power)
-            wrong = np.flatnonzero(np.abs(error) > UNEXPLAINED * NOISE_DB)
+            rows[k] = np.flatnonzero(np.abs(error) > UNEXPLAINED * NOISE_DB)
             clear = ~target.censored & (target.db > CLEAR_DB)
             left.setdefault(t.names[o.place.data], []).extend((error / target.trust)[clear])
-        rows.append(wrong)
     noise = {
         name: NORMAL_MEDIAN * float(np.median(np.abs(errors))) for name, errors in left.items() if errors
     }
@@ -833,10 +832,16 @@ def side_lobes(t: Training, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _covariance(found: Fitted, gain: bool, through: bool) -> np.ndarray:
-    """Of what a field keeps: parameters of materials and the common gain, if that was free."""
-    p = found.parameters
-    kept = Layout(*p.log_weight.shape, through=through, gain=gain).size
-    return found.covariance[:kept, :kept]
+    """Of what a field keeps: parameters of materials, with what they let through as it is known before where that was not free;
+    and the common gain, if that was."""
+    layout, whole = (
+        Layout(*found.parameters.log_weight.shape, through=t, gain=gain) for t in (through, True)
+    )
+    free = np.ones(whole.size, bool)
+    free[whole.passage(np.arange(whole.groups))] = through
+    covariance = np.where(free, 0.0, THROUGH**2) * np.eye(whole.size)
+    covariance[np.ix_(free, free)] = found.covariance[: layout.size, : layout.size]
+    return covariance
 
 
 def _report(t: Training, choice: Choice, wrong: Unexplained, seconds: float) -> dict[str, Any]:

@@ -53,17 +53,19 @@ def slabs_needed(surface: Surface, places: Sequence[Place], device: DeviceLike =
         blocked = blocked[
             np.unique(np.linspace(0, len(blocked) - 1, min(len(blocked), MOST_BLOCKED)).astype(int))
         ]
-        changes += [_change(tracer, place) for place in blocked]
-    return MOST_SLABS if changes and np.sqrt(np.mean(np.square(changes))) > NEEDED_DB else 0
+        if len(blocked):
+            changes.append(_changes(tracer, blocked))
+    return MOST_SLABS if changes and np.sqrt(np.mean(np.square(np.concatenate(changes)))) > NEEDED_DB else 0
 
 
-def _change(tracer: Tracer, receiver: np.ndarray) -> float:
-    """By how much slabs raise the total path gain of a receiver (3,) over mirrors and single scatterings [dB]."""
+def _changes(tracer: Tracer, receivers: np.ndarray) -> np.ndarray:
+    """By how much slabs raise the total path gain of each of ``receivers`` (R, 3) over mirrors and single scatterings [dB]."""
     p, none = assumed(tracer.surface, tracer.frequency_hz), np.zeros((2, tracer.surface.cells))
-    total = []
+    effects = replace(SETS["single"], mirrors=2, transmissions=MOST_SLABS, residual=False)
+    view, total = tracer.view(receivers, effects), []
     for most in (0, MOST_SLABS):
-        effects = replace(SETS["single"], mirrors=2, transmissions=most, residual=False)
-        model = Model(effects, p, none, tracer.transmitter)
-        gains = path_gains(tracer.view(receiver, effects), model, evaluation(tracer, model))
-        total.append(sum(float(power.sum()) for power in gains.tables.values()))
-    return float(NEPER * np.log(max(total[1], 1e-300) / max(total[0], 1e-300)))
+        model = Model(replace(effects, transmissions=most), p, none, tracer.transmitter)
+        gains = path_gains(view, model, evaluation(tracer, model))
+        direct = np.bincount(view.paths.receiver, gains.specular, len(receivers))
+        total.append(direct + gains.by_ray().reshape(len(receivers), -1).sum(axis=1))
+    return np.asarray(NEPER * np.log(np.maximum(total[1], 1e-300) / np.maximum(total[0], 1e-300)))

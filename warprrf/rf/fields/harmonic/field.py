@@ -121,16 +121,9 @@ class HarmonicField(RadioField):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        wanted = set(self.layers) - set(LAYERS[self.model])
-        if wanted:
-            raise ValueError(
-                f"layers: got {', '.join(sorted(wanted))}, expected {', '.join(LAYERS[self.model])}"
-            )
-        lacking = set(LAYERS[self.model]) - set(self.layers)
-        if lacking and len(self.layers) > 1:
-            raise ValueError(
-                f"layers: got no {', '.join(sorted(lacking))}, expected the gain alone or every layer"
-            )
+        given, known = ", ".join(self.layers), LAYERS[self.model]
+        if set(self.layers) not in (set(), {"gain"}, set(known)):
+            raise ValueError(f"layers: got {given}, expected the gain alone or {', '.join(known)}")
         most_coefficient = 1e9
         table = Expected(f"N {_kernels.COEFFICIENTS}", -most_coefficient, most_coefficient)
         check_arrays(self.layers, dict.fromkeys(self.layers, table), N=len(self.gaussians))

@@ -14,14 +14,12 @@ import numpy as np
 import warp as wp
 
 from warprrf.device import DeviceLike, Progress
-from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import Blending
-from warprrf.geometry.splats.render import blend_weights
 from warprrf.kernels.adam import EPSILON, FIRST_DECAY, SECOND_DECAY, corrections
 from warprrf.kernels.radio import opacity as _kernels
 from warprrf.rf.fields.harmonic.problem import Problem
-from warprrf.rf.fields.harmonic.transport import Transport, cutoffs
+from warprrf.rf.fields.harmonic.transport import Transport, cutoffs, views
 
 
 @dataclass(frozen=True)
@@ -67,20 +65,10 @@ def list_responses(
     rules = cutoffs(range_db)
     share = 0.5  # of each opacity
     thin = replace(gaussians, opacities=(share * gaussians.opacities).astype(np.float32))
-    thinned_left = (
-        1e-4  # transmittance at which a thinned list ends: float32 weights give alpha to 0.1 % there
-    )
-    blending = Blending(share * rules.alpha_min, rules.alpha_max, thinned_left, "product")
+    # transmittance at which a list ends: float32 weights give alpha to 0.1 % there
+    blending = Blending(share * rules.alpha_min, rules.alpha_max, 1e-4, "product")
     counts, indices, responses = [], [], []
-    rows, columns = seen.shape
-    for k, receiver in enumerate(seen.receivers):
-        view = blend_weights(
-            thin,
-            Camera.spherical(columns, rows, position=receiver),
-            top_k=top_k,
-            blending=blending,
-            device=device,
-        )
+    for view in views(thin, seen.receivers, seen.shape, top_k, blending, device=device, progress=progress):
         weight = np.asarray(view.weight, np.float64)
         listed = (np.asarray(view.index) >= 0) & (weight > 0)
         weight = np.where(listed, weight, 0.0)
@@ -90,8 +78,6 @@ def list_responses(
         counts.append(np.count_nonzero(listed, axis=-1).ravel())
         indices.append(index)
         responses.append(np.minimum(alpha[listed] / thin.opacities[index], 1.0).astype(np.float32))
-        if progress is not None:
-            progress("transport", k + 1, len(seen.receivers))
     start = np.concatenate([[0], np.cumsum(np.concatenate(counts))]).astype(np.int64)
     gaussian = np.concatenate(indices).astype(np.int32)
     response = np.concatenate(responses)

@@ -12,7 +12,7 @@ An interaction point stands for the whole ray, as in the paper: the centre of th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -147,13 +147,8 @@ def transport(
         raise ValueError("receivers: got none, expected at least one position")
     rows, columns = check_shape(shape)
     blending = cutoffs(range_db, rule)
-    views = []
-    for i, position in enumerate(positions):
-        camera = Camera.spherical(columns, rows, position=position)
-        views.append(_kept(blend_weights(gaussians, camera, top_k=top_k, blending=blending, device=device)))
-        if progress is not None:
-            progress("transport", i + 1, len(positions))
-    counts, gaussian, weight, dominant, expected = zip(*views, strict=True)
+    seen = views(gaussians, positions, (rows, columns), top_k, blending, device=device, progress=progress)
+    counts, gaussian, weight, dominant, expected = zip(*map(_kept, seen), strict=True)
     return Transport(
         shape=(rows, columns),
         receivers=positions,
@@ -164,6 +159,24 @@ def transport(
         expected_range=np.stack(expected),
         rule=rule,
     )
+
+
+def views(
+    gaussians: Gaussians,
+    receivers: np.ndarray,
+    shape: tuple[int, int],
+    top_k: int,
+    blending: Blending,
+    *,
+    device: DeviceLike,
+    progress: Progress | None,
+) -> Iterator[BlendWeights]:
+    """What each of ``receivers`` (R, 3) sees on a grid of ``shape``."""
+    for k, position in enumerate(receivers):
+        camera = Camera.spherical(shape[1], shape[0], position=position)
+        yield blend_weights(gaussians, camera, top_k=top_k, blending=blending, device=device)
+        if progress is not None:
+            progress("transport", k + 1, len(receivers))
 
 
 def _kept(seen: BlendWeights) -> tuple[np.ndarray, ...]:
