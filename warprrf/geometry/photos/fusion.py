@@ -44,7 +44,9 @@ EDGE_TOLERANCE = 8.0
 """A pixel is left out where inverse depth bends by more than this part of itself, per focal length in pixels: on a plane
 it is linear in the image, in a corner it bends, across an occluding edge it jumps."""
 MIN_VIEWS = 2  # a surface is kept where at least this many depth maps saw it
-TOUCHED = 4  # Open3D looks for blocks along every so many-th row and column, and refuses a map that shows none
+TOUCHED = (
+    4  # Open3D looks for blocks along every so many-th row and column, and refuses a map that shows none
+)
 BLOCK_VOXELS, BLOCKS = 16, 20_000  # voxels along a block's side; blocks set aside at first, the grid grows
 
 
