@@ -105,7 +105,7 @@ class DiffusePaths:
         power: Path gain [linear], shape ``(L,)``.
         length_m: Whole length [m], shape ``(L,)``.
         departure: Where they left the transmitter towards, not of unit length, shape ``(L, 3)``.
-        beams: Sums of the beam about each direction over the pixels, shape ``(L,)``.
+        beams: What :func:`beam_sums` gives for each direction, shape ``(L, 2)``.
         sequence: ``"S"`` scattered, ``"M"`` mirrored, ``"T"`` through slabs, from the transmitter on.
     """
 
@@ -117,8 +117,8 @@ class DiffusePaths:
     sequence: str
 
 
-_ARRAYS = ("direction", "power", "length_m", "departure", "beams")
-_NO_PATHS = {name: np.zeros((0, 3) if name in ("direction", "departure") else 0) for name in _ARRAYS}
+_ARRAYS = {"direction": (3,), "power": (), "length_m": (), "departure": (3,), "beams": (2,)}
+_NO_PATHS = {name: np.zeros((0, *size)) for name, size in _ARRAYS.items()}
 
 
 @dataclass(frozen=True)
