@@ -450,8 +450,6 @@ class Training:
     def start(self, material: np.ndarray) -> Parameters:
         """Parameters of materials before any measurement."""
         prior = Parameters.prior(int(material.max()) + 1, self.lobes, reciprocal=self.options.reciprocal)
-        if not self.candidates[0].transmissions:
-            return prior
         through = self.surface.slabs(frame_of(self.data).frequency_hz)[2]
         return replace(prior, log_through=np.bincount(material, through) / np.bincount(material))
 
