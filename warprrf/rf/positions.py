@@ -73,9 +73,7 @@ class Ends(NamedTuple):
         """
         to, source = check_receivers(name, receivers), check_receivers("transmitter", transmitter)
         if to.ndim == source.ndim == 2 and len(to) != len(source):
-            raise ValueError(
-                f"transmitter: got shape {source.shape}, expected (3,) or one for each receiver, {to.shape}"
-            )
+            raise ValueError(f"transmitter: got shape {source.shape}, expected (3,) or {to.shape}")
         rows = np.atleast_2d(*map(np.ascontiguousarray, np.broadcast_arrays(to, source)))
         return cls(rows[0], rows[1], to.ndim == source.ndim == 1)
 

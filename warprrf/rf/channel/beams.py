@@ -391,9 +391,7 @@ def rays_of(source: Source, tx: Codebook) -> Iterator[Rays]:
         departure = None
         if directed:
             if source.aod is None:
-                raise ValueError(
-                    "source: got a spectrum without aod, expected departure angles with a tx_array"
-                )
+                raise ValueError("source: got a spectrum without aod, expected departures with a tx_array")
             positive &= np.isfinite(source.aod).all(axis=-1)
             departure = directions_from_angles(source.aod[positive][:, 0], source.aod[positive][:, 1])
         yield departure, pixel_directions(source.shape)[positive], power[positive]
@@ -443,7 +441,7 @@ def _unpolarised(name: str, array: PlanarArray) -> None:
         raise TypeError(f"{name}: got {type(array).__name__}, expected a PlanarArray")
     if array.polarisation is not None:
         raise ValueError(
-            f"{name}: got polarisation {array.polarisation!r}, expected None: beams are chosen from powers"
+            f"{name}: got polarisation {array.polarisation!r}, expected None: powers choose beams"
         )
 
 

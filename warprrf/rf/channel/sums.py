@@ -298,9 +298,7 @@ def _ends(paths: PathArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         raise ValueError("paths: got ones without transmitter and receiver, which spherical waves need")
     bounces = np.isfinite(paths.vertices[..., 0]).sum(axis=1)
     if (bounces[paths.kind != "los"] == 0).any():
-        raise ValueError(
-            "paths: got mirror or diffuse paths without interaction points, which spherical waves need"
-        )
+        raise ValueError("paths: got some without the interaction points that spherical waves need")
     return paths.transmitter, paths.receiver, bounces
 
 

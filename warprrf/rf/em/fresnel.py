@@ -117,7 +117,7 @@ def _slab(
     ):
         if not fits.all():
             raise ValueError(
-                f"{name}: got {values[~fits].flat[0]!r}, expected a passive slab and a wave that meets it"
+                f"{name}: got {values[~fits].flat[0]!r}, expected a wave that meets a passive slab"
             )
     root = np.sqrt(eta - (1.0 - cos**2))
     root = np.where(root.imag > 0, -root, root)  # beyond total reflection the wave decays

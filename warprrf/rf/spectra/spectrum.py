@@ -80,9 +80,7 @@ def check_pixels(path_gain: np.ndarray, delay_s: np.ndarray | None, aod: np.ndar
         bad = int((path_gain < 0).sum())
         raise ValueError(f"path_gain: got {bad} negative values, expected linear path gain")
     if delay_s is not None and not (np.isnan(delay_s) | (delay_s >= 0) & (delay_s < np.inf)).all():
-        raise ValueError(
-            "delay_s: got values that are negative or infinite, expected seconds, or NaN where empty"
-        )
+        raise ValueError("delay_s: got negative or infinite values, expected seconds, or NaN where empty")
     angle_rounding = 1e-3  # radians by which angles of departure may lie out of range: by compact files
     if aod is not None:
         zenith, azimuth, most = aod[..., 0], aod[..., 1], np.pi + angle_rounding
@@ -96,9 +94,7 @@ def check_whole(name: str, path_gain: ArrayLike) -> None:
     """Raise ValueError, naming the argument, if pixels of spectra were not measured."""
     missing = int(np.isnan(path_gain).sum())
     if missing:
-        raise ValueError(
-            f"{name}: {missing} of {np.size(path_gain)} pixels were not measured (NaN), expected whole spectra"
-        )
+        raise ValueError(f"{name}: {missing} of {np.size(path_gain)} pixels are NaN, expected whole spectra")
 
 
 def pixel_angles(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -537,9 +533,7 @@ class Spectrum:
             ValueError: for spectra of several receivers.
         """
         if self.path_gain.ndim > 2:
-            raise ValueError(
-                f"spectrum: got {len(self.path_gain)} receivers, expected one: spectrum[0].plot()"
-            )
+            raise ValueError(f"spectrum: got {len(self.path_gain)} receivers, expected one: spectrum[0]")
         pyplot = _device.require("matplotlib.pyplot", extra="plots")
         if ax is None:
             _, ax = pyplot.subplots(figsize=(8.0, 4.0))

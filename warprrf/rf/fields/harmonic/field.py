@@ -177,9 +177,7 @@ class HarmonicField(RadioField):
         gaussians, mesh = _geometry(geometry)
         receivers, transmitter = check_dataset(mesh, ds, device=device)
         if mesh is None and (chosen.line_of_sight == "explicit" or chosen.interaction_point == "mesh"):
-            raise ValueError(
-                'line_of_sight="explicit" and interaction_point="mesh" need a mesh; the geometry has none'
-            )
+            raise ValueError('line_of_sight="explicit" and interaction_point="mesh" need a mesh; got none')
         images = check_array("ds.path_gain", ds.path_gain, (len(receivers), None, None), np.float64)
         blank = cls(
             gaussians=gaussians,
