@@ -301,9 +301,8 @@ def select_beams_multiuser(
         raise ValueError("sources: got none, expected a spectrum or paths for every user")
     served = _search(gains, noise * len(gains))
     received, transmitted = (np.array([served[u][k] for u in range(len(gains))]) for k in (0, 1))
-    return MultiUserChoice(
-        transmitted, received, signal_over_interference(gains, transmitted, received, noise)
-    )
+    sinr = signal_over_interference(gains, transmitted, received, noise)
+    return MultiUserChoice(transmitted, received, sinr)
 
 
 @checked

@@ -128,9 +128,8 @@ def gas_attenuation_db_per_m(
     f = f_hz[..., None] * 1e-9
     theta = 300.0 / temperature_k
     vapour_hpa = water_vapour_g_m3 * temperature_k / 216.7  # eq. (4)
-    imaginary = _oxygen(f, theta, pressure_hpa, vapour_hpa) + _water_vapour(
-        f, theta, pressure_hpa, vapour_hpa
-    )
+    state = f, theta, pressure_hpa, vapour_hpa
+    imaginary = _oxygen(*state) + _water_vapour(*state)
     per_km = 0.1820 * f[..., 0] * imaginary  # eq. (1)
     return float(per_km) * 1e-3 if f_hz.ndim == 0 else per_km * 1e-3
 

@@ -175,9 +175,8 @@ def reciprocal_factor(alpha_r: int, cosine: ArrayLike) -> np.ndarray:
     """
     cos = np.clip(np.asarray(cosine, dtype=np.float64), 0.0, 1.0)
     node, weighed = _reciprocal_nodes(int(alpha_r))
-    return np.asarray(
-        1.0 / (_around_the_normal(int(alpha_r), cos.ravel(), node) @ weighed).reshape(cos.shape)
-    )
+    held = _around_the_normal(int(alpha_r), cos.ravel(), node) @ weighed
+    return np.asarray(1.0 / held.reshape(cos.shape))
 
 
 @lru_cache(maxsize=64)

@@ -148,9 +148,8 @@ def sub_pixel_directions(shape: tuple[int, int], sub_pixels: int) -> tuple[np.nd
 def directions_from_angles(zenith: ArrayLike, azimuth: ArrayLike) -> np.ndarray:
     """Unit vectors, shape ``(..., 3)``, of zenith in [0, pi] and azimuth in (-pi, pi] [rad]."""
     zenith, azimuth = np.broadcast_arrays(np.asarray(zenith, float), np.asarray(azimuth, float))
-    return np.stack(
-        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1
-    )
+    sine = np.sin(zenith)
+    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=-1)
 
 
 def angles_from_directions(directions: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
@@ -163,9 +162,8 @@ def angles_from_directions(directions: ArrayLike) -> tuple[np.ndarray, np.ndarra
 def transverse_basis(directions: ArrayLike) -> np.ndarray:
     """Zenith and azimuth unit vectors at unit directions ``(..., 3)``, shape ``(..., 2, 3)``."""
     zenith, azimuth = angles_from_directions(directions)
-    up = np.stack(
-        [np.cos(zenith) * np.cos(azimuth), np.cos(zenith) * np.sin(azimuth), -np.sin(zenith)], axis=-1
-    )
+    cosine = np.cos(zenith)
+    up = np.stack([cosine * np.cos(azimuth), cosine * np.sin(azimuth), -np.sin(zenith)], axis=-1)
     around = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)], axis=-1)
     return np.stack([up, around], axis=-2)
 

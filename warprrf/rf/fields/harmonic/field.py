@@ -322,9 +322,8 @@ class HarmonicField(RadioField):
         visible, gain = self._line_of_sight(receiver, transmitter)
         if not visible:
             return None
-        return spread(
-            (transmitter - receiver)[None], [gain], self.shape, self.beam_sigma_rad, device=self.device
-        )
+        toward = (transmitter - receiver)[None]
+        return spread(toward, [gain], self.shape, self.beam_sigma_rad, device=self.device)
 
     def _free_space(self, length_m: float | np.ndarray) -> float | np.ndarray:
         """Gain of a path of ``length_m`` [m] between isotropic antennas, less what the air absorbs."""
