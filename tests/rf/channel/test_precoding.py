@@ -72,22 +72,12 @@ def test_slnr_is_the_generalised_eigenvector_and_for_channels_the_mmse_precoder(
     np.testing.assert_allclose(alike(w, mmse.T / np.linalg.norm(mmse.T, axis=1)[:, None]), 1.0, rtol=1e-12)
 
 
-def test_slnr_lies_between_maximum_ratio_and_zero_forcing() -> None:
+def test_slnr_goes_from_zero_forcing_to_maximum_ratio_with_the_noise() -> None:
     h = rayleigh()
     for channels in (h, rank_one(h)):
         loud, quiet = (wr.channel.precoders(channels, "slnr", noise=n) for n in (1.0, 1e-18))
         np.testing.assert_allclose(alike(loud, wr.channel.precoders(h, "mr", noise=1.0)), 1.0, rtol=1e-9)
         np.testing.assert_allclose(alike(quiet, wr.channel.precoders(h, "zf", noise=1.0)), 1.0, rtol=1e-6)
-    for noise in (1e-11, 1e-9, 1e-7):
-        rate = {}
-        for method in ("mr", "zf", "slnr"):
-            rates = []
-            for seed in range(40):
-                h = rayleigh(users=8, seed=seed)
-                w = wr.channel.precoders(h, method, noise=noise)
-                rates.append(np.log2(1.0 + wr.channel.precoded_sinr(h, w, noise=noise)).sum())
-            rate[method] = np.mean(rates)
-        assert rate["slnr"] > max(rate["mr"], rate["zf"]) - 1e-9
 
 
 def test_covariance_gives_every_pair_of_beams_its_mean_gain() -> None:

@@ -347,7 +347,7 @@ def _columns(parts: Sequence[PathArrays]) -> dict[str, list[np.ndarray]]:
     columns = {name: [getattr(p, name) for p in parts] for name in PADDING}
     depth = max((v.shape[1] for v in columns["vertices"]), default=1)
     for name in ("vertices", "interactions"):
-        columns[name] = [_padded(v, 1, depth, _PADDING[name]) for v in columns[name]]
+        columns[name] = [_padded(v, 1, depth, PADDING[name]) for v in columns[name]]
     known = columns.pop("jones")
     if any(jones is not None for jones in known):
         columns["jones"] = [

@@ -226,7 +226,7 @@ def read_paths(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bool]:
             **{name: held[name] for name in (*_UNITS, "interactions") if name in held},
         }
         for name, empty in PADDING.items():
-            if fields[name] is not None:
+            if fields.get(name) is not None:
                 fields[name][~fields["valid"]] = empty
         check_known_whole("vertices", fields["vertices"])
         for way, angles in (("arrival", ("theta_r", "phi_r")), ("departure", ("theta_t", "phi_t"))):

@@ -23,6 +23,7 @@ from warprrf.cache import Cache, making
 from warprrf.device import DeviceLike, Progress, resolve
 from warprrf.kernels.radio.records import MIRROR, SCATTER, SLAB, SOURCE
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.paths.edge_paths import EdgeFinder
 from warprrf.rf.paths.images import MirrorImages
 from warprrf.rf.paths.mirror_paths import MirrorPaths, ZoneRays, zone_paths
 from warprrf.rf.paths.polarisation import turns
@@ -133,9 +134,9 @@ class View:
     def kept_paths(self, effects: Effects) -> np.ndarray:
         """Which line of sight and mirror paths count, shape ``(L,)`` bool."""
         order, slabs = self.paths.order, self.paths.slabs
-        sight = (order == 0) & (slabs == 0)
         few = (order <= effects.mirrors) & (slabs <= effects.transmissions)
-        return np.asarray(few & (~sight | effects.line_of_sight))
+        few &= ~self.paths.over_edge | (effects.diffractions > 0)
+        return np.asarray(few & (~self.paths.in_sight | effects.line_of_sight))
 
 
 @dataclass(frozen=True)
@@ -274,10 +275,19 @@ class Tracer:
 
     def paths(self, receivers: np.ndarray, effects: Effects, progress: Progress | None = None) -> MirrorPaths:
         """Line of sight and mirror paths of ``receivers`` (R, 3) that ``effects`` want."""
-        return zone_paths(
+        found = zone_paths(
             self.images, receivers, effects.mirrors, self.wavelength_m, self.surface.position_error_m, progress,
             self.walls(effects.transmissions),
         )  # fmt: skip
+        if not effects.diffractions:
+            return found
+        edges = self.kept.get("edges", self._edges)
+        return edges.find(receivers, min(effects.mirrors, 1), progress).beside(found)
+
+    def _edges(self) -> EdgeFinder:
+        """Paths over edges, between surfaces as they are taken to be before any measurement."""
+        images = MirrorImages(self.surface.patches, self.transmitter, device=self.grid.device)
+        return EdgeFinder(images, self.wavelength_m, self.surface.table(self.frequency_hz))
 
     def view(
         self, receivers: np.ndarray, effects: Effects, *, paths: MirrorPaths | None = None, keeps: bool = True

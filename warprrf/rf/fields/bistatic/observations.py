@@ -606,7 +606,7 @@ def _shares(o: Observation) -> tuple[np.ndarray, np.ndarray]:
     materials = Evaluation(model.parameters, device=o.view.tracer.grid.device)
     single = o.view.records[SPECULAR].powers(materials)[:, None] * o.path
     share = single / np.maximum(o.predicted(model, materials), np.maximum(single.sum(axis=0), 1e-300))
-    return share[o.view.paths.order == 0].sum(axis=0), (share**2).sum(axis=0)
+    return share[o.view.paths.in_sight].sum(axis=0), (share**2).sum(axis=0)
 
 
 def _pointings(one: Readings, view: View) -> tuple[np.ndarray, np.ndarray] | None:
