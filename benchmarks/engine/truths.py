@@ -32,7 +32,7 @@ BOTH_HAVE = wr.Effects(scatter_mirror=False, transmissions=0, residual=False)
 SEEDS = (0, 1)
 COLUMNS = (
     ("engine", "engine", "{}"), ("core_s", "processor time of a spectrum [s]", "{:.3g}"), ("noise_db", "noise, rms [dB]", "{:.2f}"),
-    ("total_db", "total over the first row's [dB]", "{:+.2f}"), ("ratio", "least time at the noise of the first, over its", "{:.1f}"),
+    ("total_db", "total over the first row's [dB]", "{:+.2f}"), ("ratio", "least time at its noise, over its", "{:.1f}"),
 )  # fmt: skip
 
 
