@@ -33,6 +33,7 @@ NAMES = {
     "photos": ("benchmarks.photos", "photos of any place: every eighth held out, rendered and compared"),
     "bare-mesh": ("benchmarks.bare_mesh", "a mesh without names, and a scan, beside the scene with names"),
     "filmed": ("benchmarks.filmed", "a filmed room against an RGB-D camera's depth"),
+    "stage1": ("benchmarks.stage1", "the reconstruction with every stage off, one at a time"),
     "measurements": (
         "benchmarks.measurements",
         "horns, power alone, delay profiles and one spectrum, beside ten spectra",

@@ -35,6 +35,7 @@ from warprrf.kernels.radio.records import MIRROR, SCATTER, SLAB
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.mirror_paths import unobstructed
+from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.trace import MirrorTracer
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.spectrum import (
@@ -61,8 +62,17 @@ FURTHER_SUB_PIXELS = 3
 """That for light over more than one surface."""
 THROUGH_MIRRORS = 3
 """Of how many rays one looks for light by way of mirrors: a search for each."""
+QUADRATURE = 1.125
+"""Wavelengths of detour up to which a path over an edge and the straight one are added field by field: there they are in
+quadrature, so that nothing jumps."""
 SINGLE = Effects(
-    mirrors=1, scatterings=1, mirror_scatter=False, scatter_mirror=False, transmissions=0, residual=False
+    mirrors=1,
+    scatterings=1,
+    mirror_scatter=False,
+    scatter_mirror=False,
+    transmissions=0,
+    diffractions=0,
+    residual=False,
 )
 """Line of sight, one mirror, scattering once: what has no noise."""
 REVISION = 5
@@ -95,7 +105,7 @@ class DiffusePaths:
         power: Path gain [linear], shape ``(L,)``.
         length_m: Whole length [m], shape ``(L,)``.
         departure: Where they left the transmitter towards, not of unit length, shape ``(L, 3)``.
-        beams: Sums of the beam about each direction over the pixels, shape ``(L,)``.
+        beams: What :func:`beam_sums` gives for each direction, shape ``(L, 2)``.
         sequence: ``"S"`` scattered, ``"M"`` mirrored, ``"T"`` through slabs, from the transmitter on.
     """
 
@@ -107,8 +117,8 @@ class DiffusePaths:
     sequence: str
 
 
-_ARRAYS = ("direction", "power", "length_m", "departure", "beams")
-_NO_PATHS = {name: np.zeros((0, 3) if name in ("direction", "departure") else 0) for name in _ARRAYS}
+_ARRAYS = {"direction": (3,), "power": (), "length_m": (), "departure": (3,), "beams": (2,)}
+_NO_PATHS = {name: np.zeros((0, *size)) for name, size in _ARRAYS.items()}
 
 
 @dataclass(frozen=True)
@@ -162,7 +172,8 @@ class ExactEngine:
         self.shape, self.beam_sigma_rad, self.sub_pixels = check_shape(shape), beam_sigma_rad, sub_pixels
         self.effects, self.seed, self.air = effects, check_seed(seed), air_of(gas)
         self.mirrors = MirrorTracer(
-            scene, transmitter=transmitter, frequency_hz=frequency_hz, transmissions=effects.transmissions, device=device
+            scene, transmitter=transmitter, frequency_hz=frequency_hz, transmissions=effects.transmissions,
+            diffractions=effects.diffractions, device=device,
         )  # fmt: skip
         table = self.mirrors.table
         if table is None:
@@ -228,7 +239,7 @@ class ExactEngine:
     def receive(self, receiver: ArrayLike) -> ReceivedPaths:
         """The spectrum of one receiver (3,)."""
         point = check_array("receiver", receiver, (3,))
-        specular = self.mirrors.trace(point, self.effects.mirrors).with_gas(self.air)
+        specular = together(self.mirrors.trace(point, self.effects.mirrors).with_gas(self.air))
         specular = specular.select(np.flatnonzero((specular.kind != "los") | self.effects.line_of_sight))
         scattered, beam = self.diffuse(point), (self.shape, self.beam_sigma_rad)
         sharp = beam_sums(specular.arrival, *beam, device=self.device)
@@ -386,6 +397,25 @@ class ExactEngine:
         """Normals of faces on the side that a ray of ``direction`` (N, 3) meets."""
         normal = self.surface.mesh.face_normals[face]
         return np.where((normal * direction).sum(axis=1, keepdims=True) > 0, -normal, normal)
+
+
+def together(paths: Paths) -> Paths:
+    """Paths of one receiver of which those over an edge that are hardly longer than the straight path, or than one mirror's, are
+    added to it, field by field: near a shadow's boundary the two are one wave. What is longer adds in power."""
+    if paths.jones is None or paths.frequency_hz is None or not (paths.kind == "edge").any():
+        return paths
+    jones, gain, kept = paths.jones.copy(), paths.gain.copy(), np.full(len(paths.gain), True)
+    mirrors = (paths.interactions == MIRROR).sum(axis=1)
+    for k in np.flatnonzero(paths.kind == "edge"):
+        near = (paths.kind != "edge") & (mirrors == mirrors[k]) & (paths.kind != "slab")
+        near &= np.abs(paths.length_m - paths.length_m[k]) < QUADRATURE * SPEED_OF_LIGHT / paths.frequency_hz
+        if near.any():
+            parent = np.flatnonzero(near)[np.argmax(paths.arrival[near] @ paths.arrival[k])]
+            jones[parent] += paths.jones[k]
+            kept[k] = False
+    size = np.sqrt(0.5 * (np.abs(jones) ** 2).sum(axis=(1, 2)))
+    gain = np.where(kept, size * np.exp(1j * np.angle(gain)), gain)
+    return replace(paths, jones=jones, gain=gain).select(np.flatnonzero(kept))
 
 
 @lru_cache(maxsize=2)

@@ -397,14 +397,13 @@ def _is_amid(part: Mesh, points: np.ndarray) -> bool:
 
 def _is_cavity(part: Mesh, solids: list[Mesh]) -> bool:
     """Whether a closed surface bounds a hollow in one of ``solids``: it lies within that, and is wound the other way."""
-    for solid in solids:
-        if (part.bounds[0] >= solid.bounds[0]).all() and (part.bounds[1] <= solid.bounds[1]).all():
-            if (
-                _volume(part) * _volume(solid) < 0
-                and holds(solid, part.triangles.mean(axis=1)[:_DIRECTIONS]).mean() > 0.5
-            ):
-                return True
-    return False
+
+    def within(solid: Mesh) -> bool:
+        boxed = (part.bounds[0] >= solid.bounds[0]).all() and (part.bounds[1] <= solid.bounds[1]).all()
+        turned = boxed and _volume(part) * _volume(solid) < 0
+        return bool(turned and holds(solid, part.triangles.mean(axis=1)[:_DIRECTIONS]).mean() > 0.5)
+
+    return any(map(within, solids))
 
 
 def _volume(part: Mesh) -> float:

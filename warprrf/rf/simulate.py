@@ -123,7 +123,6 @@ def simulate(
 
     common: dict[str, Any] = {"transmitter": source, "frequency_hz": frequency}
     common |= {"shape": check_shape(shape), "beam_sigma_rad": check_beam(beam_sigma_rad)}
-    versions = _versions(engine)
     surfaces = (scene.mesh.vertices, scene.mesh.faces, scene.face_material, *vars(table).values())
     solver: Any = sampling, _versions(engine, solver_only=True)
     if engine == "exact":
@@ -141,7 +140,8 @@ def simulate(
         k = missing[at]
         results[k] = found if workspace is None else _kept(workspace, inputs, points[k], found)
         tell("simulate", len(results), len(points))
-    received = [results[k] for k in range(len(points))]
+    names = ("path_gain", "delay_s", "aod", "line_of_sight")
+    columns: Any = {n: np.stack([getattr(results[k], n) for k in range(len(points))]) for n in names}
     settings = {"depth": depth, "samples": samples, "refraction": int(refraction)}
     if engine == "exact":
         settings = {"sub_pixels": SUB_PIXELS} | {
@@ -151,10 +151,6 @@ def simulate(
         receivers=points,
         transmitter=source,
         frequency_hz=frequency,
-        path_gain=np.stack([r.path_gain for r in received]),
-        delay_s=np.stack([r.delay_s for r in received]),
-        aod=np.stack([r.aod for r in received]),
-        line_of_sight=np.array([r.line_of_sight for r in received]),
         beam_sigma_rad=beam_sigma_rad,
         engine=engine,
         seed=seed,
@@ -162,7 +158,8 @@ def simulate(
         floor=floor,
         attributes=settings
         | ({} if air is None else air.attributes)
-        | {f"version_{name}": value for name, value in versions.items()},
+        | {f"version_{name}": value for name, value in _versions(engine).items()},
+        **columns,
     )
 
 

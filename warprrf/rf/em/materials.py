@@ -322,9 +322,9 @@ def _number(entry: object, key: str, where: str) -> float:
 
 
 def _band(row: Any, where: str) -> Band:
-    ends = (1e9 * _number(row, key, where) for key in ("low_ghz", "high_ghz"))
-    law = (_number(row, key, where) for key in "abcd")
-    return Band(*ends, *law, source=str(row.get("source", "assumed")))
+    law: dict[str, Any] = {key: _number(row, key, where) for key in "abcd"}
+    law |= {f"{end}_hz": 1e9 * _number(row, f"{end}_ghz", where) for end in ("low", "high")}
+    return Band(**law, source=str(row.get("source", "assumed")))
 
 
 def _material(entry: object, where: str) -> Material:

@@ -105,9 +105,8 @@ def write_deepmimo(
         "materials": described.pop("materials"),
         "scene": described,
     }
-    write_text(
-        folder / "params.json", json.dumps(parameters, indent=2)
-    )  # last: a folder without it does not load
+    # last: a folder without it does not load
+    write_text(folder / "params.json", json.dumps(parameters, indent=2))
     return folder
 
 

@@ -43,9 +43,8 @@ from warprrf.rf.fields.bistatic.field import BistaticField
 ABOUT = "Digital twin written by warprrf."
 """First line of a twin's ``materials.json``: a folder that says so may be replaced."""
 LOSS_TANGENT = 0.02  # least that single precision, which Sionna computes in, surely turns into a decay
-THICKNESS_WAVELENGTHS = (
-    200.0  # then what the far side sends back has lost 25 nepers: the slab is a half-space
-)
+# What the far side sends back has then lost 25 nepers: the slab is a half-space.
+THICKNESS_WAVELENGTHS = 200.0
 LOST_IN_NOISE = 1e-2 / np.pi  # [1/sr], 20 dB below a white Lambertian lobe: darker directions hardly count
 _EXCESS = np.geomspace(1e-2, 1e6, 1601)  # of epsilon_r - 1; the last reflects like metal
 _MATERIAL = "fitted_"  # Sionna keeps names of materials and objects apart, and reserves those of the ITU
@@ -192,22 +191,17 @@ def write_twin(
         "materials": [table_entry(group.material) for group in groups],
     }
     part = partial_path(folder)
-    earlier = part.with_name(
-        f"{part.name}.earlier.kept"
-    )  # no partial file: the only one, if this is killed just then
+    # no partial file: the only one, if this is killed just then
+    earlier = part.with_name(f"{part.name}.earlier.kept")
     try:
         part.mkdir()
         for m in used:
             kept, faces = np.unique(surface.mesh.faces[face_material == m], return_inverse=True)
-            write_mesh(
-                part / "meshes" / f"{names[largest[m]]}.ply",
-                surface.mesh.vertices[kept],
-                faces.reshape(-1, 3),
-            )
+            file = part / "meshes" / f"{names[largest[m]]}.ply"
+            write_mesh(file, surface.mesh.vertices[kept], faces.reshape(-1, 3))
         write_json(part / "materials.json", table, seal=True)
-        (part / "scene.xml").write_text(
-            _scene_xml([group.material for group in groups], field.frequency_hz), encoding="utf-8"
-        )
+        xml = _scene_xml([group.material for group in groups], field.frequency_hz)
+        (part / "scene.xml").write_text(xml, encoding="utf-8")
         if folder.exists():
             folder.rename(earlier)  # a folder cannot be renamed over one that holds something
         part.rename(folder)
@@ -238,9 +232,7 @@ def project_reflection(
     shape = weight @ (gap - level) ** 2
     excess = np.log(_EXCESS)
     wanted = NEPER * np.log(np.maximum([scattered, mirrored], 1e-30))
-    mirror_share = (
-        0.01  # weight of mirrored power: the share of a spectrum's pixels that a mirror's beam fills
-    )
+    mirror_share = 0.01  # weight of mirrored power: of a spectrum's pixels a mirror's beam fills so many
     share = np.where([scattered > 0, mirrored > 0], [1.0 - mirror_share, mirror_share], 0.0)
 
     def errors(x: np.ndarray, odds: np.ndarray) -> np.ndarray:

@@ -24,7 +24,6 @@ from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
     check_beam,
     check_shape,
-    directions_from_angles,
     pixel_of,
     pixel_solid_angles,
 )
@@ -150,7 +149,7 @@ def links_of(paths: Sequence[Paths], search: BeamSearch) -> Links:
     found = []
     for p in paths:
         own = p.valid
-        power, toward = np.abs(p.gain[own]) ** 2, directions_from_angles(p.theta_r[own], p.phi_r[own])
+        power, toward = p.power[own], p.arrival[own]
         rough = p.kind[own] == "diffuse"
         image = np.zeros(search.shape)
         np.add.at(image, pixel_of(toward[rough], search.shape), power[rough])

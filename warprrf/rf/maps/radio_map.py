@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import os
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from warprrf.files import write_bytes
 from warprrf.geometry.mesh import Mesh
 from warprrf.netcdf_files import Variable
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.maps.links import LinkOptions, Links
+from warprrf.rf.maps.links import LinkOptions
 from warprrf.rf.positions import NEAR_FIELD, check_positions, ground_height, is_free
 from warprrf.rf.spectra.spectrum import to_db
 from warprrf.tensor_files import named
@@ -254,23 +254,8 @@ class MapOptions(LinkOptions):
         return float(10.0 * np.log10(noise_w) + 30.0 + self.noise_figure_db)
 
 
-class LinkField(Protocol):
-    """What maps are made of: see :class:`warprrf.RadioField`."""
-
-    transmitter: np.ndarray
-    frequency_hz: float
-    device: Any
-
-    @property
-    def mesh(self) -> Mesh | None:
-        """What blocks."""
-
-    def trace_links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
-        """Links at ``receivers`` (R, 3) [m], off the mesh."""
-
-
 def radio_map(
-    field: LinkField,
+    field: Any,
     height: float,
     cell: float = 0.25,
     transmitter: Any = None,
@@ -281,7 +266,7 @@ def radio_map(
     Cells are left out that the field's mesh takes for solid; see :func:`warprrf.rf.positions.is_free`.
 
     Args:
-        field: a fitted field with a mesh.
+        field: a :class:`warprrf.RadioField` with a mesh.
         height: of the receivers [m]: z, or over the ground if ``options`` say so.
         cell: width of a cell [m].
         transmitter: position (3,) [m] if another than the fitted one.

@@ -9,7 +9,7 @@ coefficient's terms, and the rest is tested as mirror paths are. Lengths in metr
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any
 
@@ -24,8 +24,7 @@ from warprrf.rf.channel.path_arrays import EDGE, MIRROR
 from warprrf.rf.em.diffraction import EdgeRays, Pair, boundary_fields, diffraction_matrices
 from warprrf.rf.em.fresnel import SurfaceTable, slab_reflection
 from warprrf.rf.paths.images import EdgeLeaves, MirrorImages
-from warprrf.rf.paths.mirror_paths import _distinct as distinct_paths
-from warprrf.rf.paths.mirror_paths import unobstructed
+from warprrf.rf.paths.mirror_paths import MirrorPaths, distinct, joined, unobstructed
 from warprrf.rf.spectra.spectrum import transverse_basis
 
 LEAST_DB = -80.0
@@ -54,6 +53,7 @@ class EdgePaths:
             Conductors without polarisation (a bare mesh) have one number, the "hard" coefficient, on its diagonal.
         amplitude: Its modulus squared is the path gain, half the squared Frobenius norm, spreading included; its phase that of
             the field along the edge, of TE at a mirror, of the one number where there is one. Complex, shape ``(L,)``.
+        wavelength_m: Wavelength [m].
     """
 
     receiver: np.ndarray
@@ -67,6 +67,7 @@ class EdgePaths:
     arrival: np.ndarray
     matrix: np.ndarray
     amplitude: np.ndarray
+    wavelength_m: float
 
     @property
     def power(self) -> np.ndarray:
@@ -76,9 +77,49 @@ class EdgePaths:
     def __len__(self) -> int:
         return len(self.receiver)
 
+    def beside(self, found: MirrorPaths) -> MirrorPaths:
+        """``found`` with these paths of the same receivers, whose share is what the edge makes of the field.
+
+        Near a shadow's boundary the share of a Fresnel zone that is free, on which those rest, already tells how the field
+        falls (Kirchhoff's approximation). There, up to a detour of a wavelength, paths over an edge only bring what is
+        left of theirs.
+        """
+        count = found.patch.shape[1]
+        friis = self.wavelength_m / (4.0 * np.pi * self.length_m)
+        share = np.sqrt(self.power) / friis
+        mirror = self.patch.max(axis=1, initial=-1)
+        own = np.where(found.order == 1, found.patch.max(axis=1, initial=-1), -1)
+        parents = (found.order <= 1) & (found.slabs == 0)
+        free = dict(
+            zip(
+                zip(found.receiver[parents].tolist(), own[parents].tolist(), strict=True),
+                found.share[parents],
+                strict=True,
+            )
+        )
+        left = np.array(
+            [1.0 - free.get(key, 0.0) for key in zip(self.receiver.tolist(), mirror.tolist(), strict=True)]
+        )
+        near = self.detour_m < self.wavelength_m
+        share = share * np.where(near & (left < 1.0), left, 1.0)
+
+        def filled(value: float, dtype: Any, *shape: int) -> np.ndarray:
+            return np.full((len(self), count, *shape), value, dtype)
+
+        point = filled(np.nan, float, 3)
+        point[:, : min(count, 2)] = self.point[:, :count]
+        edges = MirrorPaths(
+            self.receiver, filled(-1, np.int32), filled(-1, np.int32), point, share, self.length_m, self.arrival,
+            filled(np.nan, float, 3), filled(0.0, float), filled(0.0, float), filled(np.nan, float), np.ones(len(self), bool),
+        )  # fmt: skip
+        return joined([found, edges.subset(np.flatnonzero(share > 0))])
+
     def take(self, rows: np.ndarray) -> EdgePaths:
         """The paths ``rows``."""
-        return EdgePaths(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+        return replace(self, **{name: getattr(self, name)[rows] for name in _ARRAYS})
+
+
+_ARRAYS = tuple(f.name for f in fields(EdgePaths) if f.name != "wavelength_m")
 
 
 def patch_edges(patches: PlanarPatches, **options: Any) -> Edges:
@@ -135,9 +176,8 @@ class EdgeFinder:
             parts.append(part.take(np.argsort(part.length_m, kind="stable")))
             if progress is not None:
                 progress("edges", k + 1, len(points))
-        return EdgePaths(
-            **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(EdgePaths)}
-        )
+        every = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _ARRAYS}
+        return EdgePaths(**every, wavelength_m=self.wavelength_m)
 
     def _ways(self, receiver: np.ndarray, mirrors: int) -> _Ways:
         """What reaches a receiver, unobstructed."""
@@ -245,7 +285,7 @@ class EdgeFinder:
         return EdgePaths(
             receiver, ways.edge, ways.patch, code, point, length,
             length - np.linalg.norm(ways.end[:, 1] - ways.end[:, 0], axis=1), departure, arrival, matrix,
-            size * sign / np.maximum(np.abs(sign), 1e-300),
+            size * sign / np.maximum(np.abs(sign), 1e-300), self.wavelength_m,
         )  # fmt: skip
 
 
@@ -316,7 +356,7 @@ class _Ways:
         side = (self.patch >= 0) @ np.array([1, 2])
         stop = np.where(side > 1, 1, 0)
         point = np.nan_to_num(self.mirror[np.arange(len(side)), stop])
-        return distinct_paths(3 * self.edge + side, point[:, None], distance_m)
+        return distinct(3 * self.edge + side, point[:, None], distance_m)
 
     def stops(self) -> tuple[np.ndarray, np.ndarray]:
         """Codes ``(L, 2)`` and points ``(L, 2, 3)`` of the interactions, from the transmitter on."""

@@ -46,6 +46,7 @@ class MirrorPaths:
         cosine: Cosine of incidence at each, 0 past the last, shape ``(L, K)``.
         turn: Angle of its plane of incidence to the one before [rad], shape ``(L, K)``; see :mod:`.polarisation`.
         thickness_m: Of a slab that is a solid, else NaN, shape ``(L, K)``.
+        over_edge: Whether the path goes over an edge, and over no mirror but those that ``share`` counts, shape ``(L,)``.
     """
 
     receiver: np.ndarray
@@ -59,14 +60,20 @@ class MirrorPaths:
     cosine: np.ndarray
     turn: np.ndarray
     thickness_m: np.ndarray
+    over_edge: np.ndarray
 
     def __len__(self) -> int:
         return len(self.receiver)
 
     @property
     def order(self) -> np.ndarray:
-        """Number of reflections, shape ``(L,)``: 0 is line of sight."""
+        """Number of reflections, shape ``(L,)``: 0 is line of sight, or a path over an edge."""
         return (self.patch >= 0).sum(axis=1)
+
+    @property
+    def in_sight(self) -> np.ndarray:
+        """Which are line of sight, shape ``(L,)``."""
+        return (self.order == 0) & (self.slabs == 0) & ~self.over_edge
 
     @property
     def slabs(self) -> np.ndarray:
@@ -116,7 +123,7 @@ def exact_paths(
         # Sheets closer than the tolerance don't hide each other: seen at a slant, their mirror points lie further apart.
         free = unobstructed(patches, source, receivers[row], patch, point, images.device)
         clear = np.flatnonzero(free)
-        clear = clear[_distinct(row[clear], point[clear], 3.0 * patches.tolerance_m)]
+        clear = clear[distinct(row[clear], point[clear], 3.0 * patches.tolerance_m)]
         found = row[clear], patch[clear], point[clear], np.ones(len(clear))
         parts.append(_described(patches, source, receivers, found, order, walls))
         if walls is not None:
@@ -124,11 +131,11 @@ def exact_paths(
             legs = _legs(patches, source, receivers[row[dark]], patch[dark], point[dark], patches.tolerance_m)
             through, slabs = _passed(walls, *legs)
             through = dark[through]
-            own = _distinct(row[through], point[through], 3.0 * patches.tolerance_m)
+            own = distinct(row[through], point[through], 3.0 * patches.tolerance_m)
             own, slabs = through[own], [s.take(own) for s in slabs]
             found = row[own], patch[own], point[own], np.ones(len(own))
             parts.append(_described(patches, source, receivers, found, order, walls, slabs))
-    paths = _joined(parts)
+    paths = joined(parts)
     return paths.subset(np.argsort(paths.receiver, kind="stable"))
 
 
@@ -192,7 +199,7 @@ def zone_paths(
         row, patch, point = row[kept], patch[kept], point[kept]
         found = row, patch, point, zone.share(receivers[row], patch, point)
         parts.append(_described(patches, source, receivers, found, order, walls))
-    return _joined(parts)
+    return joined(parts)
 
 
 class ZoneRays:
@@ -370,7 +377,7 @@ def _passed(walls: Walls, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarra
     return rows[few], [s.take(few) for s in slabs]
 
 
-def _distinct(row: np.ndarray, point: np.ndarray, distance_m: float) -> np.ndarray:
+def distinct(row: np.ndarray, point: np.ndarray, distance_m: float) -> np.ndarray:
     """Indices of paths that no earlier one of the same receiver repeats, all points within ``distance_m``, sorted."""
     if point.shape[1] == 0 or len(row) < 2:
         return np.arange(len(row))
@@ -449,7 +456,7 @@ def _described(
     return MirrorPaths(
         receiver=row, patch=filled(patch, -1), slab=filled(slab, -1), point=filled(point, np.nan), share=share,
         length_m=length, arrival=arrival, normal=filled(normal, np.nan), cosine=filled(cosine, 0.0), turn=filled(turn, 0.0),
-        thickness_m=filled(thickness, np.nan),
+        thickness_m=filled(thickness, np.nan), over_edge=np.zeros(len(row), bool),
     )  # fmt: skip
 
 
@@ -458,7 +465,8 @@ def stops_of(source: np.ndarray, point: np.ndarray, ends: np.ndarray) -> np.ndar
     return np.concatenate([np.broadcast_to(source, (len(ends), 1, 3)), point, ends[:, None]], axis=1)
 
 
-def _joined(parts: list[MirrorPaths]) -> MirrorPaths:
+def joined(parts: list[MirrorPaths]) -> MirrorPaths:
+    """All paths of ``parts``, one after another."""
     return MirrorPaths(
         **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(MirrorPaths)}
     )

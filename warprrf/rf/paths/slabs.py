@@ -58,7 +58,7 @@ class Slabs:
     @property
     def trimmed(self) -> Slabs:
         """The same without columns that no way uses; one at least."""
-        used = (self.face >= 0).any(axis=0)
+        used = np.asarray((self.face >= 0).any(axis=0))
         used[:1] |= ~used.any()
         return Slabs(*(getattr(self, f.name)[:, used] for f in fields(self)))
 
@@ -134,7 +134,8 @@ class Walls:
             own = (met >= 0) & (k > 0)
             found.append((row[own], met[own], t[own], slabs.take(own)))
         row, slabs = _joined([(a, d) for a, _, _, d in found])
-        return row, *(np.concatenate([part[j] for part in found]) for j in (1, 2)), slabs
+        face, range_m = (np.concatenate([part[j] for part in found]) for j in (1, 2))  # type: ignore[misc]
+        return row, face, range_m, slabs
 
     def _stops(
         self,

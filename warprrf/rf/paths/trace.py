@@ -151,10 +151,12 @@ class MirrorTracer:
         self.patches = planar_patches(self.mesh, groups)
         if transmissions and self.table is not None and groups is not None:
             self._face_material = np.asarray(groups, np.int32)
-            known = (a[self._face_material] for a in (self.table.permittivity, self.table.thickness_m))
+            eta, thickness = (
+                a[self._face_material] for a in (self.table.permittivity, self.table.thickness_m)
+            )
             clearance = max(ENDPOINT_CLEARANCE, self.patches.tolerance_m)
             self.walls = Walls.of_slabs(
-                self.mesh, *known, self.wavelength_m, transmissions, clearance, device
+                self.mesh, eta, thickness, self.wavelength_m, transmissions, clearance, device
             )
         self.images = MirrorImages(self.patches, self.transmitter, max_chains=max_chains, device=device)
         self.edges: EdgeFinder | None = None

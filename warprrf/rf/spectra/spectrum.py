@@ -91,9 +91,7 @@ def check_pixels(path_gain: np.ndarray, delay_s: np.ndarray | None, aod: np.ndar
         raise ValueError(
             "delay_s: got values that are negative or infinite, expected seconds, or NaN where empty"
         )
-    angle_rounding = (
-        1e-3  # radians by which angles of departure may lie out of range: what compact files round
-    )
+    angle_rounding = 1e-3  # radians by which angles of departure may lie out of range: by compact files
     if aod is not None:
         check_known_whole("aod", aod)
         zenith, azimuth, most = aod[..., 0], aod[..., 1], np.pi + angle_rounding
@@ -430,9 +428,8 @@ def _least_falls(shape: tuple[int, int], sigma: float, device: str) -> tuple[wp.
     cosine = np.cos(zenith)[:, None] * np.cos(zenith[cell])
     sine = np.sin(zenith)[:, None] * np.sin(zenith[cell])
     chord = np.sqrt(np.maximum(2.0 - 2.0 * (cosine[..., None] + sine[..., None] * apart), 0.0))
-    nearest = np.maximum(
-        chord - 0.5 * np.hypot(np.pi / rows, 2.0 * np.pi / columns), 0.0
-    )  # of a ray in the cell
+    # of a ray in the cell
+    nearest = np.maximum(chord - 0.5 * np.hypot(np.pi / rows, 2.0 * np.pi / columns), 0.0)
     fall = 0.5 * (nearest / sigma) ** 2 * (1.0 - 1e-6)
     fall[nearest > 2.0 * np.sin(0.5 * _cutoff(shape, sigma)) * (1.0 + 1e-6)] = np.inf
     return (

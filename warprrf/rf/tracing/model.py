@@ -34,6 +34,7 @@ class Effects:
         mirror_scatter: whether mirrors light surfaces that scatter.
         scatter_mirror: whether lit surfaces are seen in mirrors, and through slabs. Sionna RT has no such paths.
         transmissions: most slabs that a path passes, 0 to 3.
+        diffractions: most edges on a path, 0 or 1; beside one mirror at most, and no scattering.
         residual: whether what surfaces scatter differs within their group.
 
     Example::
@@ -47,20 +48,24 @@ class Effects:
     mirror_scatter: bool = True
     scatter_mirror: bool = True
     transmissions: int = 3
+    diffractions: int = 1
     residual: bool = True
 
     def __post_init__(self) -> None:
         check_count("mirrors", self.mirrors, 0, 3)
         check_count("scatterings", self.scatterings, 0, 3)
         check_count("transmissions", self.transmissions, 0, 3)
+        check_count("diffractions", self.diffractions, 0, 1)
 
 
 SETS = {
-    "single": Effects(mirrors=1, scatterings=1, mirror_scatter=False, scatter_mirror=False, transmissions=0),
-    "room": Effects(scatter_mirror=False, transmissions=0),
-    "everything": Effects(transmissions=0),
+    "single": Effects(
+        mirrors=1, scatterings=1, mirror_scatter=False, scatter_mirror=False, transmissions=0, diffractions=0
+    ),
+    "room": Effects(scatter_mirror=False, transmissions=0, diffractions=0),
+    "everything": Effects(transmissions=0, diffractions=0),
 }
-"""Sets of effects that a fit tries; it adds what passes slabs where the scene needs it."""
+"""Sets of effects that a fit tries; it adds what passes slabs and goes over edges where the scene needs it."""
 
 MOST_NEPERS = 40.0  # of any logarithm: 174 dB from one, where no surface is
 _EXCESS = (0.05, 200.0)  # of epsilon_r - 1: the last reflects like metal

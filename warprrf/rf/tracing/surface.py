@@ -24,6 +24,7 @@ from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh, components, smoot
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.scans import is_scan, scanned_patches
 from warprrf.geometry.splats.gaussians import gaussians_of
+from warprrf.rf.em.fresnel import SurfaceTable
 from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, is_name_alone, itu_material, itu_name
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.slabs import Walls
@@ -255,12 +256,19 @@ class Surface:
                 eta[g], known[g] = itu_material(name).extrapolated().permittivity(frequency_hz), True
         known_slab = known & ~np.isnan(self.thickness_m)
         thickness = np.where(np.isnan(self.thickness_m), ASSUMED_THICKNESS_M, self.thickness_m) / wavelength_m
-        absorbed = 4.0 * np.pi * thickness * np.sqrt(eta).imag
+        absorbed = 4.0 * np.pi * np.where(known_slab, 0.0, thickness) * np.sqrt(eta).imag
         return (
             np.where(known_slab, eta, 0.0),
             thickness,
             np.where(known_slab, 0.0, np.maximum(absorbed, -MOST_ABSORBED)),
         )
+
+    def table(self, frequency_hz: float) -> SurfaceTable:
+        """Its groups as smooth surfaces, before any measurement: slabs as far as :meth:`slabs` knows them, else half-spaces."""
+        eta, thickness, _ = self.slabs(frequency_hz)
+        known, none = np.abs(eta) > 0, np.zeros(self.groups, np.int32)
+        thickness_m = np.where(known, thickness * SPEED_OF_LIGHT / frequency_hz, np.inf)
+        return SurfaceTable(np.where(known, eta, LOSSY), thickness_m, 0.0 * thickness, none, none > 0)
 
     def walls(self, frequency_hz: float, most: int, device: DeviceLike = None) -> Walls:
         """Its faces that may be passed, as far as :meth:`slabs` tells, up to ``most`` on one way."""

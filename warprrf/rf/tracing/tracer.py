@@ -23,6 +23,7 @@ from warprrf.cache import Cache, making
 from warprrf.device import DeviceLike, Progress, resolve
 from warprrf.kernels.radio.records import MIRROR, SCATTER, SLAB, SOURCE
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.paths.edge_paths import EdgeFinder
 from warprrf.rf.paths.images import MirrorImages
 from warprrf.rf.paths.mirror_paths import MirrorPaths, ZoneRays, zone_paths
 from warprrf.rf.paths.polarisation import turns
@@ -75,7 +76,9 @@ class View:
         paths: line of sight and mirror paths, L in all.
         records: tables by sequence, of those that were asked for; of line of sight and mirrors under :data:`SPECULAR`, one row
             for each of ``paths``.
-        keeps: whether what is made when it is first asked for is kept; tables of single bounces are in any case.
+        keeps: whether what is made when it is first asked for is kept.
+        lit: where it is not, rays that the transmitter lights, as bits, once that is known: the table of single bounces is
+            made of them without casting rays.
     """
 
     tracer: Tracer
@@ -84,6 +87,7 @@ class View:
     paths: MirrorPaths
     records: dict[str, Records] = field(repr=False)
     keeps: bool = True
+    lit: list[np.ndarray] = field(default_factory=list, repr=False)
     _beams: list[np.ndarray] = field(init=False, repr=False, default_factory=list)
 
     @property
@@ -118,19 +122,21 @@ class View:
         wanted = (SPECULAR, *sequences(effects))
         missing = [name for name in wanted if name not in self.records]
         made = self.tracer.trace(self, missing) if missing else {}
-        if made:
+        if made and self.keeps:
             with making:
-                self.records.update(
-                    {name: table for name, table in made.items() if self.keeps or name == "S"}
-                )
+                self.records.update(made)
+        elif "S" in made and not self.lit:
+            bits = np.zeros(len(self.hits.face), bool)
+            bits[made["S"].ray] = True
+            self.lit[:] = [np.packbits(bits)]
         return {name: made[name] if name in made else self.records[name] for name in wanted}
 
     def kept_paths(self, effects: Effects) -> np.ndarray:
         """Which line of sight and mirror paths count, shape ``(L,)`` bool."""
         order, slabs = self.paths.order, self.paths.slabs
-        sight = (order == 0) & (slabs == 0)
         few = (order <= effects.mirrors) & (slabs <= effects.transmissions)
-        return np.asarray(few & (~sight | effects.line_of_sight))
+        few &= ~self.paths.over_edge | (effects.diffractions > 0)
+        return np.asarray(few & (~self.paths.in_sight | effects.line_of_sight))
 
 
 @dataclass(frozen=True)
@@ -269,10 +275,19 @@ class Tracer:
 
     def paths(self, receivers: np.ndarray, effects: Effects, progress: Progress | None = None) -> MirrorPaths:
         """Line of sight and mirror paths of ``receivers`` (R, 3) that ``effects`` want."""
-        return zone_paths(
+        found = zone_paths(
             self.images, receivers, effects.mirrors, self.wavelength_m, self.surface.position_error_m, progress,
             self.walls(effects.transmissions),
         )  # fmt: skip
+        if not effects.diffractions:
+            return found
+        edges = self.kept.get("edges", self._edges)
+        return edges.find(receivers, min(effects.mirrors, 1), progress).beside(found)
+
+    def _edges(self) -> EdgeFinder:
+        """Paths over edges, between surfaces as they are taken to be before any measurement."""
+        images = MirrorImages(self.surface.patches, self.transmitter, device=self.grid.device)
+        return EdgeFinder(images, self.wavelength_m, self.surface.table(self.frequency_hz))
 
     def view(
         self, receivers: np.ndarray, effects: Effects, *, paths: MirrorPaths | None = None, keeps: bool = True
@@ -301,7 +316,10 @@ class Tracer:
                 seen[last] = (
                     self._turned(view) if last == "M" else self.behind(first, most) if last == "T" else first
                 )
-            made[name] = self._trace(sequence, seen[last], most)
+            if name == "S" and view.lit:
+                made[name] = self.lit(first, np.flatnonzero(np.unpackbits(view.lit[0], count=len(first.ray))))
+            else:
+                made[name] = self._trace(sequence, seen[last], most)
         return made
 
     def _trace(self, sequence: str, rays: Rays, most: int) -> Records:
@@ -325,8 +343,11 @@ class Tracer:
         row = np.arange(len(p), dtype=np.int32)
         return Records(power, row, group.astype(np.int32), angle, kind.astype(np.int32))
 
-    def lit(self, rays: Rays) -> Records:
-        """What rays see of surfaces that the transmitter lights."""
+    def lit(self, rays: Rays, row: np.ndarray | None = None) -> Records:
+        """What rays see of surfaces that the transmitter lights: the rays ``row``, if that is known."""
+        if row is not None:
+            light = self.grid.light_through(rays.hits, self.transmitter, row)
+            return self.scattered(rays, row, light.strength, light.angle)
         light = self.grid.light(rays.hits, self.transmitter)
         row = np.flatnonzero(light.strength > 0)
         return self.scattered(rays, row, light.strength[row], light.angle[row])

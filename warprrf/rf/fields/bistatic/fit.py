@@ -26,7 +26,7 @@ from warprrf.rf.fields.base import Data, Measured
 from warprrf.rf.fields.bistatic.gauss_newton import THROUGH, Fitted, Problem, gauss_newton, layout_of
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, WeighedPaths, read
 from warprrf.rf.fields.bistatic.merging import BY_SHAPE, Merging, merge
-from warprrf.rf.fields.bistatic.needs import MOST_BLOCKED, slabs_needed
+from warprrf.rf.fields.bistatic.needs import MOST_BLOCKED, RARE, RAYS, evenly, needed, total
 from warprrf.rf.fields.bistatic.observations import (
     NOISE_DB,
     Observation,
@@ -40,7 +40,6 @@ from warprrf.rf.fields.bistatic.observations import (
 from warprrf.rf.fields.bistatic.placing import moved, position_offset, with_azimuths
 from warprrf.rf.fields.bistatic.residual import fit_residual, shares_of
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
-from warprrf.rf.paths.blockage import Walls, past_obstacles
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.tracing.model import LOBES, SETS, Effects, Layout, Model, Parameters
@@ -147,6 +146,9 @@ class FitOptions:
             Effects(**{f.name: min(getattr(one, f.name), getattr(most, f.name)) for f in fields(Effects)})
             for one in given
         ]
+        rare: dict[str, Any] = {"transmissions": most.transmissions, "diffractions": most.diffractions}
+        if self.relevance is not None:
+            found = [replace(one, **rare) for one in found]
         return list(dict.fromkeys(found))
 
     def exponents(self, frequency_hz: float) -> tuple[int, ...]:
@@ -170,14 +172,13 @@ class TrainingViews:
     Attributes:
         places: receivers under their transmitters.
         views: one for each place.
-        mirrors, transmissions: most reflections and slabs that were sought.
+        effects: whose mirrors, slabs and edges were sought.
         seconds: what it took.
     """
 
     places: list[Place] = field(repr=False)
     views: list[View] = field(repr=False)
-    mirrors: int
-    transmissions: int
+    effects: Effects
     seconds: float
 
     @property
@@ -207,7 +208,7 @@ def trace(
     ds: Data,
     *,
     effects: Effects | None = None,
-    finds_slabs: bool = True,
+    decides: bool = True,
     sub_pixels: int = SUB_PIXELS,
     client: Any = None,
     device: DeviceLike = None,
@@ -218,7 +219,7 @@ def trace(
     Args:
         effects: which tables are traced at once (others when they are first asked for); None for single bounces, and for
             as many mirrors up to 3 as can be searched (2 in a city).
-        finds_slabs: whether paths pass slabs if the scene needs it (:func:`slabs_needed`), else as ``effects`` say.
+        decides: whether paths pass slabs and go over edges as the scene needs it (:func:`needed`), else as ``effects`` say.
         sub_pixels: square root of the rays per pixel.
         client: a ``dask.distributed.Client`` whose workers trace, to the same bits; this process by default.
         device: where rays are cast.
@@ -237,8 +238,8 @@ def trace(
     tell("patches", 0, 1)
     surface = Surface.of(geometry)
     tell("patches", 1, 1)
-    if finds_slabs:
-        wanted = replace(wanted, transmissions=slabs_needed(surface, places, device))
+    if decides:
+        wanted = needed(wanted, surface, places, device)
     keeps = len(places) * places[0].shape[0] * places[0].shape[1] * sub_pixels**2 <= MOST_KEPT
     together: dict[tuple[object, ...], list[int]] = {}  # places under one transmitter
     for k, place in enumerate(places):
@@ -261,7 +262,7 @@ def trace(
             tell("transport", len(views), len(places))
     seconds = time.perf_counter() - started
     every = [views[k] for k in range(len(places))]
-    return TrainingViews(places, every, wanted.mirrors, wanted.transmissions, seconds)
+    return TrainingViews(places, every, wanted, seconds)
 
 
 def _check_rays(places: Sequence[Place], sub_pixels: int) -> None:
@@ -306,7 +307,7 @@ def fit(
     candidates = options.candidates(frequency_hz)
     where: dict[str, Any] = {"client": client, "device": device, "progress": progress}
     where |= {"effects": candidates[0] if len(candidates) == 1 else None, "sub_pixels": options.rays}
-    where |= {"finds_slabs": isinstance(options.effects, str) and options.relevance is None}
+    where |= {"decides": isinstance(options.effects, str) and options.relevance is None}
     if views is not None:
         places = places_of(data, as_mesh(geometry, "geometry"), device)
         views.check(places, options.sub_pixels)
@@ -402,13 +403,12 @@ class Training:
         frequency_hz, count = frame_of(data).frequency_hz, len(seen.places)
         observations, chains = observe(data, seen.places, seen.views, frequency_hz)
         totals = all(isinstance(one, Readings) and one.total for one in data)
-        candidates = [
-            replace(one, mirrors=min(one.mirrors, seen.mirrors), transmissions=seen.transmissions)
-            for one in candidates
-        ]
+        sought = seen.effects
+        rare: dict[str, Any] = {"transmissions": sought.transmissions, "diffractions": sought.diffractions}
+        candidates = [replace(one, mirrors=min(one.mirrors, sought.mirrors), **rare) for one in candidates]
         if len(candidates) > 1 and any(isinstance(one, ArraySpectra) for one in data):
             candidates = [
-                replace(one, mirrors=seen.mirrors) for one in candidates
+                replace(one, mirrors=sought.mirrors) for one in candidates
             ]  # they hear the phases of all
         if len(candidates) > 1 and totals:
             candidates = candidates[1:2]
@@ -761,42 +761,31 @@ def _offsets(t: Training, found: Fit) -> dict[int, list[tuple[Place, np.ndarray]
 
 
 def left_out(t: Training, model: Model) -> dict[str, Any]:
-    """Effects that are not modelled, estimated at a few ``"receivers"`` that are blocked: by how much what goes round edges and
-    through walls would raise all power there [dB], by name; and ``"error_db"``, by how much the fit has more than was read
-    there, rms. What it lacks is no measure of its error: it may be just these effects."""
+    """Effects of :data:`RARE` that are not modelled, estimated at a few ``"receivers"`` that are blocked: by how much they would
+    raise all power there [dB], by name; and ``"error_db"``, by how much the fit has more than was read there, rms. What it
+    lacks is no measure of its error: it may be just these effects."""
     blocked = list({o.place.seen_from: k for k, o in enumerate(t.observations) if _is_dark(o.view)}.values())
-    chosen = np.linspace(0, len(blocked) - 1, min(len(blocked), MOST_BLOCKED)).astype(int)
-    seen, s = list(t.evaluated(model, [blocked[i] for i in chosen])), t.surface
-    walls = Walls.of(s.mesh, 1.0 + model.parameters.excess[s.group], s.thickness_m[s.group])
-    receivers = np.array([o.place.receiver for o, *_ in seen]).reshape(-1, 3)
-    total, over = np.zeros((2, len(seen)))
+    seen = list(t.evaluated(model, evenly(np.array(blocked, int), MOST_BLOCKED)))
+    lacking = {name: on for name, on in RARE.items() if not any(getattr(model.effects, key) for key in on)}
+    change, over = {name: np.zeros(len(seen)) for name in RARE}, np.zeros(len(seen))
     for k, (o, here, materials) in enumerate(seen):
-        gains = path_gains(o.view, here, materials)
-        total[k] = gains.specular.sum() + gains.by_ray().sum()
+        gains, tracer = path_gains(o.view, here, materials), o.view.tracer.on_grid(*RAYS)
+        whole = gains.specular.sum() + gains.by_ray().sum() + o.floor
         read_sum, predicted = o.target.sums(o.predicted(here, materials))
         over[k] = NEPER * max(np.log1p(predicted) - np.log1p(read_sum), 0.0)
-    floor = np.array([o.floor for o, *_ in seen])
-    change = {name: np.zeros(len(seen)) for name in ("diffraction", "transmission")}
-    for tracer in {id(o.view.tracer): o.view.tracer for o, *_ in seen}.values():
-        own = np.array([k for k, (o, *_) in enumerate(seen) if o.view.tracer is tracer])
-        link, grid = (tracer.transmitter, receivers[own], tracer.wavelength_m), tracer.grid
-        past = past_obstacles(walls, *link, position_error_m=s.position_error_m, device=grid.device)
-        if model.effects.transmissions:
-            del past["transmission"]
-        for name, paths in past.items():
-            power = model.parameters.gain * paths.power * grid.transmittance(paths.length_m)
-            more = np.bincount(paths.receiver, power, minlength=len(own))
-            change[name][own] = NEPER * np.log1p(more / (total[own] + floor[own]))
+        few = total(tracer, o.place.receiver, here, {}) if lacking else 0.0
+        for name, on in lacking.items():
+            more = total(tracer, o.place.receiver, here, on) - few
+            change[name][k] = NEPER * np.log1p(max(more, 0.0) / whole)
     error_db = float(np.sqrt(np.mean(over**2))) if len(seen) else 0.0
-    return {"receivers": receivers.tolist(), "error_db": error_db} | {
-        n: c.tolist() for n, c in change.items()
-    }
+    found: dict[str, Any] = {"receivers": [o.place.receiver.tolist() for o, *_ in seen], "error_db": error_db}
+    return found | {name: own.tolist() for name, own in change.items()}
 
 
 def _is_dark(view: View) -> bool:
     """Whether less than :data:`DARK` of line of sight passes what is in its way."""
     p = view.paths
-    return bool((p.share[p.order == 0] ** 2).sum() < DARK)
+    return bool((p.share[p.in_sight] ** 2).sum() < DARK)
 
 
 def side_lobes(t: Training, choice: Choice) -> tuple[np.ndarray, np.ndarray]:

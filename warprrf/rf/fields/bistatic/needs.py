@@ -1,10 +1,12 @@
-"""Whether a fit needs what few scenes do: transmission through slabs. Estimated before anything is fitted, where receivers are
-blocked, with materials as they are before any measurement."""
+"""What few scenes need, transmission through slabs and diffraction at edges: whether a fit is to model them, and what it lacks
+without. Estimated where receivers are blocked, by the tracer itself on few rays, over line of sight, mirrors and
+single scatterings."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +19,9 @@ from warprrf.rf.tracing.render import evaluation, path_gains
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import Tracer
 
-MOST_SLABS = 3  # on a path, where any count
+RARE: dict[str, dict[str, Any]] = {"transmission": {"transmissions": 3}, "diffraction": {"diffractions": 1}}
+"""Effects by name, and what of :class:`Effects` has them whole."""
+FEW = replace(SETS["single"], mirrors=2, residual=False)
 MOST_BLOCKED = 12
 """Blocked places at which effects are estimated."""
 NEEDED_DB = 0.25
@@ -35,37 +39,40 @@ def assumed(surface: Surface, frequency_hz: float) -> Parameters:
     )
 
 
-def slabs_needed(surface: Surface, places: Sequence[Place], device: DeviceLike = None) -> int:
-    """How many slabs paths are to pass: :data:`MOST_SLABS`, or 0 where they would change the total path gain of blocked
-    places by less than :data:`NEEDED_DB`."""
+def needed(effects: Effects, surface: Surface, places: Sequence[Place], device: DeviceLike = None) -> Effects:
+    """``effects`` with those of :data:`RARE` that raise the total path gain of blocked places by :data:`NEEDED_DB`, without the
+    others."""
     by_transmitter: dict[tuple[bytes, float], list[Place]] = {}
     for place in places:
         by_transmitter.setdefault((place.transmitter.tobytes(), place.frequency_hz), []).append(place)
-    changes: list[np.ndarray] = []
+    changes: dict[str, list[float]] = {name: [] for name in RARE}
     for own in by_transmitter.values():
         first = own[0]
         tracer = Tracer.of(surface, first.transmitter, first.frequency_hz, *RAYS, device=device)
-        if not tracer.walls(MOST_SLABS).passes.any():
-            continue
         receivers = np.unique([place.receiver for place in own], axis=0)
-        sight = tracer.paths(receivers, Effects(mirrors=0, transmissions=0))
-        blocked = receivers[np.setdiff1d(np.arange(len(receivers)), sight.receiver)]
-        blocked = blocked[
-            np.unique(np.linspace(0, len(blocked) - 1, min(len(blocked), MOST_BLOCKED)).astype(int))
-        ]
-        if len(blocked):
-            changes.append(_changes(tracer, blocked))
-    return MOST_SLABS if changes and np.sqrt(np.mean(np.square(np.concatenate(changes)))) > NEEDED_DB else 0
+        sight = tracer.paths(receivers, replace(FEW, mirrors=0))
+        blocked = evenly(np.setdiff1d(np.arange(len(receivers)), sight.receiver), MOST_BLOCKED)
+        p, none = assumed(surface, first.frequency_hz), np.zeros((2, surface.cells))
+        model = Model(FEW, p, none, tracer.transmitter)
+        for receiver in receivers[blocked]:
+            before = total(tracer, receiver, model, {})
+            for name, on in RARE.items():
+                after = total(tracer, receiver, model, on)
+                changes[name].append(float(NEPER * np.log(max(after, 1e-300) / max(before, 1e-300))))
+    off: dict[str, Any] = {key: 0 for on in RARE.values() for key in on}
+    for name, found in changes.items():
+        if found and np.sqrt(np.mean(np.square(found))) > NEEDED_DB:
+            off |= RARE[name]
+    return replace(effects, **off)
 
 
-def _changes(tracer: Tracer, receivers: np.ndarray) -> np.ndarray:
-    """By how much slabs raise the total path gain of each of ``receivers`` (R, 3) over mirrors and single scatterings [dB]."""
-    p, none = assumed(tracer.surface, tracer.frequency_hz), np.zeros((2, tracer.surface.cells))
-    effects = replace(SETS["single"], mirrors=2, transmissions=MOST_SLABS, residual=False)
-    view, total = tracer.view(receivers, effects), []
-    for most in (0, MOST_SLABS):
-        model = Model(replace(effects, transmissions=most), p, none, tracer.transmitter)
-        gains = path_gains(view, model, evaluation(tracer, model))
-        direct = np.bincount(view.paths.receiver, gains.specular, len(receivers))
-        total.append(direct + gains.by_ray().reshape(len(receivers), -1).sum(axis=1))
-    return np.asarray(NEPER * np.log(np.maximum(total[1], 1e-300) / np.maximum(total[0], 1e-300)))
+def total(tracer: Tracer, receiver: np.ndarray, model: Model, on: dict[str, Any]) -> float:
+    """Total path gain of a receiver (3,) under the parameters of ``model``, with :data:`FEW` effects and those that are ``on``."""
+    here = replace(model, effects=replace(FEW, **on))
+    gains = path_gains(tracer.view(receiver, here.effects), here, evaluation(tracer, here))
+    return sum(float(power.sum()) for power in gains.tables.values())
+
+
+def evenly(index: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of ``index``, evenly chosen."""
+    return index[np.linspace(0, len(index) - 1, min(len(index), most)).astype(int)]

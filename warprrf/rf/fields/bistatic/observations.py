@@ -136,17 +136,6 @@ class Target:
     trust: np.ndarray | None = None
     censored: np.ndarray | None = None
 
-    @classmethod
-    def joined(cls, targets: Sequence[Target]) -> Target:
-        """All readings of ``targets``, one after another."""
-        trust = [np.ones(len(t.db)) if t.trust is None else t.trust for t in targets]
-        censored = [np.zeros(len(t.db), bool) if t.censored is None else t.censored for t in targets]
-        return cls(
-            np.concatenate([t.db for t in targets]),
-            np.concatenate(trust) if any(t.trust is not None for t in targets) else None,
-            np.concatenate(censored) if any(t.censored is not None for t in targets) else None,
-        )
-
     def part(self, index: np.ndarray) -> Target:
         """Some of the readings."""
         return Target(*(None if a is None else a[index] for a in (self.db, self.trust, self.censored)))  # type: ignore[arg-type]
@@ -617,7 +606,7 @@ def _shares(o: Observation) -> tuple[np.ndarray, np.ndarray]:
     materials = Evaluation(model.parameters, device=o.view.tracer.grid.device)
     single = o.view.records[SPECULAR].powers(materials)[:, None] * o.path
     share = single / np.maximum(o.predicted(model, materials), np.maximum(single.sum(axis=0), 1e-300))
-    return share[o.view.paths.order == 0].sum(axis=0), (share**2).sum(axis=0)
+    return share[o.view.paths.in_sight].sum(axis=0), (share**2).sum(axis=0)
 
 
 def _pointings(one: Readings, view: View) -> tuple[np.ndarray, np.ndarray] | None:

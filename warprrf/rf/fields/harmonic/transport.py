@@ -74,20 +74,6 @@ class Transport:
             expected_range=self.expected_range[chosen],
         )
 
-    def at(self, receiver: ArrayLike) -> Transport:
-        """The part of one receiver (3,) [m].
-
-        Raises:
-            ValueError: if it is none of these receivers.
-        """
-        position = check_array("receiver", receiver, (3,))
-        found = np.flatnonzero((self.receivers == position).all(axis=1))
-        if len(found) == 0:
-            raise ValueError(
-                f"receiver: got {position.tolist()}, which is none of the {len(self.receivers)} here"
-            )
-        return self.subset(found[:1])
-
     @cached_property
     def seen(self) -> np.ndarray:
         """Gaussians that any receiver sees, ascending."""
