@@ -12,8 +12,10 @@ from trimesh.remesh import subdivide_to_size
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.links import LinkTracer
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
 from warprrf.rf.fields.bistatic.residual import Shares, fit_residual, shares_of
+from warprrf.rf.maps.links import LinkOptions
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.tracing.model import Effects
 
@@ -110,3 +112,18 @@ def test_another_transmitters_light_falls_elsewhere(field: BistaticField) -> Non
     for name in ("MS", "E"):
         np.testing.assert_array_equal(ours[name], bare[name])
     assert not np.allclose(ours["S"], bare["S"], atol=0.0)
+
+
+def test_links_have_the_same_gains(field: BistaticField) -> None:
+    """What either gain adds to the total path gain of a link is what it adds to the spectrum."""
+    rng = np.random.default_rng(6)
+
+    def totals(asked: BistaticField) -> tuple[np.ndarray, np.ndarray]:
+        tracer, options = asked.tracer(), LinkOptions(asked.beam_sigma_rad, SHAPE)
+        links = LinkTracer(tracer, asked.state, asked.evaluation(tracer), options, SHAPE)(RECEIVERS)
+        return links.total_path_gain, np.array([asked.spectrum(r).path_gain.sum() for r in RECEIVERS])
+
+    bare = totals(field)
+    for scale in ([[1.0], [0.0]], [[0.0], [1.0]]):
+        textured = totals(replace(field, residual=rng.normal(1.0, 0.3, field.residual.shape) * scale))
+        np.testing.assert_allclose(textured[0] - bare[0], textured[1] - bare[1], rtol=0.1)
