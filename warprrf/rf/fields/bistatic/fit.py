@@ -772,9 +772,9 @@ def left_out(t: Training, model: Model) -> dict[str, Any]:
         whole = gains.specular.sum() + gains.by_ray().sum() + o.floor
         read_sum, predicted = o.target.sums(o.predicted(here, materials))
         over[k] = NEPER * max(np.log1p(predicted) - np.log1p(read_sum), 0.0)
-        few = total(tracer, o.place.receiver, here, {}) if lacking else 0.0
+        few = total(tracer, o.place.receiver[None], here, {})[0] if lacking else 0.0
         for name, on in lacking.items():
-            more = total(tracer, o.place.receiver, here, on) - few
+            more = total(tracer, o.place.receiver[None], here, on)[0] - few
             change[name][k] = NEPER * np.log1p(max(more, 0.0) / whole)
     error_db = float(np.sqrt(np.mean(over**2))) if len(seen) else 0.0
     found: dict[str, Any] = {"receivers": [o.place.receiver.tolist() for o, *_ in seen], "error_db": error_db}
