@@ -766,16 +766,21 @@ def left_out(t: Training, model: Model) -> dict[str, Any]:
     blocked = list({o.place.seen_from: k for k, o in enumerate(t.observations) if _is_dark(o.view)}.values())
     seen = list(t.evaluated(model, evenly(np.array(blocked, int), MOST_BLOCKED)))
     lacking = {name: on for name, on in RARE.items() if not any(getattr(model.effects, key) for key in on)}
-    change, over = {name: np.zeros(len(seen)) for name in RARE}, np.zeros(len(seen))
+    change, by_tracer = {name: np.zeros(len(seen)) for name in RARE}, dict[int, list[int]]()
+    whole, over = np.zeros(len(seen)), np.zeros(len(seen))
     for k, (o, here, materials) in enumerate(seen):
-        gains, tracer = path_gains(o.view, here, materials), o.view.tracer.on_grid(*RAYS)
-        whole = gains.specular.sum() + gains.by_ray().sum() + o.floor
+        gains = path_gains(o.view, here, materials)
+        whole[k] = gains.specular.sum() + gains.by_ray().sum() + o.floor
         read_sum, predicted = o.target.sums(o.predicted(here, materials))
         over[k] = NEPER * max(np.log1p(predicted) - np.log1p(read_sum), 0.0)
-        few = total(tracer, o.place.receiver[None], here, {})[0] if lacking else 0.0
+        by_tracer.setdefault(id(o.view.tracer), []).append(k)
+    for own in by_tracer.values() if lacking else ():
+        tracer, here = seen[own[0]][0].view.tracer.on_grid(*RAYS), seen[own[0]][1]
+        receivers = np.stack([seen[k][0].place.receiver for k in own])
+        few = total(tracer, receivers, here, {})
         for name, on in lacking.items():
-            more = total(tracer, o.place.receiver[None], here, on)[0] - few
-            change[name][k] = NEPER * np.log1p(max(more, 0.0) / whole)
+            more = np.maximum(total(tracer, receivers, here, on) - few, 0.0)
+            change[name][own] = NEPER * np.log1p(more / whole[own])
     error_db = float(np.sqrt(np.mean(over**2))) if len(seen) else 0.0
     found: dict[str, Any] = {"receivers": [o.place.receiver.tolist() for o, *_ in seen], "error_db": error_db}
     return found | {name: own.tolist() for name, own in change.items()}

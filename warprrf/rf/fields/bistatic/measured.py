@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
-from scipy.sparse import csr_matrix
 
-from warprrf.cache import cached_property
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.mirror_paths import stops_of
@@ -77,7 +76,13 @@ class ByPixels:
     def bins(self, view: View) -> tuple[np.ndarray, int]:
         """A bin for each pixel."""
         grid = view.tracer.grid
-        return np.arange(len(view.hits.face)) // grid.sub_pixels**2, grid.shape[0] * grid.shape[1]
+        return _pixel_of(len(view.hits.face), grid.per_pixel), grid.shape[0] * grid.shape[1]
+
+
+@lru_cache(maxsize=4)
+def _pixel_of(rays: int, per_pixel: int) -> np.ndarray:
+    """Pixel of each ray: one array for all receivers."""
+    return np.arange(rays) // per_pixel
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,11 +98,6 @@ class SpectrumPixels(ByPixels):
     pixels: np.ndarray | None = None
     together: None = None
 
-    @cached_property
-    def _matrix(self) -> csr_matrix | None:
-        """The beam at the pixels."""
-        return None if self.pixels is None else self.beam.at(self.pixels)
-
     @property
     def alike(self) -> object:
         """Itself: receivers of one data set have one."""
@@ -105,8 +105,8 @@ class SpectrumPixels(ByPixels):
 
     def of_bins(self, power: np.ndarray, *, quick: bool = False) -> np.ndarray:
         """Seen through the beam."""
-        if self._matrix is not None:
-            return np.asarray(self._matrix @ power.astype(np.float32, copy=False))
+        if self.pixels is not None:
+            return np.asarray(self.beam.at(self.pixels) @ power.astype(np.float32, copy=False))
         return self.beam(power.reshape(*self.beam.shape, -1), quick=quick).reshape(power.shape)
 
     def to_bins(self, readings: np.ndarray) -> np.ndarray:
