@@ -26,6 +26,10 @@ NAMES = {
     ),
     "beams": ("benchmarks.beams", "beams chosen from the field without pilots"),
     "engine": ("benchmarks.engine.table", "the engine's speed against error"),
+    "truths": (
+        "benchmarks.engine.truths",
+        "the exact engine beside Sionna RT: time against noise, to depth 3",
+    ),
     "gpu": ("benchmarks.gpu", "tests and times on a CUDA device; without one a dry run"),
     "map": ("benchmarks.radio_map", "the radio map beside Sionna RT's RadioMapSolver"),
     "relevance": ("benchmarks.relevance", "what each effect is worth, at two carriers and three roughnesses"),

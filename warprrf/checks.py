@@ -70,9 +70,7 @@ def check_array(
         bad = ~(size <= most) if finite else (size > most) & (size < np.inf)
         if bad.any():
             number, kinds = int(np.count_nonzero(bad)), "NaN, infinite or " if finite else ""
-            raise ValueError(
-                f"{name}: got {number} values that are {kinds}above {most:g}, expected finite numbers"
-            )
+            raise ValueError(f"{name}: got {number} values that are {kinds}above {most:g}, expected finite")
     return array
 
 
@@ -133,7 +131,7 @@ def check_chosen(name: str, value: ArrayLike, count: int, least: int = 0) -> np.
     whole = chosen.dtype.kind in "iu" or chosen.size == 0
     if chosen.ndim != 1 or not whole or len(chosen) < least or (np.abs(chosen + 0.5) > count).any():
         raise ValueError(
-            f"{name}: got {value!r}, expected whole numbers from 0 to {count - 1}, or a mask ({count},)"
+            f"{name}: got {value!r}, expected indices from 0 to {count - 1} or a mask ({count},)"
         )
     return chosen.astype(np.int64)
 

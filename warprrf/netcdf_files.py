@@ -291,9 +291,7 @@ class Store:
             file.seek(max(path.stat().st_size - _MOST_LINE, 0))
             line, _, digest = file.read().rpartition(_LINE)[2].partition(b"\n")[0].rpartition(b" ")
         if digest != b"%08x" % zlib.crc32(line):
-            raise ValueError(
-                f"store: {path} is damaged, or no store of ours; name another file, or remove it"
-            )
+            raise ValueError(f"store: {path} is damaged, or no store; name another file, or remove it")
         entry = json.loads(line)
         if entry["key"] != self._attributes["key"]:
             raise ValueError(

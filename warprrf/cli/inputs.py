@@ -366,9 +366,7 @@ def load_geometry(path: str, options: argparse.Namespace) -> Any:
     if splats:
         return wr.Reconstruction.from_files(source, mesh=None if mesh is None else _load_mesh(mesh, options))
     if mesh is not None:
-        raise ValueError(
-            f"--mesh: {source} has surfaces itself, expected splats (.ply) where --mesh is given"
-        )
+        raise ValueError(f"--mesh: {source} has surfaces itself, expected splats (.ply) with --mesh")
     if source.suffix == ".xml" or options.materials is not None:
         return load_scene(source, options)
     if not is_mesh_file(source):

@@ -509,9 +509,7 @@ def _relevance(args: argparse.Namespace, out: Output) -> None:
         given = {name: measured[name] if value is None else value for name, value in given.items()}
         receivers = dataset.receivers if receivers is None else receivers
     if receivers is None:
-        raise ValueError(
-            "--receivers: none given, expected positions, or --spectra with a file that holds some"
-        )
+        raise ValueError("--receivers: none given, expected positions, or --spectra with some")
     check_count("--most", args.most)
     if len(receivers) > args.most:
         receivers = receivers[np.random.default_rng(args.seed).permutation(len(receivers))[: args.most]]

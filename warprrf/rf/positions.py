@@ -73,9 +73,7 @@ class Ends(NamedTuple):
         """
         to, source = check_receivers(name, receivers), check_receivers("transmitter", transmitter)
         if to.ndim == source.ndim == 2 and len(to) != len(source):
-            raise ValueError(
-                f"transmitter: got shape {source.shape}, expected (3,) or one for each receiver, {to.shape}"
-            )
+            raise ValueError(f"transmitter: got shape {source.shape}, expected (3,) or {to.shape}")
         rows = np.atleast_2d(*map(np.ascontiguousarray, np.broadcast_arrays(to, source)))
         return cls(rows[0], rows[1], to.ndim == source.ndim == 1)
 
@@ -376,12 +374,10 @@ def _rooms(mesh: Mesh) -> list[int]:
         rest = mesh.distinct_faces[
             rest[np.argsort(-mesh.areas[mesh.distinct_faces[rest]], kind="stable")][:samples]
         ]
-        places, area = mesh.triangles[rest].mean(axis=1), mesh.areas[rest]
-        held, left = area[holds(mesh.closed_parts[k], places)].sum(), area.sum()
+        places, area, part = mesh.triangles[rest].mean(axis=1), mesh.areas[rest], mesh.closed_parts[k]
+        held, left = area[holds(part, places)].sum(), area.sum()
         # a tenth of a surface's area beside it is nothing to speak of
-        fragments = left <= 0.1 * mesh.closed_parts[k].areas.sum() and not _is_amid(
-            mesh.closed_parts[k], places
-        )
+        fragments = left <= 0.1 * part.areas.sum() and not _is_amid(part, places)
         if held > 0.5 * left or fragments:
             rooms.append(k)
             least = wall * volume[k]

@@ -198,12 +198,10 @@ class Scene:
         found = []
         for (thing, material), faces in zip(key[starts], np.split(order, starts[1:]), strict=True):
             used, own = np.unique(self.mesh.faces[faces], return_inverse=True)
-            name = self.object_names[thing]
+            name, made_of = self.object_names[thing], self.materials[material]
             if several[thing]:
-                name = f"{name}-{self.materials[material].name}"
-            found.append(
-                ScenePart(name, self.mesh.vertices[used], own.reshape(-1, 3), self.materials[material])
-            )
+                name = f"{name}-{made_of.name}"
+            found.append(ScenePart(name, self.mesh.vertices[used], own.reshape(-1, 3), made_of))
         return found
 
     def with_materials(self, materials: Sequence[Material]) -> Scene:

@@ -49,9 +49,7 @@ def parts_of(rt_scene: Any, choice: MaterialChoice) -> tuple[list[ScenePart], Po
     """
     rt = sionna_rt()
     if not isinstance(rt_scene, rt.Scene):
-        raise TypeError(
-            f"rt_scene: got {type(rt_scene).__name__}, expected a sionna.rt.Scene (a path goes to Scene.load)"
-        )
+        raise TypeError(f"rt_scene: got {type(rt_scene).__name__}, expected a sionna.rt.Scene")
     if not rt_scene.objects:
         raise ValueError("rt_scene: got a scene without objects, expected surfaces")
     frequency = float(np.asarray(rt_scene.frequency).reshape(-1)[0])
@@ -176,9 +174,7 @@ def _radio_material(rt: Any, material: Material, name: str, frequency: float) ->
             f'than {narrowest_sionna_lobe} scatters nothing; take engine="exact" or a wider lobe'
         )
     if not np.isfinite(material.thickness_m):
-        raise ValueError(
-            f"material {material.name!r}: an infinite slab is unknown to Sionna; give a thickness"
-        )
+        raise ValueError(f"material {material.name!r}: Sionna knows no infinite slab; give a thickness")
     if material.reciprocal and material.scattering_coefficient(frequency) > 0:
         raise ValueError(
             f"material {material.name!r}: it scatters reciprocally, Sionna RT's patterns do not; set reciprocal=False to "

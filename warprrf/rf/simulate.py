@@ -198,9 +198,7 @@ def sample_receivers(
     low, high = mesh.bounds.copy()
     low[2], high[2] = z if above_ground else (max(low[2], z[0]), min(high[2], z[1]))
     if low[2] > high[2]:
-        raise ValueError(
-            f"z: got {z.tolist()}, but the scene lies between {mesh.bounds[0, 2]:g} and {mesh.bounds[1, 2]:g} m"
-        )
+        raise ValueError(f"z: got {z.tolist()}, but the scene lies at {mesh.bounds[:, 2].tolist()}")
     rng = np.random.default_rng(check_seed(seed))
     found: list[np.ndarray] = []
     count = 0
@@ -214,9 +212,7 @@ def sample_receivers(
         count += len(points)
         if count >= n:
             return np.concatenate(found)[:n]
-    raise ValueError(
-        f"clearance: found {count} of {n} places {clearance:g} m from everything in {most} draws"
-    )
+    raise ValueError(f"clearance: found {count} of {n} places {clearance:g} m from all in {most} draws")
 
 
 def _versions(engine: str, solver_only: bool = False) -> dict[str, str]:

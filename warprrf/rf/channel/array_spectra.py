@@ -163,9 +163,7 @@ def check_steering(array: PlanarArray, directions: ArrayLike) -> np.ndarray:
     """
     check_type("array", array, PlanarArray)
     if array.polarisation is not None:
-        raise ValueError(
-            f"array: got polarisation {array.polarisation!r}, expected None: vertical antennas are meant"
-        )
+        raise ValueError(f"array: got polarisation {array.polarisation!r}, expected None: all are vertical")
     found = check_array("directions", directions, (..., 3))
     if found.ndim < 2 or found.size == 0:
         raise ValueError(f"directions: got shape {found.shape}, expected (..., 3)")
@@ -191,9 +189,7 @@ def _picture(path: Path, shape: tuple[int, ...] | None) -> np.ndarray:
         with image.open(path, formats=["PNG"]) as opened:
             width, height = opened.size
             if opened.mode != "L" or width * height > most:
-                raise ValueError(
-                    f"got {width} x {height} pixels of mode {opened.mode}, expected grey of 8 bits"
-                )
+                raise ValueError(f"got {width} x {height} of mode {opened.mode}, expected grey of 8 bits")
             if shape not in (None, (height, width)):
                 raise ValueError(f"got {height} rows of {width}, expected {shape} as of the first spectrum")
             return np.asarray(opened, np.float32) / np.float32(255.0)
@@ -218,9 +214,7 @@ def _gateway(path: Path) -> tuple[np.ndarray, np.ndarray]:
                 raise ValueError(f"got {len(entries)} of it")
             found.append(check_array(key, [float(value) for value in entries[0].split(",")], (size,)))
         except ValueError as error:
-            raise ValueError(
-                f"path: {path}: expected one gateway with {key}: [{size} numbers] ({error})"
-            ) from error
+            raise ValueError(f"path: {path}: expected one {key}: [{size} numbers] ({error})") from error
     if not np.linalg.norm(found[1]) > 0:
         raise ValueError(f"path: {path}: got an orientation of length zero, expected a quaternion xyzw")
     return found[0], Rotation.from_quat(found[1]).as_matrix()

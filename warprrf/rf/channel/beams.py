@@ -301,9 +301,8 @@ def select_beams_multiuser(
         raise ValueError("sources: got none, expected a spectrum or paths for every user")
     served = _search(gains, noise * len(gains))
     received, transmitted = (np.array([served[u][k] for u in range(len(gains))]) for k in (0, 1))
-    return MultiUserChoice(
-        transmitted, received, signal_over_interference(gains, transmitted, received, noise)
-    )
+    sinr = signal_over_interference(gains, transmitted, received, noise)
+    return MultiUserChoice(transmitted, received, sinr)
 
 
 @checked
@@ -391,9 +390,7 @@ def rays_of(source: Source, tx: Codebook) -> Iterator[Rays]:
         departure = None
         if directed:
             if source.aod is None:
-                raise ValueError(
-                    "source: got a spectrum without aod, expected departure angles with a tx_array"
-                )
+                raise ValueError("source: got a spectrum without aod, expected departures with a tx_array")
             positive &= np.isfinite(source.aod).all(axis=-1)
             departure = directions_from_angles(source.aod[positive][:, 0], source.aod[positive][:, 1])
         yield departure, pixel_directions(source.shape)[positive], power[positive]
@@ -443,7 +440,7 @@ def _unpolarised(name: str, array: PlanarArray) -> None:
         raise TypeError(f"{name}: got {type(array).__name__}, expected a PlanarArray")
     if array.polarisation is not None:
         raise ValueError(
-            f"{name}: got polarisation {array.polarisation!r}, expected None: beams are chosen from powers"
+            f"{name}: got polarisation {array.polarisation!r}, expected None: powers choose beams"
         )
 
 

@@ -124,9 +124,7 @@ def precoded_sinr(channels: ArrayLike, weights: ArrayLike, *, noise: float) -> n
     h = _checked(channels, allow_dark=True)
     w = np.asarray(weights, dtype=complex)
     if w.shape != h.shape[:2] or not (np.isfinite(w).all() and w.any(axis=1).all()):
-        raise ValueError(
-            f"weights: got shape {w.shape}, expected finite ones of shape {h.shape[:2]}, none zero"
-        )
+        raise ValueError(f"weights: got shape {w.shape}, expected finite ones {h.shape[:2]}, none zero")
     w = _unit(w)
     if h.ndim == 2:
         heard = squared(h @ w.T)
@@ -177,7 +175,5 @@ def _checked(channels: ArrayLike, allow_dark: bool = False) -> np.ndarray:
             raise ValueError("channels: got covariances that are not Hermitian")
     dark = np.flatnonzero(~h.reshape(len(h), -1).any(axis=1))
     if len(dark) and not allow_dark:
-        raise ValueError(
-            f"channels: users {dark.tolist()} get no power; expected some for all, leave them out"
-        )
+        raise ValueError(f"channels: users {dark.tolist()} get no power; leave them out")
     return h

@@ -99,9 +99,7 @@ def frequency_response(
     """
     f = check_array("frequencies_hz", frequencies_hz, (None,))
     if not (len(f) and (f > 0).all()):
-        raise ValueError(
-            "frequencies_hz: expected at least one, all positive (absolute, not about the carrier)"
-        )
+        raise ValueError("frequencies_hz: expected some, all positive (absolute, not about the carrier)")
     check_choice("amplitude", amplitude, ("carrier", "friis"))
     check_choice("method", method, ("auto", "dense", "grid"))
     even = len(f) >= LEAST_FREQUENCIES and _evenly_spaced(f)

@@ -198,9 +198,8 @@ def gridded_sum(job: Sum, frequencies_hz: np.ndarray) -> np.ndarray:
     for m, n, block in job.blocks(max(cells, paths * (TAPS if job.own_delays else 1))):
         factor, longer = block.pairs(middle_hz if job.squint else job.carrier_hz)
         delay = job.tau + longer / SPEED_OF_LIGHT if job.own_delays else job.tau
-        grid = _spread(
-            step_hz * cells * delay.reshape(-1, paths), (amplitude * factor).reshape(-1, paths), cells
-        )
+        place = step_hz * cells * delay.reshape(-1, paths)
+        grid = _spread(place, (amplitude * factor).reshape(-1, paths), cells)
         waves = scipy.fft.fft(grid, axis=1, workers=threads(), overwrite_x=True)
         out[m, n] = (waves[:, harmonic] * correction).reshape(*factor.shape[:2], count)
     return out
@@ -298,9 +297,7 @@ def _ends(paths: PathArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         raise ValueError("paths: got ones without transmitter and receiver, which spherical waves need")
     bounces = np.isfinite(paths.vertices[..., 0]).sum(axis=1)
     if (bounces[paths.kind != "los"] == 0).any():
-        raise ValueError(
-            "paths: got mirror or diffuse paths without interaction points, which spherical waves need"
-        )
+        raise ValueError("paths: got some without the interaction points that spherical waves need")
     return paths.transmitter, paths.receiver, bounces
 
 

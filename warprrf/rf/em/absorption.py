@@ -123,16 +123,13 @@ def gas_attenuation_db_per_m(
     """
     f_hz = check_array("frequency_hz", frequency_hz, finite=False)
     if not np.all((f_hz >= 1e9) & (f_hz <= 1000e9)):
-        raise ValueError(
-            f"frequency_hz: got {frequency_hz!r}, expected 1e+09 to 1e+12 Hz, where ITU-R P.676 holds"
-        )
+        raise ValueError(f"frequency_hz: got {frequency_hz!r}, expected 1e+09 to 1e+12, where P.676 holds")
     Air(temperature_k, pressure_hpa, water_vapour_g_m3)  # which checks them
     f = f_hz[..., None] * 1e-9
     theta = 300.0 / temperature_k
     vapour_hpa = water_vapour_g_m3 * temperature_k / 216.7  # eq. (4)
-    imaginary = _oxygen(f, theta, pressure_hpa, vapour_hpa) + _water_vapour(
-        f, theta, pressure_hpa, vapour_hpa
-    )
+    state = f, theta, pressure_hpa, vapour_hpa
+    imaginary = _oxygen(*state) + _water_vapour(*state)
     per_km = 0.1820 * f[..., 0] * imaginary  # eq. (1)
     return float(per_km) * 1e-3 if f_hz.ndim == 0 else per_km * 1e-3
 

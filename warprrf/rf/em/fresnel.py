@@ -130,7 +130,7 @@ def _slab(
     ):
         if not fits.all():
             raise ValueError(
-                f"{name}: got {values[~fits].flat[0]!r}, expected a passive slab and a wave that meets it"
+                f"{name}: got {values[~fits].flat[0]!r}, expected a wave that meets a passive slab"
             )
     root = np.sqrt(eta - (1.0 - cos**2))
     root = np.where(root.imag > 0, -root, root)  # beyond total reflection the wave decays
@@ -188,9 +188,8 @@ def reciprocal_factor(alpha_r: int, cosine: ArrayLike) -> np.ndarray:
     """
     cos = np.clip(np.asarray(cosine, dtype=np.float64), 0.0, 1.0)
     node, weighed = _reciprocal_nodes(int(alpha_r))
-    return np.asarray(
-        1.0 / (_around_the_normal(int(alpha_r), cos.ravel(), node) @ weighed).reshape(cos.shape)
-    )
+    held = _around_the_normal(int(alpha_r), cos.ravel(), node) @ weighed
+    return np.asarray(1.0 / held.reshape(cos.shape))
 
 
 @lru_cache(maxsize=64)

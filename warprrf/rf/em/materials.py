@@ -405,9 +405,7 @@ def load_materials(path: str | os.PathLike[str]) -> dict[str, Material]:
     for k, entry in enumerate(table):
         material = _material(entry, f"path: {path}, entry {k}")
         if material.name in found:
-            raise ValueError(
-                f"path: {path} has two materials named {material.name!r}, expected one of each name"
-            )
+            raise ValueError(f"path: {path} has two materials named {material.name!r}, expected one")
         found[material.name] = material
     return found
 
@@ -491,9 +489,7 @@ def itu_material(
     """
     known = itu_name(itu) if isinstance(itu, str) else None
     if known is None:
-        raise ValueError(
-            f"itu: got {itu!r}, expected a material of ITU-R P.2040: {', '.join(sorted(ITU_BANDS))}"
-        )
+        raise ValueError(f"itu: got {itu!r}, expected one of ITU-R P.2040: {', '.join(sorted(ITU_BANDS))}")
     return Material(
         name=known if name is None else name,
         bands=ITU_BANDS[known],

@@ -465,9 +465,7 @@ class RadioField(ABC):
             field = wr.RadioField.fit(room, wr.SpectrumDataset.empty(transmitter=source, frequency_hz=300e9))
             first = candidates[field.suggest(candidates, 3)]
         """
-        raise ValueError(
-            f"field: got one of model {self.model!r}, expected 'bistatic', which can suggest places"
-        )
+        raise ValueError(f"field: got one of model {self.model!r}, expected 'bistatic' to suggest places")
 
     def check_positions(
         self, receivers: ArrayLike, transmitter: ArrayLike | None = None, *, name: str = "receivers"

@@ -83,9 +83,7 @@ class LinkOptions:
             object.__setattr__(self, "shape", check_shape(self.shape))
         check_beam(self.beam_sigma_rad)
         if self.mirror_order not in (None, 0, 1, 2, 3):
-            raise ValueError(
-                f"mirror_order: got {self.mirror_order!r}, expected 0 to 3, or None for the field's own"
-            )
+            raise ValueError(f"mirror_order: got {self.mirror_order!r}, expected 0 to 3, or None")
 
     def in_batches(self, receivers: np.ndarray, batch: int, trace: Callable[[np.ndarray], Links]) -> Links:
         """Links of ``receivers`` (R, 3), at most ``batch`` of them at a time."""

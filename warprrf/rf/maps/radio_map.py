@@ -96,9 +96,7 @@ class RadioMap:
         for name in _LAYERS:
             fields[name] = check_array(name, getattr(self, name), cells, finite=False)
             if not (np.isnan(fields[name]) | (fields[name] >= 0) & np.isfinite(fields[name])).all():
-                raise ValueError(
-                    f"{name}: got negative or infinite values, expected none, or NaN outside the air"
-                )
+                raise ValueError(f"{name}: got negative or infinite values, expected NaN outside the air")
         if self.ground_m is not None:
             fields["ground_m"] = check_array("ground_m", self.ground_m, cells, finite=False)
         for name, value in fields.items():
@@ -289,9 +287,7 @@ def radio_map(
     check_positive("cell", cell)
     low, high = mesh.bounds
     if not (0.0 if o.above_ground else low[2]) < height < high[2]:
-        raise ValueError(
-            f"height: got {height!r} m, expected one inside the scene, {low[2]:.3g} to {high[2]:.3g} m"
-        )
+        raise ValueError(f"height: got {height!r} m, expected {low[2]:.3g} to {high[2]:.3g} m")
     x, y = _centres(mesh, cell, o.bounds)
     across, along = np.meshgrid(x, y)
     ground = ground_height(mesh, across, along, device=field.device) if o.above_ground else None

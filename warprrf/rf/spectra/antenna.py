@@ -256,9 +256,7 @@ def sample_pattern(pattern: Pattern, angle: np.ndarray) -> np.ndarray:
     if callable(pattern):
         gain = check_array("pattern", pattern(angle), finite=False)
         if gain.shape not in ((), angle.shape):
-            raise ValueError(
-                f"pattern: got shape {gain.shape} for angles {angle.shape}, expected one gain for each angle"
-            )
+            raise ValueError(f"pattern: got shape {gain.shape} for angles {angle.shape}, expected the same")
         return np.broadcast_to(gain, angle.shape)
     samples = check_array("pattern", pattern, finite=False)
     if samples.ndim != 1 or len(samples) < 2:

@@ -104,9 +104,7 @@ class SpectrumDataset:
         count = len(receivers)
         gain = check_array("path_gain", self.path_gain, (count, None, None), dtype=np.float32, finite=False)
         if np.isinf(gain).any():
-            raise ValueError(
-                "path_gain: got infinite values, expected linear path gain, or NaN where not measured"
-            )
+            raise ValueError("path_gain: got infinite values, expected linear gains, NaN where not measured")
         shape = check_shape(gain.shape[1:])
         fields: dict[str, Any] = {
             "receivers": receivers,
@@ -241,9 +239,7 @@ class SpectrumDataset:
                 "(dataclasses.replace(paths, receiver=...) adds one)"
             )
         if np.ndim(paths.transmitter) != 1:
-            raise ValueError(
-                "paths: got ones of several transmitters, expected those of one; a set holds one"
-            )
+            raise ValueError("paths: got ones of several transmitters, expected those of one")
         several = list(paths.each())
         grid = check_shape(shape)
         spread = [spread_paths(p.arrival, p.power, grid, beam_sigma_rad, device=device) for p in several]
@@ -310,9 +306,7 @@ class SpectrumDataset:
             TypeError: for anything but a whole number.
         """
         if isinstance(index, bool) or not isinstance(index, int | np.integer):
-            raise TypeError(
-                f"index: got {index!r}, expected a whole number; subset() takes several receivers"
-            )
+            raise TypeError(f"index: got {index!r}, expected a whole number; subset() takes several")
         return Spectrum(
             path_gain=self.path_gain[index],
             delay_s=self.delay_s[index],
@@ -365,9 +359,7 @@ class SpectrumDataset:
         train, test = np.flatnonzero(self.role == "train"), np.flatnonzero(self.role == "test")
         check_count("n_train", n_train, most=len(train))
         if len(test) == 0:
-            raise ValueError(
-                "role: there are no test receivers; give simulate(..., roles=) or assign_roles some"
-            )
+            raise ValueError("role: there are no test receivers; give simulate(..., roles=) some")
         if check_seed(seed) != 0:
             train = np.random.default_rng(seed).permutation(train)
         return self.subset(train[:n_train]), self.subset(test)
@@ -553,13 +545,9 @@ def _check_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
     most_attribute_bytes = 60_000  # HDF5 takes 64 kB
     for name, value in attributes.items():
         if not isinstance(name, str) or not name or name.startswith("_") or {"/", "\0"} & set(name):
-            raise ValueError(
-                f"attributes: got the name {name!r}, expected text without / that does not begin with _"
-            )
+            raise ValueError(f"attributes: got the name {name!r}, expected text without / or a leading _")
         if name in dataset_files.RESERVED:
-            raise ValueError(
-                f"attributes: got {name!r}, which a data set's file needs itself; take another name"
-            )
+            raise ValueError(f"attributes: got {name!r}, which the file needs itself; take another name")
         held = np.asarray(value)
         if held.dtype.kind not in "biufU" or held.ndim > 1 or held.nbytes > most_attribute_bytes:
             raise TypeError(

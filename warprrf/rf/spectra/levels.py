@@ -59,9 +59,7 @@ def question_levels(
     rows = f"{name}: {len(wrong)} of {len(power)} (rows {some_of(wrong)})"
     end = f"{unit}{hint}; expected received over transmitted power"
     if len(impossible):
-        raise ValueError(
-            f"{rows} are up to {level_db[wrong].max():.4g} dB, no less than was transmitted{end}"
-        )
+        raise ValueError(f"{rows} are up to {level_db[wrong].max():.4g} dB, not less than transmitted{end}")
     warnings.warn(
         f"{rows} are up to {above[wrong].max():.3g} dB above line of sight in free space, where reflections add "
         f"{float(np.max(margin_db)):g} dB at most{end}",

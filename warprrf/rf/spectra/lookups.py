@@ -44,9 +44,7 @@ class Lookup:
         """
         places = check_array("receivers", receivers, (..., 3))
         if places.size == 0:
-            raise ValueError(
-                f"receivers: got shape {places.shape}, expected (3,) or (R, 3) with R at least 1"
-            )
+            raise ValueError(f"receivers: got shape {places.shape}, expected (3,) or (R, 3), R at least 1")
         found = [self._predict(place) for place in places.reshape(-1, 3)]
         return found[0] if places.ndim == 1 else Spectrum.stack(found)
 

@@ -45,9 +45,7 @@ def unit_image(path_gain: np.ndarray, floor: float, range_db: tuple[float, float
     """The dB image of a spectrum mapped to [0, 1] by the data set's range, shape of ``path_gain``, float64."""
     low, high = check_array("range_db", range_db, (2,))
     if not high > low:
-        raise ValueError(
-            f"range_db: got ({low}, {high}), expected (lowest, highest) with highest above lowest"
-        )
+        raise ValueError(f"range_db: got ({low}, {high}), expected (lowest, highest), the latter above")
     path_gain = check_array("path_gain", path_gain, finite=False)
     if (path_gain < 0).any():
         raise ValueError(f"path_gain: got {path_gain.min()}, expected gains of at least 0")

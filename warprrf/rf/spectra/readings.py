@@ -166,24 +166,18 @@ class Readings(PowerTable):
         for turned, pattern in (("arrival", "receive_pattern"), ("departure", "transmit_pattern")):
             value, gain = getattr(self, turned), getattr(self, pattern)
             if (value is None) != (gain is None):
-                raise ValueError(
-                    f"{pattern}: it goes with {turned}, got one of the two; expected both or neither"
-                )
+                raise ValueError(f"{pattern}: got one of it and {turned}; expected both or neither")
             if value is not None:
                 fields[turned] = check_turned(turned, value, count)
                 check_gains(pattern, gain)
         if (self.delay_s is None) != (self.bandwidth_hz is None):
-            raise ValueError(
-                "bandwidth_hz: it goes with delay_s, got one of the two; expected both or neither"
-            )
+            raise ValueError("bandwidth_hz: got one of it and delay_s; expected both or neither")
         if self.delay_s is not None:
             fields["delay_s"] = check_array("delay_s", self.delay_s, (count,))
             fields["bandwidth_hz"] = check_positive("bandwidth_hz", self.bandwidth_hz)
         check_type("azimuth_known", self.azimuth_known, bool)
         if not self.azimuth_known and self.arrival is None:
-            raise ValueError(
-                "azimuth_known: got False without arrival; expected the azimuths whose zero is to be found"
-            )
+            raise ValueError("azimuth_known: got False without arrival, whose zero is to be found")
         check_number("position_std_m", self.position_std_m, 0.0, 1.0)
         if self.position_std_m > 0 and self.total:
             raise ValueError(
@@ -495,9 +489,7 @@ def check_turned(name: str, value: ArrayLike, count: int) -> np.ndarray:
     angles = check_array(name, value, (count, 2))
     wrong = angles[np.abs(angles[:, 0] - np.pi / 2) > np.pi / 2 + 1e-6, 0]
     if len(wrong):
-        raise ValueError(
-            f"{name}: got a zenith of {wrong[0]:g}, expected 0 to pi (elevations from -90 to 90 degrees)"
-        )
+        raise ValueError(f"{name}: got a zenith of {wrong[0]:g}, expected 0 to pi (elevations: -90 to 90)")
     return angles
 
 
@@ -505,9 +497,7 @@ def check_gains(name: str, pattern: Pattern) -> None:
     """Raise ValueError, naming the argument, unless a pattern holds gains, some above zero."""
     gain = sample_pattern(pattern, np.linspace(0.0, np.pi, 721))
     if not np.isfinite(gain).all() or (gain < 0).any() or not gain.max() > 0:
-        raise ValueError(
-            f"{name}: got negative, NaN or infinite gains, or none above zero; expected linear power gains"
-        )
+        raise ValueError(f"{name}: got negative, NaN, infinite or no gains; expected linear power gains")
 
 
 def _tap(place: np.ndarray, window: str) -> np.ndarray:

@@ -88,9 +88,7 @@ def check_pixels(path_gain: np.ndarray, delay_s: np.ndarray | None, aod: np.ndar
         bad = int((path_gain < 0).sum())
         raise ValueError(f"path_gain: got {bad} negative values, expected linear path gain")
     if delay_s is not None and not (np.isnan(delay_s) | (delay_s >= 0) & (delay_s < np.inf)).all():
-        raise ValueError(
-            "delay_s: got values that are negative or infinite, expected seconds, or NaN where empty"
-        )
+        raise ValueError("delay_s: got negative or infinite values, expected seconds, or NaN where empty")
     angle_rounding = 1e-3  # radians by which angles of departure may lie out of range: by compact files
     if aod is not None:
         check_known_whole("aod", aod)
@@ -105,9 +103,7 @@ def check_whole(name: str, path_gain: ArrayLike) -> None:
     """Raise ValueError, naming the argument, if pixels of spectra were not measured."""
     missing = int(np.isnan(path_gain).sum())
     if missing:
-        raise ValueError(
-            f"{name}: {missing} of {np.size(path_gain)} pixels were not measured (NaN), expected whole spectra"
-        )
+        raise ValueError(f"{name}: {missing} of {np.size(path_gain)} pixels are NaN, expected whole spectra")
 
 
 def pixel_angles(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -161,9 +157,8 @@ def sub_pixel_directions(shape: tuple[int, int], sub_pixels: int) -> tuple[np.nd
 def directions_from_angles(zenith: ArrayLike, azimuth: ArrayLike) -> np.ndarray:
     """Unit vectors, shape ``(..., 3)``, of zenith in [0, pi] and azimuth in (-pi, pi] [rad]."""
     zenith, azimuth = np.broadcast_arrays(np.asarray(zenith, float), np.asarray(azimuth, float))
-    return np.stack(
-        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1
-    )
+    sine = np.sin(zenith)
+    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=-1)
 
 
 def angles_from_directions(directions: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
@@ -176,9 +171,8 @@ def angles_from_directions(directions: ArrayLike) -> tuple[np.ndarray, np.ndarra
 def transverse_basis(directions: ArrayLike) -> np.ndarray:
     """Zenith and azimuth unit vectors at unit directions ``(..., 3)``, shape ``(..., 2, 3)``."""
     zenith, azimuth = angles_from_directions(directions)
-    up = np.stack(
-        [np.cos(zenith) * np.cos(azimuth), np.cos(zenith) * np.sin(azimuth), -np.sin(zenith)], axis=-1
-    )
+    cosine = np.cos(zenith)
+    up = np.stack([cosine * np.cos(azimuth), cosine * np.sin(azimuth), -np.sin(zenith)], axis=-1)
     around = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)], axis=-1)
     return np.stack([up, around], axis=-2)
 
@@ -546,9 +540,7 @@ class Spectrum:
             ValueError: for spectra of several receivers.
         """
         if self.path_gain.ndim > 2:
-            raise ValueError(
-                f"spectrum: got {len(self.path_gain)} receivers, expected one: spectrum[0].plot()"
-            )
+            raise ValueError(f"spectrum: got {len(self.path_gain)} receivers, expected one: spectrum[0]")
         pyplot = _device.require("matplotlib.pyplot", extra="plots")
         if ax is None:
             _, ax = pyplot.subplots(figsize=(8.0, 4.0))

@@ -268,7 +268,7 @@ class Surface:
         eta, thickness, _ = self.slabs(frequency_hz)
         known, none = np.abs(eta) > 0, np.zeros(self.groups, np.int32)
         thickness_m = np.where(known, thickness * SPEED_OF_LIGHT / frequency_hz, np.inf)
-        return SurfaceTable(np.where(known, eta, LOSSY), thickness_m, 0.0 * thickness, none, none > 0)
+        return SurfaceTable(np.where(known, eta, LOSSY), thickness_m, np.zeros(self.groups), none, none > 0)
 
     def walls(self, frequency_hz: float, most: int, device: DeviceLike = None) -> Walls:
         """Its faces that may be passed, as far as :meth:`slabs` tells, up to ``most`` on one way."""

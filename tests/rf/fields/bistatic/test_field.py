@@ -25,6 +25,7 @@ from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.spectrum import spread, sub_pixel_directions, to_db
 from warprrf.rf.tracing.model import SETS, Effects, Parameters
 from warprrf.rf.tracing.surface import Surface
+from warprrf.rf.tracing.tracer import SPECULAR
 
 WAVELENGTH = SPEED_OF_LIGHT / F
 
@@ -50,6 +51,24 @@ def test_spectra_that_would_not_fit_into_memory_are_refused(
     with pytest.raises(ValueError, match="ds: 10 spectra of 24 x 48 pixels take 4.6e.04 rays"):
         trace(scene, data, sub_pixels=2)
     assert len(trace(scene, data.subset(np.arange(9)), sub_pixels=2).views) == 9
+
+
+def test_a_fit_to_many_keeps_no_records_and_is_the_same(
+    scene: RadioScene, data: SpectrumDataset, field: BistaticField, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of each ray 4 bytes of its face, 8 of its range, and a bit that says whether it is lit; records alone would take 24."""
+    monkeypatch.setattr(fitting, "MOST_KEPT", 0)
+    few = data.subset(np.arange(6))
+    views = trace(scene, few)
+    again = RadioField.fit(scene, few, views=views)
+    for view in views.views:
+        assert sum(a.nbytes for a in (view.hits.face, view.hits.range_m, *view.lit)) < 13 * len(
+            view.hits.face
+        )
+        assert set(view.records) == {SPECULAR}
+    assert np.array_equal(again.residual, field.residual)
+    for name in ("log_weight", "log_excess", "log_mirror"):
+        assert np.array_equal(getattr(again.parameters, name), getattr(field.parameters, name))
 
 
 def test_ten_times_better_than_the_nearest_measurement(field: BistaticField, data: SpectrumDataset) -> None:
@@ -91,7 +110,7 @@ def test_before_any_spectrum_the_field_is_that_of_the_prior(scene: RadioScene, d
     assert np.allclose(image, unfitted.spectrum(RECEIVERS[4]).path_gain, rtol=1e-6)
     dark = replace(data, path_gain=np.zeros_like(data.path_gain))
     assert np.array_equal(image, BistaticField.prior(scene, dark).spectrum(RECEIVERS[4]).path_gain)
-    bare = BistaticField.prior(scene, data, effects=Effects(line_of_sight=False, mirrors=0, scatterings=0))
+    bare = BistaticField.prior(scene, data, effects=Effects(False, 0, 0, transmissions=0, diffractions=0))
     assert bare.spectrum(RECEIVERS[4]).path_gain.max() == 0
 
 

@@ -239,7 +239,7 @@ class BistaticField(RadioField):
         )
         places_of(data, prior.mesh, device)
         own = assumed(prior.surface, prior.frequency_hz)
-        parameters = replace(prior.parameters, log_excess=own.log_excess, log_through=own.log_through)
+        parameters = replace(prior.parameters, log_excess=own.log_excess)
         report = {"receivers": 0, "held_out": 0, "chains": {}, "unexplained": {}}
         return replace(prior, parameters=parameters, report=report)
 
@@ -280,8 +280,9 @@ class BistaticField(RadioField):
             range_db=(float(ds.range_db[0]), float(ds.range_db[1])),
             beam_sigma_rad=float(ds.beam_sigma_rad),
             effects=replace(SETS["single"], residual=False) if effects is None else effects,
-            parameters=Parameters.prior(
-                surface.groups, *([] if lobes is None else [lobes]), reciprocal=reciprocal
+            parameters=replace(
+                Parameters.prior(surface.groups, *([] if lobes is None else [lobes]), reciprocal=reciprocal),
+                log_through=surface.slabs(float(ds.frequency_hz))[2],
             ),
             material=surface.material,
             residual=np.zeros((2, surface.cells)),

@@ -177,9 +177,7 @@ class HarmonicField(RadioField):
         gaussians, mesh = _geometry(geometry)
         receivers, transmitter = check_dataset(mesh, ds, device=device)
         if mesh is None and (chosen.line_of_sight == "explicit" or chosen.interaction_point == "mesh"):
-            raise ValueError(
-                'line_of_sight="explicit" and interaction_point="mesh" need a mesh; the geometry has none'
-            )
+            raise ValueError('line_of_sight="explicit" and interaction_point="mesh" need a mesh; got none')
         images = check_array("ds.path_gain", ds.path_gain, (len(receivers), None, None), np.float64)
         blank = cls(
             gaussians=gaussians,
@@ -324,9 +322,8 @@ class HarmonicField(RadioField):
         visible, gain = self._line_of_sight(receiver, transmitter)
         if not visible:
             return None
-        return spread(
-            (transmitter - receiver)[None], [gain], self.shape, self.beam_sigma_rad, device=self.device
-        )
+        toward = (transmitter - receiver)[None]
+        return spread(toward, [gain], self.shape, self.beam_sigma_rad, device=self.device)
 
     def _free_space(self, length_m: float | np.ndarray) -> float | np.ndarray:
         """Gain of a path of ``length_m`` [m] between isotropic antennas, less what the air absorbs."""

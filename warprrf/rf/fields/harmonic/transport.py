@@ -173,9 +173,7 @@ def _kept(seen: BlendWeights) -> tuple[np.ndarray, ...]:
     min_weight = 1e-4  # smaller shares of a pixel's weight are given to the others: 0.0004 dB
     keep = listed & (weight > min_weight * total[..., None])
     kept = np.sum(weight, axis=-1, where=keep, initial=0.0)
-    scale = np.divide(
-        total + np.asarray(seen.dropped, np.float64), kept, out=np.zeros_like(kept), where=kept > 0
-    )
+    scale = np.divide(total + np.asarray(seen.dropped, float), kept, out=np.zeros_like(kept), where=kept > 0)
     expected = np.sum(weight * np.asarray(seen.range), axis=-1, where=keep, initial=0.0)
     expected = np.divide(expected, kept, out=np.full_like(kept, np.nan), where=kept > 0)
     return (
