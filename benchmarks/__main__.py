@@ -26,6 +26,10 @@ NAMES = {
     ),
     "beams": ("benchmarks.beams", "beams chosen from the field without pilots"),
     "engine": ("benchmarks.engine.table", "the engine's speed against error"),
+    "truths": (
+        "benchmarks.engine.truths",
+        "the exact engine beside Sionna RT: time against noise, to depth 3",
+    ),
     "gpu": ("benchmarks.gpu", "tests and times on a CUDA device; without one a dry run"),
     "map": ("benchmarks.radio_map", "the radio map beside Sionna RT's RadioMapSolver"),
     "relevance": ("benchmarks.relevance", "what each effect is worth, at two carriers and three roughnesses"),
@@ -33,6 +37,7 @@ NAMES = {
     "photos": ("benchmarks.photos", "photos of any place: every eighth held out, rendered and compared"),
     "bare-mesh": ("benchmarks.bare_mesh", "a mesh without names, and a scan, beside the scene with names"),
     "filmed": ("benchmarks.filmed", "a filmed room against an RGB-D camera's depth"),
+    "stage1": ("benchmarks.stage1", "the reconstruction with every stage off, one at a time"),
     "measurements": (
         "benchmarks.measurements",
         "horns, power alone, delay profiles and one spectrum, beside ten spectra",

@@ -75,10 +75,9 @@ def heard(
     rng, steering, found = np.random.default_rng(7), ARRAY.response(hemisphere(SHAPE), 1.0).conj(), []
     for place in places:
         paths = engine.solve(place)
-        phase = np.exp(-2j * np.pi * np.mod(carrier_hz * paths["tau"], 1.0))
-        random = np.exp(2j * np.pi * rng.random(len(phase)))
-        amplitude = paths["jones"][:, 0, 0] * np.where(paths["diffuse"], random, phase)
-        found.append(np.abs(steering @ (ARRAY.response(paths["arrival"], 1.0).T @ amplitude)) ** 2)
+        random = np.exp(2j * np.pi * rng.random(len(paths.tau)))
+        amplitude = np.asarray(paths.jones)[:, 0, 0] * np.where(paths.kind == "diffuse", random, 1.0)
+        found.append(np.abs(steering @ (ARRAY.response(paths.arrival, 1.0).T @ amplitude)) ** 2)
     return np.asarray(np.round(255.0 * normalised(np.stack(found))), np.uint8)
 
 

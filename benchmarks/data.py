@@ -29,7 +29,7 @@ VERSIONS = {
     "geometry": 1,
     "metrics": 1,
     "sionna": 1,
-    "bistatic": 3,
+    "bistatic": 4,
     "harmonic": 1,
     "lookups": 1,
     "networks": 1,

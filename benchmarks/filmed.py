@@ -183,22 +183,31 @@ def score_cameras(
 
 def score(mesh: Mesh, reference: Mesh, rays: tuple[np.ndarray, np.ndarray, np.ndarray]) -> dict[str, Any]:
     """Errors of ``mesh`` where the reference saw a surface: from what its rays meet to the fused reference, along these
-    rays, and from the reference back to the mesh; and the share of the rays that meet the mesh at all."""
+    rays, and from the reference back to the mesh; the F score of both at 5 cm; the angle between normals where they are as
+    close; and the share of the rays that meet the mesh at all."""
     origins, directions, ranges = rays
     met = mesh.cast(origins, directions)
+    near = reference.closest(met.point[met.valid])
+    close = near.distance < CLOSE_M  # farther off, the nearest surface is another one
+    cosine = np.abs((met.normal[met.valid][close] * reference.face_normals[near.face[close]]).sum(axis=1))
     found = {
-        "distance": reference.distance(met.point[met.valid]),
+        "distance": near.distance,
         "range": np.abs(met.t - ranges)[met.valid],
         "back": mesh.distance(origins + ranges[:, None] * directions),
     }
-    figures: dict[str, Any] = {"covered": float(met.valid.mean())}
+    turned = np.degrees(np.arccos(np.clip(cosine, 0, 1)))
+    figures: dict[str, Any] = {
+        "covered": float(met.valid.mean()),
+        "normal_median_deg": float(np.median(turned)) if len(turned) else float("nan"),
+    }
     for name, error in found.items():
         figures |= {
             f"{name}_median_m": float(np.median(error)),
             f"{name}_p90_m": float(np.percentile(error, 90)),
             f"{name}_within_5_cm": float(np.mean(error < CLOSE_M)),
         }
-    return figures
+    there, back = figures["distance_within_5_cm"], figures["back_within_5_cm"]
+    return figures | {"f_5_cm": 2 * there * back / max(there + back, 1e-9)}
 
 
 def laid_on(
@@ -260,7 +269,9 @@ def _text(figures: Mapping[str, Any]) -> str:
     return (
         f"{figures['posed']} of {figures['frames']} frames posed{took}; cameras "
         f"{100 * figures['camera_rms_m']:.1f} cm rms off, {figures['camera_rotation_median_deg']:.2f} degrees; "
-        f"{100 * figures['covered']:.0f} % of the reference's pixels meet the mesh. The mesh is aligned by its cameras; *laid "
+        f"{100 * figures['covered']:.0f} % of the reference's pixels meet the mesh, normals "
+        f"{figures['laid_on_normal_median_deg']:.1f} degrees off, F at 5 cm {figures['laid_on_f_5_cm']:.3f}. The mesh "
+        "is aligned by its cameras; *laid "
         f"on it*, by its surface: scale {figures['laid_on_scale']:.3f}, what is left is the error of its shape.\n\n"
         + table(("", "median [m]", "90th percentile [m]", "within 5 cm"), rows)
     )

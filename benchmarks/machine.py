@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import resource
+import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -43,8 +44,26 @@ def processor_name() -> str:
     return processor
 
 
+def commit() -> str | None:
+    """Version of the code, with a plus where files differ from it; None outside a repository."""
+    asked = [
+        "git",
+        "-C",
+        str(Path(__file__).parent),
+        "describe",
+        "--always",
+        "--abbrev=12",
+        "--exclude=*",
+        "--dirty=+",
+    ]
+    try:
+        return subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
 def machine(device: Any = None) -> dict[str, Any]:
-    """What the figures were measured on: processor, cores, system, versions."""
+    """What the figures were measured on: version of the code, processor, cores, system, versions."""
     processor, on = processor_name(), resolve(device)
     versions = {}
     for package in PACKAGES:
@@ -53,6 +72,7 @@ def machine(device: Any = None) -> dict[str, Any]:
         except metadata.PackageNotFoundError:
             continue
     return {
+        "commit": commit(),
         "processor": processor,
         "cores": threads(),
         "device": f"{on} ({on.name})" if on.is_cuda else str(on),

@@ -16,7 +16,6 @@ from benchmarks.report import Row
 from benchmarks.runner import option
 from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
 from warprrf.rf.spectra.readings import path_weights
-from warprrf.rf.spectra.spectrum import directions_from_angles
 
 HELP = """\
 Readings of the lobby are made from the paths that Sionna RT finds at training receivers, never from a field of ours: a horn that
@@ -186,12 +185,12 @@ class Room:
         for k, place in enumerate(places):
             self.fits.job.progress("paths", k, len(places))
             paths = engine.solve(place)
-            departure = directions_from_angles(*paths["aod"].T)
+            departure = paths.departure
             like = table_of(kind, ds, place[None], np.ones((1, count)))
             for first in range(0, len(departure), AT_ONCE):
                 part = slice(first, first + AT_ONCE)
-                arrive = paths["arrival"][part], departure[part], paths["tau"][part]
-                found[k] += path_weights(like, np.arange(count), *arrive) @ paths["power"][part]
+                arrive = paths.arrival[part], departure[part], paths.tau[part]
+                found[k] += path_weights(like, np.arange(count), *arrive) @ paths.power[part]
         return {"power": found}
 
     def simulated(self, name: str, receivers: np.ndarray, **changed: Any) -> wr.SpectrumDataset:

@@ -183,7 +183,9 @@ def _harmonic(task: Task, model: str, **options: Any) -> Fitted:
     seen, seconds = place.weights(task.test, slot=task.slot, progress=progress)
     return replace(
         fitted,
-        predict=lambda rx: learned.spectrum(rx, transport=seen.at(rx)),
+        predict=lambda rx: learned.spectrum(
+            rx, transport=seen.subset((seen.receivers == rx).all(axis=1).nonzero()[0])
+        ),
         before_s=seconds / len(task.test),
     )
 

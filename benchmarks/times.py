@@ -36,12 +36,14 @@ seconds, peak memory. Places: lobby, or Sionna RT's cities munich and san_franci
 examples:
   python -m benchmarks times
   python -m benchmarks times --geometry runs/lobby/reconstruction      on the room from photos
+  python -m benchmarks times --verbs fit-few fit-many spectrum spectra map
+  python -m benchmarks times --verbs simulate-large fit-large          seven hundred spectra: memory and time
   python -m benchmarks times --place munich --verbs load spectrum
 """
 CITIES = {"munich": (8.5, 21.0, 27.0), "san_francisco": (0.0, 0.0, 45.0)}
 """Transmitters [m]."""
 CITY_HZ, SCATTERING = 3.5e9, 0.4
-FEW, MANY, MOST = 10, 50, 1000
+FEW, MANY, HUNDREDS, MOST = 10, 50, 700, 1000
 MAP_M = 0.25  # cells
 CITY_MAP_M, HALF_M = 5.0, 150.0  # cells, and half the width of a city's map
 BAND_HZ = np.linspace(299e9, 301e9, 64)
@@ -70,10 +72,11 @@ class Options:
 
 @dataclass(frozen=True)
 class Room:
-    """Where verbs are asked, and a folder in which one process leaves a field for the next."""
+    """Where verbs are asked, a folder in which one process leaves a field for the next, and one that is kept between runs."""
 
     options: Options
     folder: Path
+    kept: Path
 
     @cached_property
     def is_city(self) -> bool:
@@ -118,6 +121,13 @@ class Room:
         if not file.is_file():
             wr.simulate(self.scene, receivers=self.receivers[:MANY], **self.link).save(file)
         return wr.SpectrumDataset.load(file)
+
+    @cached_property
+    def large(self) -> wr.SpectrumDataset:
+        """Many spectra by the exact engine, of the paper's size."""
+        return wr.simulate(
+            self.scene, receivers=self.receivers[:HUNDREDS], workspace=self.kept / self.options.place, **self.link
+        )  # fmt: skip
 
     def fit(self, count: int) -> Any:
         """A field on ``count`` spectra."""
@@ -193,6 +203,10 @@ VERBS: dict[str, Verb] = {
     "relevance": Verb("relevance, 6 receivers", lambda r: wr.relevance(r.scene, receivers=r.receivers[:6], **r.link)),
     "fit-few": Verb(f"RadioField.fit, {FEW} spectra", lambda r: r.fit(FEW), ("geometry", "spectra")),
     "fit-many": Verb(f"RadioField.fit, {MANY} spectra", lambda r: r.fit(MANY), ("geometry", "spectra")),
+    "simulate-large": Verb(f"simulate, exact, {HUNDREDS} receivers, or what is kept of it", lambda r: r.large),
+    "fit-large": Verb(
+        f"RadioField.fit, {HUNDREDS} spectra of 90 x 180", lambda r: wr.RadioField.fit(r.geometry, r.large), ("geometry", "large"),
+    ),
     "spectrum": Verb("field.spectrum", lambda r: r.field.spectrum(r.receivers[20]), FIELD, 5),
     "spectra": Verb(f"field.spectra, {MOST} receivers", lambda r: r.field.spectra(r.receivers), FIELD),
     "paths": Verb("field.paths, 10 receivers", lambda r: r.field.paths(r.receivers[:10], max_paths=100), FIELD, 2),
@@ -213,7 +227,7 @@ def run(options: Options, job: Job) -> Report:
         raise ValueError(f"verbs: got {', '.join(unknown)}, expected some of {', '.join(VERBS)}")
     names, rows, context = options.verbs or tuple(VERBS), [], multiprocessing.get_context("spawn")
     with tempfile.TemporaryDirectory() as folder:
-        room = Room(options, Path(folder))
+        room = Room(options, Path(folder), job.out / "simulated")
         for k, name in enumerate(names):
             job.progress("verbs", k, len(names))
             with ProcessPoolExecutor(1, mp_context=context) as process:

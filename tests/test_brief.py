@@ -20,6 +20,8 @@ def test_it_is_one_line_that_begins_with_the_class(name, place):
 def test_it_says_how_much_there_is(place):
     many = wr.Paths.stack([place.paths.row(0)] * 40)
     for thing, part in (
+        (place.spectra, f"({len(place.spectra)} receivers: "),
+        (place.scene, f"({len(place.mesh.faces)} faces, "),
         (place.gaussians, f"means ({len(place.gaussians)}, 3)"),
         (wr.render(place.gaussians, place.camera, device="cpu"), "alpha (12, 16)"),
         (many, f"gain (40, {many.gain.shape[1]})"),

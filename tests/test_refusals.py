@@ -28,6 +28,10 @@ def readings(**changes):
     [
         ("faces.*0 to 2", lambda: wr.Mesh(np.eye(3), [[0, 1, 3]])),
         ("faces.*0 to 2", lambda: wr.Mesh(np.eye(3), [[0, 1, -1]])),
+        ("faces.*int32", lambda: wr.Mesh(np.eye(3), [[0, 1.5, 2.0]])),  # neither rounded nor wrapped
+        ("faces", lambda: wr.Mesh(np.eye(3), [[0, 2**40, 1]])),
+        ("length", lambda: wr.Paths.stack([random_paths(3)], length=3.5)),
+        ("mirrors", lambda: wr.Effects(mirrors=2.5)),
         ("spacing", lambda: wr.PlanarArray(1, 1, spacing=-1.0)),
         ("power", lambda: delay_spread([1.0, -1.0], [0.0, 1e-9])),
         ("level", lambda: coherence_bandwidth([1.0, 1.0], [0.0, 1e-9], level=1.5)),

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from warprrf import steps as module
-from warprrf.files import plain, write_text
+from warprrf.files import write_text
 from warprrf.steps import Attempt, Steps, digest
 
 
@@ -197,10 +197,3 @@ def test_two_jobs_do_not_share_a_folder_unless_told_to(tmp_path: Path) -> None:
         pass
     with Steps(tmp_path, shared=True), Steps(tmp_path, shared=True):
         pass
-
-
-def test_json_has_no_nan() -> None:
-    given = {"a": np.array([1.0, np.nan]), "b": np.float32(2), "c": float("inf")}
-    assert plain(given) == {"a": [1.0, None], "b": 2.0, "c": None}
-    with pytest.raises(TypeError):
-        plain(object())

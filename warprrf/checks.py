@@ -7,7 +7,7 @@ import inspect
 import numbers
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from types import EllipsisType
 from typing import Any, TypeVar
@@ -70,10 +70,20 @@ def check_array(
         bad = ~(size <= most) if finite else (size > most) & (size < np.inf)
         if bad.any():
             number, kinds = int(np.count_nonzero(bad)), "NaN, infinite or " if finite else ""
-            raise ValueError(
-                f"{name}: got {number} values that are {kinds}above {most:g}, expected finite numbers"
-            )
+            raise ValueError(f"{name}: got {number} values that are {kinds}above {most:g}, expected finite")
     return array
+
+
+def check_each(name: str, value: ArrayLike, count: int, *shape: int) -> np.ndarray:
+    """``value``, one of ``shape`` for all or one for each of ``count``, as a new array ``(count, *shape)``.
+
+    Raises:
+        TypeError, ValueError: naming the argument.
+    """
+    found = check_array(name, value)
+    if found.shape not in (shape, (count, *shape)):
+        raise ValueError(f"{name}: got shape {found.shape}, expected {shape} or {(count, *shape)}")
+    return np.broadcast_to(found, (count, *shape)).copy()
 
 
 def check_alike(**arrays: ArrayLike) -> None:
@@ -102,6 +112,13 @@ def check_count(name: str, value: object, least: int = 1, most: int = 2**31 - 1)
     return int(value)  # type: ignore[call-overload]
 
 
+def check_choice(name: str, value: object, allowed: Iterable[object]) -> None:
+    """Raise ValueError, naming the argument, unless ``value`` is one of those ``allowed``."""
+    known = tuple(allowed)
+    if value not in known:
+        raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(map(str, known))}")
+
+
 def check_chosen(name: str, value: ArrayLike, count: int, least: int = 0) -> np.ndarray:
     """Indices, ``least`` or more, of ``count`` rows that ``value`` names by whole numbers or a mask.
 
@@ -114,7 +131,7 @@ def check_chosen(name: str, value: ArrayLike, count: int, least: int = 0) -> np.
     whole = chosen.dtype.kind in "iu" or chosen.size == 0
     if chosen.ndim != 1 or not whole or len(chosen) < least or (np.abs(chosen + 0.5) > count).any():
         raise ValueError(
-            f"{name}: got {value!r}, expected whole numbers from 0 to {count - 1}, or a mask ({count},)"
+            f"{name}: got {value!r}, expected indices from 0 to {count - 1} or a mask ({count},)"
         )
     return chosen.astype(np.int64)
 
@@ -258,6 +275,17 @@ def check_arrays(
             bad = array[~within][0]
             raise ValueError(f"{name}: got {bad}, expected values from {wanted.least:g} to {most:g}")
     return sizes
+
+
+def check_known_whole(name: str, array: np.ndarray, axes: int = 1) -> None:
+    """Raise ValueError, naming the array, unless NaN is in all or none of the numbers along each row of its last ``axes``.
+
+    A point, a direction, a matrix is known whole or not at all.
+    """
+    unknown, last = np.isnan(array), tuple(range(-axes, 0))
+    some = int((unknown.any(last) != unknown.all(last)).sum())
+    if some:
+        raise ValueError(f"{name}: got {some} that are NaN in part, expected each known whole or not at all")
 
 
 def index_to(size: str, shape: str, least: int = 0) -> Expected:

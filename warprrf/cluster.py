@@ -61,9 +61,8 @@ def each(
         while True:
             room = max(_LEAST, 2 * sum(client.nthreads().values())) - len(running)
             for k, part in islice(waiting, max(room, 0)):
-                future = client.submit(
-                    _run, known, shared, part, pure=False, priority=-k
-                )  # first come, first done
+                # first come, first done
+                future = client.submit(_run, known, shared, part, pure=False, priority=-k)
                 running[future] = k
                 ready.add(future)
             if not running:

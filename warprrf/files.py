@@ -275,6 +275,4 @@ def plain(value: Any) -> Any:
         return value
     if isinstance(value, os.PathLike):
         return os.fspath(value)
-    raise TypeError(
-        f"value: got {type(value).__name__}, expected numbers, text, arrays, lists or dictionaries"
-    )
+    raise TypeError(f"value: got {type(value).__name__}, expected numbers, text, arrays, lists or mappings")

@@ -11,7 +11,9 @@ import fcntl
 import io
 import json
 import math
+import mmap
 import os
+import struct
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
@@ -29,6 +31,8 @@ _CHUNK_BYTES = 2_000_000  # of packed variables, several rows to a chunk
 _SUMS = "checksums"
 _LINE, _MOST_LINE = b"\nwarprrf rows ", 1 << 16
 _SAME_PLACE = 1e-6  # of coordinates, in their unit
+# HDF5's global heaps, with the lengths of 8 bytes that all its writers use: signature and size; index and size.
+_HEAP, _HEAP_HEADER, _HEAP_OBJECT = b"GCOL\1\0\0\0", struct.Struct("<8sQ"), struct.Struct("<H6xQ")
 
 
 @dataclass(frozen=True)
@@ -287,9 +291,7 @@ class Store:
             file.seek(max(path.stat().st_size - _MOST_LINE, 0))
             line, _, digest = file.read().rpartition(_LINE)[2].partition(b"\n")[0].rpartition(b" ")
         if digest != b"%08x" % zlib.crc32(line):
-            raise ValueError(
-                f"store: {path} is damaged, or no store of ours; name another file, or remove it"
-            )
+            raise ValueError(f"store: {path} is damaged, or no store; name another file, or remove it")
         entry = json.loads(line)
         if entry["key"] != self._attributes["key"]:
             raise ValueError(
@@ -367,9 +369,11 @@ def read(
         OSError: naming ``path``, if it cannot be read.
         ValueError: naming ``path``, if it is damaged, no NetCDF-4 file, or not to be put in order.
     """
-    check_seal(path)
     h5netcdf, name = require("h5netcdf", extra="all"), os.fspath(path)
+    sealed = check_seal(path)
     try:
+        if not sealed:
+            check_heaps(path)
         with h5netcdf.File(name, "r") as file:
             there = {n: file.variables[n] for n in (*variables, *axes) if n in file.variables}
             stated = sum(math.prod(v.shape) * max(np.dtype(v.dtype).itemsize, 1) for v in there.values())
@@ -394,6 +398,28 @@ def read(
     except (ValueError, IndexError) as error:
         raise ValueError(f"{name}: {error}") from error
     return arrays, attributes
+
+
+def check_heaps(path: str | os.PathLike[str]) -> None:
+    """Raise ValueError for a damaged heap of texts and references, in which HDF5 would go round for ever.
+
+    HDF5 steps from one object of a heap to the next by the sizes that they state (file format specification, III.E), nothing
+    or past the end included.
+    """
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        heap = data.find(_HEAP)
+        while heap >= 0:
+            at = heap + _HEAP_HEADER.size
+            end = heap + _HEAP_HEADER.unpack(data[heap:at])[1]
+            while at + _HEAP_OBJECT.size <= min(end, len(data)):
+                index, size = _HEAP_OBJECT.unpack_from(data, at)
+                step = (
+                    _HEAP_OBJECT.size + -(-size // 8) * 8 if index else size
+                )  # free space counts its own header
+                if not _HEAP_OBJECT.size <= step <= end - at:
+                    raise ValueError(f"its heap at byte {heap} states an object of {size} bytes at {at}")
+                at += step
+            heap = data.find(_HEAP, heap + 1)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -94,9 +94,15 @@ def _db(gain: np.ndarray) -> np.ndarray:
     return np.asarray(10.0 * np.log10(np.maximum(gain, 10.0 ** (DARK_DB / 10.0))))
 
 
-FIELDS = {"field, without": wr.Effects(mirrors=2, scatter_mirror=False)}
+BARE = wr.Effects(mirrors=2, scatter_mirror=False, transmissions=0, diffractions=0)
+FIELDS = {
+    "field": replace(BARE, transmissions=3, diffractions=1),
+    "field, without diffraction": replace(BARE, transmissions=3), "field, without either": BARE,
+}  # fmt: skip
 """Rows of fields by their effects."""
-TRACED = {"traced, without": {"mirror_order": 2}}
+TRACED = {
+    "traced": {"mirror_order": 2, "transmissions": 3, "diffractions": 1}, "traced, without either": {"mirror_order": 2}
+}  # fmt: skip
 """Rows of sharp paths by the options of their tracing."""
 
 

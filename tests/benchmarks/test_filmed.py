@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import places
 import pytest
 import views
 from PIL import Image
@@ -13,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 import warprrf as wr
 from benchmarks.filmed import Film, laid_on, score, score_cameras
+from benchmarks.stage1 import Room
 
 pytest.importorskip("open3d")
 LOW, HIGH = np.array([-1.2, -1.0, 0.0]), np.array([1.2, 1.0, 2.4])
@@ -76,14 +79,15 @@ def test_true_cameras_and_mesh_score_zero_in_any_frame_and_a_larger_mesh_how_muc
     assert scale == pytest.approx(1, abs=1e-6)
     true, grown = (box_mesh(LOW - by, HIGH + by, inward=True) for by in (0.0, 0.1))
     found = score(wr.Mesh(true[0] @ rotation.T + shift, true[1]), surface, levelled.rays(3))
-    assert found["covered"] == 1
+    assert found["covered"] == 1 and found["f_5_cm"] > 0.97
+    assert found["normal_median_deg"] < 3  # of millimetres rounded, fused in voxels of 2 cm
     for name in ("distance", "range", "back"):
         assert found[f"{name}_median_m"] < 0.01 and found[f"{name}_within_5_cm"] > 0.97
     found = score(wr.Mesh(grown[0] @ rotation.T + shift, grown[1]), surface, levelled.rays(3))
     assert found["distance_median_m"] == pytest.approx(0.1, abs=0.01)
     assert found["back_median_m"] == pytest.approx(0.1, abs=0.01)
     assert 0.1 < found["range_median_m"] < 0.15  # along slanted rays
-    assert found["back_within_5_cm"] < 0.01
+    assert found["back_within_5_cm"] < 0.01 and found["f_5_cm"] < 0.02
 
 
 def test_a_moved_mesh_is_laid_on_the_reference(reference, cameras):
@@ -97,3 +101,12 @@ def test_a_moved_mesh_is_laid_on_the_reference(reference, cameras):
     assert scale == pytest.approx(1.04, abs=0.004)
     # A voxel of the reference; moved by 5 to 17 cm.
     np.testing.assert_allclose(mesh.vertices, true, atol=0.02)
+
+
+@pytest.mark.parametrize("drawn", [False, True])
+def test_the_reference_of_a_room_scores_nothing_against_itself(film, drawn):
+    folder = places.LOBBY if drawn else Path(film.stems[0]).parent
+    room = Room.open(str(folder), 8, lambda stage, done, total: None)
+    assert len(room.files) == (120 if drawn else 8) and set(room.known) <= {file.name for file in room.files}
+    found = score(room.reference, room.reference, room.rays)
+    assert found["covered"] > 0.9 and found["distance_p90_m"] < 1e-4 and found["f_5_cm"] > 0.98

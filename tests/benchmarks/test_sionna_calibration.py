@@ -39,7 +39,7 @@ def test_calibration_lowers_the_error_and_finds_what_scatters(tmp_path: Path) ->
     recorded = []
 
     class Engine(SionnaEngine):
-        def _read(self, paths: Any) -> dict[str, np.ndarray]:
+        def _read(self, paths: Any) -> Any:
             recorded.append(any(drjit.grad_enabled(part) for part in paths.a))
             return super()._read(paths)
 

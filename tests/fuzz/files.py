@@ -31,6 +31,7 @@ from warprrf.geometry.mesh_files import read_mesh
 from warprrf.geometry.photos.photo_files import check_photos, find_photos, read_photo
 from warprrf.geometry.photos.poses import DepthFile, read_depth, read_poses
 from warprrf.geometry.photos.sfm import read_colmap
+from warprrf.netcdf_files import check_heaps
 from warprrf.rf.interop.twin import write_twin
 from warprrf.steps import Steps
 
@@ -151,6 +152,7 @@ def _write_tensors(path: Path, tree: Any) -> None:
 def _read_netcdf(path: Path) -> Any:
     import xarray
 
+    check_heaps(path)
     with xarray.open_dataset(path, engine="h5netcdf", decode_cf=False) as opened:
         data = opened.load()
     parts = {str(k): [list(map(str, v.dims)), v.values, dict(v.attrs)] for k, v in data.variables.items()}
@@ -360,7 +362,7 @@ FORMATS: dict[str, Format] = {
     },
     "field without checksum": Format(_made("old.safetensors", without_checksum), _field, "", "whole", ("transmitter",)),
     "unfinished store": Format(_copy("store.nc.unfinished", "bistatic.safetensors"), _resumed, "", "sealed"),
-    "paths": Format(_copy("paths.nc"), _paths, "netcdf", "sealed"),
+    "paths": Format(_copy("paths.nc"), _paths, "netcdf", "sealed", unknown=(".jones",)),
     "reconstruction": Format(
         _copy("reconstruction/reconstruction.safetensors"), lambda p: wr.Reconstruction.load(p.parent), "tensors", "sealed"
     ),

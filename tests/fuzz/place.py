@@ -29,7 +29,7 @@ GIVEN: dict[str, Any] = {
     "top_k": 4, "index": 1, "count": 8, "number": 1, "n_train": 4, "height": 1.2, "width_rad": 0.2, "noise": 0.1,
     "cos_incidence": np.cos(ANGLES / 2), "thickness_m": 0.1, "tau": 1e-8 * ANGLES, "tx": np.array([0, 1]),
     "power": np.array([1e-9, 2e-9, 5e-10, 1e-10, 0.0]), "rows": np.array([0, 2]), "indices": np.array([0, 1]),
-    "materials": (wr.Material.conductor(),) * 2, "path": "saved", "home": "folder",
+    "materials": (wr.Material.conductor(),) * 2, "path": "saved", "home": "folder", "reach_m": 1e-3,
 }  # fmt: skip
 """What arguments are given, by their names."""
 

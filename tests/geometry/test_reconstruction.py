@@ -1,6 +1,5 @@
 """From photos to geometry: initial Gaussians, resumed runs, files."""
 
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -114,27 +113,6 @@ def test_a_killed_run_continues_to_the_same_result(whole, monkeypatch):
     assert steps(told) == {"depth", "stereo", "surface"}
     np.testing.assert_array_equal(resumed.gaussians.means, rec.gaussians.means)
     np.testing.assert_array_equal(resumed.mesh.vertices, rec.mesh.vertices)
-
-
-@pytest.mark.parametrize(
-    "changed, again",
-    [
-        ("initial", {"planes", "refine", "depth", "stereo", "surface"}),
-        ("refined", {"refine", "depth", "stereo", "surface"}),
-        ("surface", {"depth", "stereo", "surface"}),
-    ],
-)
-def test_a_step_of_another_version_is_done_again_and_those_after_it(
-    whole, changed, again, tmp_path, monkeypatch
-):
-    workspace, rec = whole
-    shutil.copytree(workspace, tmp_path / "w", symlinks=True)
-    monkeypatch.setitem(from_photos.VERSIONS, changed, from_photos.VERSIONS[changed] + 1)
-    for wanted in (again, set()):  # and then no more
-        other, told = made(tmp_path / "w")
-        assert steps(told) == wanted
-        np.testing.assert_array_equal(other.mesh.vertices, rec.mesh.vertices)
-        np.testing.assert_array_equal(other.gaussians.sh, rec.gaussians.sh)
 
 
 def test_a_changed_setting_is_not_served_from_the_old_run(whole):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, square
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, square
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.fresnel import lobe, slab_reflection
@@ -88,22 +88,6 @@ def test_every_path_follows_the_scattering_formula(material):
     clear = cos_s > 0.2
     np.testing.assert_allclose(power[clear], expected[clear], rtol=2e-4 if alpha else 1e-9)
     assert (power < 3 * expected.max()).all()
-
-
-def test_a_solid_throws_a_shadow():
-    mesh, part = joined(box_mesh(LOW, HIGH, inward=True), box_mesh([-1, -1, 0.5], [0.5, 1.5, 1.2]))
-    scene = RadioScene(mesh, part, [SlabMaterial(scattering=0.5), SlabMaterial(scattering=0.0)])
-    above = np.array([-0.25, 0.25, 3.5])
-    found = engine(scene, above).diffuse(RX)
-    floor = above + found.departure
-    floor = floor[floor[:, 2] < 1e-9]
-    # Central projection of the top face's outline onto the floor.
-    scale = 3.5 / (3.5 - 1.2)
-    low, high = above[:2] + scale * ([-1, -1] - above[:2]), above[:2] + scale * ([0.5, 1.5] - above[:2])
-    hidden = ((floor[:, :2] > low + 1e-3) & (floor[:, :2] < high - 1e-3)).all(axis=1)
-    assert len(floor) > 1000 and not hidden.any()
-    near = ((floor[:, :2] > low - 0.3) & (floor[:, :2] < high + 0.3)).all(axis=1)
-    assert near.any()
 
 
 def wall_integral(material, rx):

@@ -97,6 +97,9 @@ def test_a_map_marks_what_it_does_not_answer(field):
     cells = field.radio_map(0.7, 0.5)
     inside = ((cells.positions > CUPBOARD[0]) & (cells.positions < CUPBOARD[1])).all(axis=-1)
     assert inside.any() and not cells.free[inside].any() and cells.free[~inside].all()
+    assert (np.isnan(cells.total_path_gain) == inside).all() and (
+        np.isnan(cells.best_beam_gain) == inside
+    ).all()
     with pytest.raises(ValueError, match="transmitter.*inside a solid"):
         field.radio_map(0.7, 0.5, transmitter=IN_CUPBOARD)
 

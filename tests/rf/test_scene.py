@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 from pathlib import Path
 
@@ -84,10 +83,6 @@ def test_other_materials_are_materials_one_for_each(lobby: Scene) -> None:
     for wrong in (["marble"] * len(lobby.materials), lobby.materials[:-1]):
         with pytest.raises((ValueError, TypeError), match="^materials"):
             lobby.with_materials(wrong)
-
-
-def test_a_scene_says_what_it_is_in_a_line(lobby: Scene) -> None:
-    assert re.fullmatch(r"Scene\(\d+ faces, \d+ objects, materials [a-z_, ]*marble[a-z_, ]*\)", repr(lobby))
 
 
 @pytest.mark.parametrize("how", ["absolute", "upward", "link", "folder that is a link"])

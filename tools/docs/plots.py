@@ -10,8 +10,12 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+from scipy.special import erfc  # noqa: E402
 from tables.common import NAMES, TRUTHS, read  # noqa: E402
 from tables.paper import PLACES, paper  # noqa: E402
+
+from warprrf.rf.em.diffraction import EdgeRays, diffraction_matrices  # noqa: E402
 
 STYLE = {
     "svg.fonttype": "none", "svg.hashsalt": "warprrf", "font.family": "sans-serif", "font.size": 9, "axes.grid": True,
@@ -149,4 +153,40 @@ def _ablation() -> Any:
     ax.invert_yaxis()
     ax.set_xlabel("PSNR [dB]")
     ax.legend(fontsize=7, loc="lower right")
+    return figure
+
+
+@entry(
+    "half-plane",
+    "Field behind and before a metal half plane, a plane wave from 60 degrees, 5 wavelengths from its edge",
+)
+def _half_plane() -> Any:
+    """Sommerfeld's closed form beside line of sight, mirror image and diffracted path."""
+    source, phi, kr = np.radians(60.0), np.linspace(0.001, 2 * np.pi - 0.001, 1501), 2 * np.pi * 5.0
+    rays = EdgeRays(2.0, source, phi, 0.0, np.inf, 5.0, 1.0)
+    bent = diffraction_matrices(rays, [(-1.0, 1.0)] * 2) * np.exp(-1j * kr)
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), sharey=True)
+    for k, (ax, name, sign) in enumerate(zip(axes, ("along the edge", "across it"), (-1, 1), strict=True)):
+        exact, paths = 0.0, bent[:, k, k]
+        for angle, factor in ((phi - source, 1.0), (phi + source, sign)):
+            wave = factor * np.exp(1j * kr * np.cos(angle))
+            exact = exact + 0.5 * wave * erfc(-np.exp(0.25j * np.pi) * np.sqrt(2 * kr) * np.cos(angle / 2))
+            paths = paths + np.where(angle < np.pi, wave, 0.0)
+        for field, style, label in (
+            (exact, "-", "closed form"), (paths, "--", "paths"), (paths - bent[:, k, k], ":", "paths without the edge"),
+        ):  # fmt: skip
+            level = 20 * np.log10(np.maximum(np.abs(field), 1e-9))
+            width = 3.0 if style == "-" else 1.2
+            ax.plot(
+                np.degrees(phi),
+                level,
+                style,
+                lw=width,
+                color={"-": "#5aa9c9", "--": "#c4570f", ":": "#777777"}[style],
+                label=label,
+            )
+        ax.set(title=f"electric field {name}", xlabel="angle about the edge [degrees]", ylim=(-40, 10))
+        ax.set_xticks(range(0, 361, 60))
+    axes[0].set_ylabel("over the incident field [dB]")
+    axes[1].legend(fontsize=7, loc="lower left")
     return figure

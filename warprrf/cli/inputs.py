@@ -321,8 +321,11 @@ def _read_places(values: Sequence[str], name: str, what: str, count: int) -> np.
     return np.array(rows)
 
 
-def add_mesh_options(parser: argparse.ArgumentParser) -> None:
-    """Define how a mesh file is read."""
+def add_geometry_options(parser: argparse.ArgumentParser, splats: str = "") -> None:
+    """Define how a mesh file is read, what of a scene file's materials is taken, and that either may name any file; and a
+    mesh beside splats, where the argument ``splats`` may be some."""
+    if splats:
+        parser.add_argument("--mesh", help=f"mesh for line of sight, where {splats} is splats")
     parser.add_argument("--unit", choices=tuple(METRES), help="of a mesh file (default m)")
     parser.add_argument(
         "--up",
@@ -331,9 +334,6 @@ def add_mesh_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--simplify", type=int, metavar="N", help="most triangles of a mesh file")
 
-
-def add_scene_options(parser: argparse.ArgumentParser) -> None:
-    """Define what of a scene file's materials is taken, and that it may name any file."""
     parser.add_argument("--materials", metavar="FILE", help="table that replaces a scene's materials by name")
     parser.add_argument(
         "--extrapolate",
@@ -350,21 +350,14 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
 def load_scene(path: str | Path, options: argparse.Namespace) -> wr.Scene:
     """A scene file that Sionna RT opens, or a mesh file."""
     materials = None if options.materials is None else existing(options.materials)
-    return wr.Scene.load(
-        existing(path),
-        materials=materials,
-        extrapolate=options.extrapolate,
-        allow_outside=options.allow_outside,
-        unit=options.unit,
-        up=options.up,
-        simplify=options.simplify,
-    )
+    how = _mesh_options(options)
+    return wr.Scene.load(existing(path), materials=materials, extrapolate=options.extrapolate, **how)
 
 
-def load_geometry(path: str, mesh: str | None, options: argparse.Namespace) -> Any:
+def load_geometry(path: str, options: argparse.Namespace) -> Any:
     """A saved reconstruction (folder), splats (PLY, optionally with a mesh), a scene (XML) or a mesh file, which is a scene
     where materials are given."""
-    source = existing(path)
+    source, mesh = existing(path), options.mesh
     splats = source.suffix.lower() == ".ply" and "scale_0" in ply_columns(source).get("vertex", ())
     if options.materials is not None and (source.is_dir() or splats):
         raise ValueError(f"--materials: {source} names no materials, expected a scene (.xml) or a mesh file")
@@ -373,9 +366,7 @@ def load_geometry(path: str, mesh: str | None, options: argparse.Namespace) -> A
     if splats:
         return wr.Reconstruction.from_files(source, mesh=None if mesh is None else _load_mesh(mesh, options))
     if mesh is not None:
-        raise ValueError(
-            f"--mesh: {source} has surfaces itself, expected splats (.ply) where --mesh is given"
-        )
+        raise ValueError(f"--mesh: {source} has surfaces itself, expected splats (.ply) with --mesh")
     if source.suffix == ".xml" or options.materials is not None:
         return load_scene(source, options)
     if not is_mesh_file(source):
@@ -387,10 +378,8 @@ def load_geometry(path: str, mesh: str | None, options: argparse.Namespace) -> A
 
 
 def _load_mesh(path: str | Path, options: argparse.Namespace) -> wr.Mesh:
-    return wr.Mesh.load(
-        existing(path),
-        options.unit,
-        options.up,
-        simplify=options.simplify,
-        allow_outside=options.allow_outside,
-    )
+    return wr.Mesh.load(existing(path), **_mesh_options(options))
+
+
+def _mesh_options(options: argparse.Namespace) -> dict[str, Any]:
+    return {name: getattr(options, name) for name in ("unit", "up", "simplify", "allow_outside")}

@@ -42,9 +42,8 @@ class Output:
         self._interval = 1.0 if lines else 0.2 if self._terminal else 30.0
         self._left = TimeLeft()
         self._stage: str | None = None
-        self._unshown: tuple[int, int, float | None] | None = (
-            None  # what was last reported, if it was not shown
-        )
+        # what was last reported, if it was not shown
+        self._unshown: tuple[int, int, float | None] | None = None
         self._began = self._shown = 0.0
         self._resumes: Path | None = None
         self._once = threading.Lock()

@@ -16,12 +16,11 @@ from warprrf.cli.inputs import (
     Add,
     add_effects,
     add_frequency,
+    add_geometry_options,
     add_measured_options,
-    add_mesh_options,
     add_out,
     add_pattern,
     add_point,
-    add_scene_options,
     existing,
     load_field,
     load_geometry,
@@ -132,8 +131,7 @@ def add_sample(add: Add) -> None:
     """Define `sample`."""
     sam = add("sample", _sample)
     sam.add_argument("scene", help="scene file that Sionna RT opens (Mitsuba's XML), or mesh file")
-    add_mesh_options(sam)
-    add_scene_options(sam)
+    add_geometry_options(sam)
     add_out(sam, "CSV file of x,y,z rows")
     sam.add_argument("-n", type=int, default=1, help="how many (default 1)")
     sam.add_argument(
@@ -172,13 +170,12 @@ def add_simulate(add: Add) -> None:
     """Define `simulate`."""
     sim = add("simulate", _simulate)
     sim.add_argument("scene", help="scene file that Sionna RT opens (Mitsuba's XML), or mesh file")
-    add_mesh_options(sim)
     add_out(sim, "NetCDF file")
     add_point(sim, "--transmitter", "metres", required=True)
     sim.add_argument(
         "--receivers", nargs="+", required=True, help="CSV or NPY file of x,y,z rows, or x,y,z words"
     )
-    add_scene_options(sim)
+    add_geometry_options(sim)
     add_frequency(sim, "carrier (default 300e9)", default=300e9)
     sim.add_argument(
         "--shape", nargs=2, type=int, default=(90, 180), metavar=("H", "W"), help="pixels (90 180)"
@@ -264,9 +261,7 @@ def add_fit(add: Add) -> None:
         metavar="N",
         help="receivers of the nested training subset (default: all for training)",
     )
-    fit.add_argument("--mesh", help="mesh for line of sight, where GEOMETRY is splats")
-    add_mesh_options(fit)
-    add_scene_options(fit)
+    add_geometry_options(fit, splats="GEOMETRY")
     fit.add_argument(
         "--relevance", metavar="FILE", help="what `warprrf relevance -o` wrote: effects ruled out are off"
     )
@@ -315,7 +310,7 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
       rf3dgs(+)      transmittance, interaction_point, gain, sh_degree, top_k, line_of_sight, iterations, batch,
                      train_opacity, checkpoint
     """
-    geometry = load_geometry(args.geometry, args.mesh, args)
+    geometry = load_geometry(args.geometry, args)
     data = read_measured(args.measurements, args)
     options: dict[str, Any] = dict(map(_option, args.option))
     if args.relevance is not None:
@@ -381,9 +376,7 @@ def add_suggest(add: Add) -> None:
         "--receive-pattern",
         "of a horn that candidates x,y,z,azimuth,elevation turn; isotropic: power alone",
     )
-    sug.add_argument("--mesh", help="mesh for line of sight, where SOURCE is splats")
-    add_mesh_options(sug)
-    add_scene_options(sug)
+    add_geometry_options(sug, splats="SOURCE")
 
 
 def _suggest(args: argparse.Namespace, out: Output) -> None:
@@ -415,9 +408,7 @@ def _suggest(args: argparse.Namespace, out: Output) -> None:
             if getattr(args, flag) is None:
                 raise ValueError(f"--{flag}: {source} needs it, it is no field")
         nothing = wr.SpectrumDataset.empty(transmitter=args.transmitter, frequency_hz=args.frequency)
-        field = wr.RadioField.fit(
-            load_geometry(args.source, args.mesh, args), nothing, device=args.device, progress=out
-        )
+        field = wr.RadioField.fit(load_geometry(args.source, args), nothing, device=args.device, progress=out)
     chosen = pointings[field.suggest(pointings[:, :3], args.n, **turned, progress=out)]
     rows = _rows(chosen)
     if args.out:
@@ -493,9 +484,7 @@ def add_relevance(add: Add) -> None:
     rel.add_argument(
         "--most", type=int, default=12, metavar="N", help="receivers used, drawn by --seed (default 12)"
     )
-    rel.add_argument("--mesh", help="mesh for line of sight, where SOURCE is splats")
-    add_mesh_options(rel)
-    add_scene_options(rel)
+    add_geometry_options(rel, splats="SOURCE")
 
 
 def _relevance(args: argparse.Namespace, out: Output) -> None:
@@ -520,9 +509,7 @@ def _relevance(args: argparse.Namespace, out: Output) -> None:
         given = {name: measured[name] if value is None else value for name, value in given.items()}
         receivers = dataset.receivers if receivers is None else receivers
     if receivers is None:
-        raise ValueError(
-            "--receivers: none given, expected positions, or --spectra with a file that holds some"
-        )
+        raise ValueError("--receivers: none given, expected positions, or --spectra with some")
     check_count("--most", args.most)
     if len(receivers) > args.most:
         receivers = receivers[np.random.default_rng(args.seed).permutation(len(receivers))[: args.most]]
@@ -531,7 +518,7 @@ def _relevance(args: argparse.Namespace, out: Output) -> None:
         refuse(args, own, f"{source} is a field, which has its own")
         geometry = load_field(source, args)
     else:
-        geometry = load_geometry(args.source, args.mesh, args)
+        geometry = load_geometry(args.source, args)
     found = wr.relevance(
         geometry,
         receivers=receivers,

@@ -79,9 +79,7 @@ def _render(args: argparse.Namespace, out: Output) -> None:
         out.result(text, files=[args.out], total_path_gain_db=total)
         return
     if args.position is None or args.look_at is None:
-        raise ValueError(
-            "--position and --look-at: both are needed to draw Gaussians (three coordinates each)"
-        )
+        raise ValueError("--position and --look-at: both are needed to draw Gaussians, three numbers each")
     gaussians = wr.Gaussians.load_ply(source)
     camera = _look_at(args.position, args.look_at, tuple(args.size), args.field_of_view)
     image = wr.render(gaussians, camera, device=args.device).features
@@ -95,9 +93,7 @@ def _render(args: argparse.Namespace, out: Output) -> None:
 
 def _array_spectrum(field: Any, place: np.ndarray, args: argparse.Namespace) -> wr.Spectrum:
     if field.model != "bistatic":
-        raise ValueError(
-            f"--array: got a field of model {field.model}, which knows no phases; expected bistatic"
-        )
+        raise ValueError(f"--array: got model {field.model}, which knows no phases; expected bistatic")
     from warprrf.rf.spectra.spectrum import pixel_directions
 
     azimuth, elevation = np.radians(args.facing)
@@ -307,6 +303,4 @@ def _thickness(words: list[str]) -> float | dict[str, float] | None:
         named = [word.rpartition("=") for word in words]
         return {name: float(value) for name, _, value in named} or None
     except ValueError as error:
-        raise ValueError(
-            f"--thickness: got {' '.join(words)}, expected a number, or NAME=NUMBER of each [m]"
-        ) from error
+        raise ValueError(f"--thickness: got {' '.join(words)}, expected M, or NAME=M of each") from error

@@ -35,7 +35,7 @@ from warprrf.checks import (
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh_files import MeshOptions, load_mesh
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
-from warprrf.kernels.rays.mesh import closest_faces, find_crossings
+from warprrf.kernels.rays.mesh import closest_faces, find_crossings, find_touching
 
 ENDPOINT_CLEARANCE = 1e-4
 """Length at both ends of a segment in which :meth:`Mesh.visible` ignores surfaces [m]."""
@@ -425,6 +425,32 @@ class Mesh:
         inputs = [bvh.id, corners, start, toward, winding, side]
         _device.launch(find_crossings, len(p) * len(d), inputs, device=where)
         return winding.numpy().reshape(len(p), len(d)), side.numpy().reshape(len(p), len(d))
+
+    def faces_at(
+        self, points: ArrayLike, reach_m: float, *, device: DeviceLike = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """All faces that ``points`` (N, 3) [m] lie on, to ``reach_m``: index of the point and face, by point, ``(L,)`` each.
+
+        Of repeated faces the first is named.
+        """
+        p = check_array("points", points, (None, 3))
+        where = _device.resolve(device)
+        bvh, corners = self._boxes(where)
+        put = wp.array(p - self.center, dtype=wp.vec3d, device=where)
+        start, count, face = (wp.zeros(n, dtype=wp.int32, device=where) for n in (len(p), len(p), 0))
+        reach = wp.float64(check_number("reach_m", reach_m, 0.0))
+        for _ in range(2):  # how many, then which
+            _device.launch(
+                find_touching, len(p), [bvh.id, corners, put, reach, start, count, face], device=where
+            )
+            many = count.numpy()
+            start = wp.array(np.cumsum(many) - many, dtype=wp.int32, device=where)
+            row = np.repeat(np.arange(len(p)), many)
+            if face.shape[0] == 0:
+                face = wp.zeros(len(row), dtype=wp.int32, device=where)
+        found = self.distinct_faces[face.numpy()]
+        order = np.lexsort((found, row))  # trees differ by device
+        return row, found[order]
 
     @cached_property
     def _boxed(self) -> Cache:

@@ -158,6 +158,7 @@ def reconstruct(
         guessed=(*sparse.guessed, *said),
         lenses=sparse.lenses,
         causes=sparse.causes,
+        pieces=sparse.pieces,
         photos=sparse.photos,
     )
 

@@ -19,7 +19,7 @@ import warp as wp
 
 from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
-from warprrf.checks import check_array
+from warprrf.checks import check_array, check_choice
 from warprrf.kernels.rays.mesh import (
     AGAIN,
     BAD,
@@ -322,8 +322,7 @@ def choose_backend(backend: str, device: wp.Device, count: int) -> str:
     Raises:
         ValueError: on an unknown name, or Embree on a GPU.
     """
-    if backend not in BACKENDS:
-        raise ValueError(f"backend: got {backend!r}, expected one of {', '.join(BACKENDS)}")
+    check_choice("backend", backend, BACKENDS)
     if backend == "embree" and device.is_cuda:
         raise ValueError(f'backend: got "embree" on {device}, expected "warp" there, or device="cpu"')
     if backend != "auto":

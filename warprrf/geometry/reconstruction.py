@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +75,8 @@ class Reconstruction:
         metric: whether lengths are metres (else they are an assumed scale).
         unposed: names of photos without a pose.
         causes: why each of them has none, by name, where that is known.
+        pieces: names of photos that were posed together, the largest piece first, which ``cameras`` are of. The others share
+            no view with it; their COLMAP models are ``sfm/model-2`` and so on in the workspace, fit for ``poses=``.
         photos: image files of the cameras, by name, as the Gaussians were fitted to them.
         held_out: names of photos that the Gaussians were not fitted to.
         guessed: what nobody measured and the photos do not show, a sentence each.
@@ -95,6 +98,7 @@ class Reconstruction:
         guessed: Sequence[str] = (),
         lenses: Mapping[str, Lens] | None = None,
         causes: Mapping[str, str] | None = None,
+        pieces: Sequence[Sequence[str]] = (),
         photos: Mapping[str, Path] | None = None,
     ) -> None:
         if gaussians is None and mesh is None:
@@ -110,6 +114,7 @@ class Reconstruction:
         self.guessed = tuple(guessed)
         self.lenses = dict(lenses or {})
         self.causes = dict(causes or {})
+        self.pieces = tuple(map(tuple, pieces))
         for name, file in (photos or {}).items():
             if not isinstance(file, str | os.PathLike):
                 raise TypeError(f"photos: got {type(file).__name__} for {name!r}, expected an image file")
@@ -183,7 +188,8 @@ class Reconstruction:
             mesh if patches is None else patches.mesh,
             {name: camera.transformed(**how) for name, camera in self.cameras.items()},
             patches=patches, scale_rms_m=number * self.scale_rms_m, metric=self.metric, unposed=self.unposed,
-            held_out=self.held_out, guessed=self.guessed, lenses=self.lenses, causes=self.causes, photos=self.photos,
+            held_out=self.held_out, guessed=self.guessed, lenses=self.lenses, causes=self.causes, pieces=self.pieces,
+            photos=self.photos,
         )  # fmt: skip
 
     def aligned(self, known_positions: Mapping[str, ArrayLike]) -> Reconstruction:
@@ -222,7 +228,7 @@ class Reconstruction:
             },
             "scale_rms_m": None if np.isnan(self.scale_rms_m) else self.scale_rms_m,
             "metric": self.metric, "unposed": self.unposed, "held_out": self.held_out,
-            "guessed": self.guessed, "causes": self.causes,
+            "guessed": self.guessed, "causes": self.causes, "pieces": self.pieces,
             "photos": {name: str(file) for name, file in self.photos.items()},
             "lenses": [{**asdict(lens), "photos": names} for lens, names in lenses_in_use(self.lenses).items()],
             "labels": () if self._mesh is None else self._mesh.labels,
@@ -288,9 +294,10 @@ class Reconstruction:
             check_type("metric", header["metric"], bool)
             guessed = header.get("guessed", ())
             causes, photos = header.get("causes", {}), header.get("photos", {})
-            words = (*causes.values(), *photos.values())
+            pieces = header.get("pieces", ())
+            words = (*causes.values(), *photos.values(), *chain.from_iterable(pieces))
             for name in (*header["unposed"], *header["held_out"], *guessed, *words):
-                check_type("unposed, held_out, guessed, causes, photos", name, str)
+                check_type("unposed, held_out, guessed, causes, pieces, photos", name, str)
             return cls(
                 splats,
                 mesh,
@@ -303,6 +310,7 @@ class Reconstruction:
                 guessed=guessed,
                 lenses=_lenses(header.get("lenses", ())),
                 causes=causes,
+                pieces=pieces,
                 photos=photos,
             )
 

@@ -7,7 +7,8 @@ directions per pixel, each with one receiver ray and one shadow ray on the mesh,
 for, is that of each path's own length.
 
 What more effects bring goes through fewer rays: they are turned at mirrors, connected to images of the transmitter, and
-scattered on, one direction a ray, drawn by the cosine from a stated seed: unbiased, with sampling noise.
+scattered on, one direction a ray, drawn by the cosine from a stated seed: unbiased, with sampling noise. Slabs are passed
+straight on, on the way to a surface that scatters and behind it.
 
 Diffuse power changes, by some decibels a path, when transmitter and receiver change places: lobes are normalised by the
 direction of incidence (Degli-Esposti et al. 2007). Materials with ``reciprocal`` scatter alike both ways, with |Gamma|^2 the
@@ -20,7 +21,7 @@ would meet upright edges in whole columns, and errs 3 to 5 times more.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -30,10 +31,11 @@ from warprrf import device as _device
 from warprrf.checks import check_array, check_seed
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
-from warprrf.kernels.radio.records import SCATTER
+from warprrf.kernels.radio.records import MIRROR, SCATTER, SLAB
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.mirror_paths import unobstructed
+from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.trace import MirrorTracer
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.spectrum import (
@@ -48,7 +50,7 @@ from warprrf.rf.tracing.model import Effects
 from warprrf.rf.tracing.rays import Hits, RayGrid
 from warprrf.rf.tracing.records import Records, SlabEvaluation
 from warprrf.rf.tracing.surface import Surface
-from warprrf.rf.tracing.tracer import Rays, Tracer
+from warprrf.rf.tracing.tracer import Interactions, Rays, Tracer
 
 SUB_PIXELS = 8
 """Default square root of the directions per pixel.
@@ -60,7 +62,18 @@ FURTHER_SUB_PIXELS = 3
 """That for light over more than one surface."""
 THROUGH_MIRRORS = 3
 """Of how many rays one looks for light by way of mirrors: a search for each."""
-SINGLE = Effects(mirrors=1, scatterings=1, mirror_scatter=False, scatter_mirror=False, residual=False)
+QUADRATURE = 1.125
+"""Wavelengths of detour up to which a path over an edge and the straight one are added field by field: there they are in
+quadrature, so that nothing jumps."""
+SINGLE = Effects(
+    mirrors=1,
+    scatterings=1,
+    mirror_scatter=False,
+    scatter_mirror=False,
+    transmissions=0,
+    diffractions=0,
+    residual=False,
+)
 """Line of sight, one mirror, scattering once: what has no noise."""
 REVISION = 5
 """Raised whenever the engine's numbers change: finished receivers of another revision are not used."""
@@ -92,8 +105,8 @@ class DiffusePaths:
         power: Path gain [linear], shape ``(L,)``.
         length_m: Whole length [m], shape ``(L,)``.
         departure: Where they left the transmitter towards, not of unit length, shape ``(L, 3)``.
-        beams: Sums of the beam about each direction over the pixels, shape ``(L,)``.
-        sequence: ``"S"`` scattered, ``"M"`` mirrored, from the transmitter on.
+        beams: What :func:`beam_sums` gives for each direction, shape ``(L, 2)``.
+        sequence: ``"S"`` scattered, ``"M"`` mirrored, ``"T"`` through slabs, from the transmitter on.
     """
 
     direction: np.ndarray
@@ -104,8 +117,8 @@ class DiffusePaths:
     sequence: str
 
 
-_ARRAYS = ("direction", "power", "length_m", "departure", "beams")
-_NO_PATHS = {name: np.zeros((0, 3) if name in ("direction", "departure") else 0) for name in _ARRAYS}
+_ARRAYS = {"direction": (3,), "power": (), "length_m": (), "departure": (3,), "beams": (2,)}
+_NO_PATHS = {name: np.zeros((0, *size)) for name, size in _ARRAYS.items()}
 
 
 @dataclass(frozen=True)
@@ -158,7 +171,10 @@ class ExactEngine:
             raise ValueError(f"sub_pixels: got {sub_pixels!r}, expected at least 1")
         self.shape, self.beam_sigma_rad, self.sub_pixels = check_shape(shape), beam_sigma_rad, sub_pixels
         self.effects, self.seed, self.air = effects, check_seed(seed), air_of(gas)
-        self.mirrors = MirrorTracer(scene, transmitter=transmitter, frequency_hz=frequency_hz, device=device)
+        self.mirrors = MirrorTracer(
+            scene, transmitter=transmitter, frequency_hz=frequency_hz, transmissions=effects.transmissions,
+            diffractions=effects.diffractions, device=device,
+        )  # fmt: skip
         table = self.mirrors.table
         if table is None:
             raise TypeError(
@@ -176,6 +192,7 @@ class ExactEngine:
             n: Tracer(
                 self.surface, self.mirrors.transmitter, self.mirrors.frequency_hz,
                 RayGrid(self.surface, self.shape, n, loss_per_m=loss, dtype=np.float64, device=device),
+                walls=self.mirrors.walls,
             )
             for n in {sub_pixels, min(sub_pixels, FURTHER_SUB_PIXELS)}
         }  # fmt: skip
@@ -195,21 +212,25 @@ class ExactEngine:
         e = self.effects
         if not e.scatterings:
             return
-        fine, coarse = (
-            self._first(n, receiver) for n in (self.sub_pixels, min(self.sub_pixels, FURTHER_SUB_PIXELS))
-        )
-        yield self._lit(fine, self.sub_pixels)
-        if e.mirror_scatter:
-            yield self._lit_by_mirrors(coarse)
-        starts = [self._scattered_on(coarse, 1)] if e.scatterings > 1 else []
-        if e.scatter_mirror:
-            starts.append(self._turned(coarse))
+        sizes = self.sub_pixels, min(self.sub_pixels, FURTHER_SUB_PIXELS)
+        fine, coarse = (self._first(n, receiver) for n in sizes)
+        for rays in self._and_behind(fine, self.sub_pixels):
+            yield from self._lit(rays, self.sub_pixels)
+        starts: list[_Beams] = []
+        for rays in self._and_behind(coarse, FURTHER_SUB_PIXELS):
+            if e.mirror_scatter:
+                yield self._lit_by_mirrors(rays)
+            if e.scatterings > 1:
+                starts.append(self._scattered_on(rays, 1))
+            if e.scatter_mirror:
+                starts.append(self._turned(rays))
         for rays in starts:
             depth = rays.sequence.count("S")
             while True:
-                yield self._lit(rays, FURTHER_SUB_PIXELS)
-                if e.mirror_scatter:
-                    yield self._lit_by_mirrors(rays)
+                for own in self._and_behind(rays, FURTHER_SUB_PIXELS):
+                    yield from self._lit(own, FURTHER_SUB_PIXELS)
+                    if e.mirror_scatter:
+                        yield self._lit_by_mirrors(own)
                 depth += 1
                 if depth >= e.scatterings:
                     break
@@ -218,7 +239,7 @@ class ExactEngine:
     def receive(self, receiver: ArrayLike) -> ReceivedPaths:
         """The spectrum of one receiver (3,)."""
         point = check_array("receiver", receiver, (3,))
-        specular = self.mirrors.trace(point, self.effects.mirrors).with_gas(self.air)
+        specular = together(self.mirrors.trace(point, self.effects.mirrors).with_gas(self.air))
         specular = specular.select(np.flatnonzero((specular.kind != "los") | self.effects.line_of_sight))
         scattered, beam = self.diffuse(point), (self.shape, self.beam_sigma_rad)
         sharp = beam_sums(specular.arrival, *beam, device=self.device)
@@ -240,12 +261,31 @@ class ExactEngine:
         hits = self._tracers[sub_pixels].grid.hit(receiver)
         return _Beams(hits, np.arange(len(hits.face)), np.zeros(len(hits.face)), "")
 
-    def _lit(self, rays: _Beams, sub_pixels: int) -> DiffusePaths:
-        """What the transmitter lights where rays hit."""
+    def _and_behind(self, rays: _Beams, sub_pixels: int) -> Iterator[_Beams]:
+        """``rays``, and what those of them that pass slabs meet behind."""
+        yield rays
+        if self.mirrors.walls is None or not self.effects.scatter_mirror:
+            return
         tracer = self._tracers[min(sub_pixels, self.sub_pixels)]
-        records = tracer.lit(Rays(rays.hits, np.arange(len(rays.ray))))
-        out = rays.hits.points(records.ray) - tracer.transmitter
-        return self._paths(rays, records, np.linalg.norm(out, axis=1), out, "S", tracer)
+        behind = tracer.behind(Rays(rays.hits, np.arange(len(rays.ray))), self.effects.transmissions)
+        hits, after = behind.hits, behind.after
+        if after is not None and len(behind.ray):
+            kind = np.full((1, after.index.shape[1]), SLAB, np.int32)
+            index = after.index.astype(np.int32)
+            passed = Records(hits.solid_angle, behind.ray, index, after.angle, kind).powers(self.materials)
+            length = rays.length_m[behind.ray]
+            yield _Beams(replace(hits, solid_angle=passed), rays.ray[behind.ray], length, "T" + rays.sequence)
+
+    def _lit(self, rays: _Beams, sub_pixels: int) -> Iterator[DiffusePaths]:
+        """What the transmitter lights where rays hit, and what it lights through slabs."""
+        tracer = self._tracers[min(sub_pixels, self.sub_pixels)]
+        seen = Rays(rays.hits, np.arange(len(rays.ray)))
+        lit = {"S": tracer.lit(seen)}
+        if self.mirrors.walls is not None:
+            lit["TS"] = tracer.lit_through(seen, self.effects.transmissions)
+        for name, records in lit.items():
+            out = rays.hits.points(records.ray) - tracer.transmitter
+            yield self._paths(rays, records, np.linalg.norm(out, axis=1), out, name, tracer)
 
     def _lit_by_mirrors(self, rays: _Beams) -> DiffusePaths:
         """What images of the transmitter light there, by one ray of :data:`THROUGH_MIRRORS`."""
@@ -266,7 +306,8 @@ class ExactEngine:
         row, patch, way = row[k], patch[k], point[row[k]] - image[k]
         length, plane = np.linalg.norm(way, axis=1), self.surface.plane_normal[patch]
         across = (way * plane).sum(axis=1)
-        before = self.surface.patch_group[patch], np.abs(across) / np.maximum(length, 1e-9)
+        cosine = np.abs(across) / np.maximum(length, 1e-9)
+        before = Interactions.of_mirrors(self.surface.patch_group[patch], cosine)
         strength = every * light.strength[k]
         records = tracer.scattered(
             Rays(rays.hits, np.arange(len(rays.ray))), ray[row], strength, light.angle[k], before
@@ -299,7 +340,10 @@ class ExactEngine:
         point, direction, face = rays.take(ray)
         normal = self._toward(face, direction)
         cosine = -(direction * normal).sum(axis=1)
-        angle = np.column_stack([cosine, 0.0 * cosine, 0.0 * cosine])[:, None]
+        mirror, kind = (
+            Interactions.of_mirrors(self.surface.group[face], cosine),
+            np.array([[MIRROR]], np.int32),
+        )
         onward = direction + 2.0 * cosine[:, None] * normal
         return self._on(
             rays,
@@ -307,7 +351,7 @@ class ExactEngine:
             point,
             normal,
             onward,
-            Records(self._left(rays, ray), ray, self._groups(face), angle, 1),
+            Records(self._left(rays, ray), ray, mirror.index, mirror.angle, kind),
             "M",
         )
 
@@ -326,7 +370,8 @@ class ExactEngine:
         cos_mirror = np.clip(2.0 * up * cos_out + (onward * direction).sum(axis=1), -1.0, 1.0)
         angle = np.column_stack([up, cos_out, cos_mirror])[:, None]
         records = Records(
-            np.pi * self._left(rays, ray), ray, self._groups(face), angle, 0, SCATTER,
+            np.pi * self._left(rays, ray), ray, self.surface.group[face][:, None], angle,
+            np.array([[SCATTER]], np.int32),
             half_width=self._tracers[min(FURTHER_SUB_PIXELS, self.sub_pixels)].grid.half_width,
         )  # fmt: skip
         return self._on(rays, ray, point, normal, onward, records, "S")
@@ -353,8 +398,24 @@ class ExactEngine:
         normal = self.surface.mesh.face_normals[face]
         return np.where((normal * direction).sum(axis=1, keepdims=True) > 0, -normal, normal)
 
-    def _groups(self, face: np.ndarray) -> np.ndarray:
-        return self.surface.group[face][:, None]
+
+def together(paths: Paths) -> Paths:
+    """Paths of one receiver of which those over an edge that are hardly longer than the straight path, or than one mirror's, are
+    added to it, field by field: near a shadow's boundary the two are one wave. What is longer adds in power."""
+    if paths.jones is None or paths.frequency_hz is None or not (paths.kind == "edge").any():
+        return paths
+    jones, gain, kept = paths.jones.copy(), paths.gain.copy(), np.full(len(paths.gain), True)
+    mirrors = (paths.interactions == MIRROR).sum(axis=1)
+    for k in np.flatnonzero(paths.kind == "edge"):
+        near = (paths.kind != "edge") & (mirrors == mirrors[k]) & (paths.kind != "slab")
+        near &= np.abs(paths.length_m - paths.length_m[k]) < QUADRATURE * SPEED_OF_LIGHT / paths.frequency_hz
+        if near.any():
+            parent = np.flatnonzero(near)[np.argmax(paths.arrival[near] @ paths.arrival[k])]
+            jones[parent] += paths.jones[k]
+            kept[k] = False
+    size = np.sqrt(0.5 * (np.abs(jones) ** 2).sum(axis=(1, 2)))
+    gain = np.where(kept, size * np.exp(1j * np.angle(gain)), gain)
+    return replace(paths, jones=jones, gain=gain).select(np.flatnonzero(kept))
 
 
 @lru_cache(maxsize=2)

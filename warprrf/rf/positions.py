@@ -33,28 +33,10 @@ NEAR_FIELD = 1.0 / (2.0 * np.pi)
 """Distance of two antennas, in wavelengths, within which their reactive fields outweigh what they radiate, however
 small they are: Friis's formula does not hold, and gives gains above one within half of it. Source: H. A. Wheeler, "The
 radiansphere around a small antenna", Proc. IRE 47 (1959)."""
-FAR_FIELD = 1.0
-"""Distance in wavelengths above which Friis's formula is trusted: 2 D^2 / lambda for an antenna 0.7 wavelengths wide.
-Source: H. T. Friis, "A note on a simple transmission formula", Proc. IRE 34 (1946)."""
-LARGEST_M = 20e3
-HIGHEST_M = 1e3
-MOST_WAVELENGTHS = 5e6
-SMALLEST_M = 0.05
-LEAST_HZ = 100e9
-"""Below it walls let much through, and waves bend round edges, indoors too."""
 
 _DIRECTIONS = 24
-_AGREED = 0.75  # share of the rays of a band that must say the same
 _BANDS = 3  # of rays upward: low, slanting, steep; a fourth of as many is overhead
-_OVERHEAD = 0.98  # least sine of the elevation there
-_SKY = 1.0 / 3.0  # share of rays upward that meet nothing where there is sky
-_PLACES = 5  # along each side of a scene, at which the sky is looked for
-_ROOM = 0.1  # least share of the box around a scene that its room takes
-_WALL = 0.5  # least share of what a room's walls hold that their inner surface does
-_FRAGMENTS = 0.1  # of a surface's area: what is left beside it is nothing to speak of
-_SAMPLES = 1000  # faces whose places tell what a surface holds
 _LEAK = 0.02  # share of rays that may leave a closed room: its walls need not meet exactly
-_FLOOR = 0.1  # least share of a plan with something below, for a scene with a floor
 _AT_ONCE = 20_000  # places whose rays are cast in one launch
 
 
@@ -91,9 +73,7 @@ class Ends(NamedTuple):
         """
         to, source = check_receivers(name, receivers), check_receivers("transmitter", transmitter)
         if to.ndim == source.ndim == 2 and len(to) != len(source):
-            raise ValueError(
-                f"transmitter: got shape {source.shape}, expected (3,) or one for each receiver, {to.shape}"
-            )
+            raise ValueError(f"transmitter: got shape {source.shape}, expected (3,) or {to.shape}")
         rows = np.atleast_2d(*map(np.ascontiguousarray, np.broadcast_arrays(to, source)))
         return cls(rows[0], rows[1], to.ndim == source.ndim == 1)
 
@@ -234,7 +214,7 @@ def is_free(
     if known is not None:
         floor = bool(_is_over(mesh, known[None], device)[0])
     else:
-        floor = bool(_is_over(mesh, _spread(mesh), device).mean() > _FLOOR)
+        floor = bool(_is_over(mesh, _spread(mesh), device).mean() > 0.1)
     if floor:
         free[free] = _is_over(mesh, points[free], device)
     return free
@@ -261,9 +241,9 @@ def question_unit(mesh: Mesh, wavelength_m: float) -> None:
     extent = np.ptp(mesh.bounds, axis=0)
     largest = float(extent.max())
     unit, metres = "millimetres", "1e-3"
-    if largest < SMALLEST_M:
+    if largest < 0.05:
         unit, metres = "kilometres", "1e3"
-    elif largest <= min(LARGEST_M, MOST_WAVELENGTHS * wavelength_m) and extent.min() <= HIGHEST_M:
+    elif largest <= min(20e3, 5e6 * wavelength_m) and extent.min() <= 1e3:
         return
     size = " x ".join(f"{e:.4g}" for e in extent)
     warnings.warn(
@@ -278,13 +258,14 @@ def under_a_roof(mesh: Mesh, points: np.ndarray, *, device: DeviceLike = None) -
     """Whether each of ``points`` (N, 3) [m] of a scene under the sky is in a building or in the ground, shape ``(N,)``,
     bool; in doubt it is not."""
     found = np.zeros(len(points), dtype=bool)
+    agreed = 0.75  # share of the rays of a band that must say the same
     for first in range(0, len(points), _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
         winding, _ = mesh.crossings(points[some], np.concatenate([_upward(), _overhead()]), device=device)
         middle = np.median(winding, axis=1, keepdims=True)
         for votes in (winding % 2 == 1, (winding == middle) & (middle != 0)):
             share = votes.reshape(len(votes), _BANDS + 1, -1).mean(axis=2)
-            found[some] |= (share >= _AGREED).all(axis=1)
+            found[some] |= (share >= agreed).all(axis=1)
     return found
 
 
@@ -294,12 +275,6 @@ def ground_height(mesh: Mesh, x: np.ndarray, y: np.ndarray, *, device: DeviceLik
     start = np.column_stack([np.ravel(x), np.ravel(y), np.full(np.size(x), low)])
     up = mesh.cast(start, np.tile([0.0, 0.0, 1.0], (len(start), 1)), device=device).t
     return np.where(np.isfinite(up), low + up, np.nan).reshape(np.shape(x))
-
-
-def sees_sky(mesh: Mesh, *points: np.ndarray, device: DeviceLike = None) -> bool:
-    """Whether there is sky over any of the first ``points``, each (3,) or (N, 3) [m]."""
-    places = np.concatenate([np.reshape(p, (-1, 3)) for p in points])[:_DIRECTIONS]
-    return bool(_sky_over(mesh, places, device).any())
 
 
 def is_open_air(mesh: Mesh, *, device: DeviceLike = None) -> bool:
@@ -320,6 +295,7 @@ def warn_of_unmodelled(
     *,
     frequency_hz: float,
     transmission: bool = False,
+    diffraction: bool = False,
     device: DeviceLike = None,
 ) -> None:
     """Warn, where the user's code calls, of what is left out and matters: below 100 GHz, and outdoors.
@@ -328,17 +304,18 @@ def warn_of_unmodelled(
         mesh: The scene's; None if there is none.
         transmitter, receivers: Positions [m], shapes ``(3,)``, and ``(3,)`` or ``(R, 3)``.
         frequency_hz: Carrier frequency [Hz].
-        transmission: Whether transmission through walls is modelled.
+        transmission, diffraction: Whether transmission through walls is modelled, and diffraction.
         device: Where rays are cast.
     """
-    reasons = [f"below {LEAST_HZ / 1e9:g} GHz"] if frequency_hz < LEAST_HZ else []
-    if mesh is not None and (
-        sees_sky(mesh, transmitter, receivers, device=device) or is_open_air(mesh, device=device)
-    ):
+    least_hz = 100e9  # below it walls let much through, and waves bend round edges, indoors too
+    reasons = [f"below {least_hz / 1e9:g} GHz"] if frequency_hz < least_hz else []
+    some = np.concatenate([transmitter[None], np.reshape(receivers, (-1, 3))])[:_DIRECTIONS]
+    if mesh is not None and (_sky_over(mesh, some, device).any() or is_open_air(mesh, device=device)):
         reasons.append("outdoors (under the sky)")
-    if not reasons:
+    lacking = ["diffraction"] * (not diffraction) + ["transmission through walls"] * (not transmission)
+    if not reasons or not lacking:
         return
-    what = "diffraction is" if transmission else "diffraction and transmission through walls are"
+    what = f"{' and '.join(lacking)} {'are' if len(lacking) > 1 else 'is'}"
     warnings.warn(
         f"{frequency_hz / 1e9:g} GHz: {what} not modelled, which matters {' and '.join(reasons)}: receivers without line "
         "of sight may get more power than is found here; warprrf.relevance estimates how much",
@@ -349,7 +326,10 @@ def warn_of_unmodelled(
 
 def _check_apart(points: np.ndarray, wavelength_m: float, labels: list[str]) -> None:
     apart = np.linalg.norm(points[1:] - points[0], axis=1) / wavelength_m
-    if len(apart) == 0 or apart.min() >= FAR_FIELD:
+    # Distance in wavelengths above which Friis's formula is trusted: 2 D^2 / lambda for an antenna 0.7
+    # wavelengths wide. Source: H. T. Friis, "A note on a simple transmission formula", Proc. IRE 34 (1946)
+    far_field = 1.0
+    if len(apart) == 0 or apart.min() >= far_field:
         return
     k = int(apart.argmin())
     where = f"{apart[k]:.3g} wavelengths ({apart[k] * wavelength_m:.3g} m) from the transmitter"
@@ -359,7 +339,7 @@ def _check_apart(points: np.ndarray, wavelength_m: float, labels: list[str]) -> 
     if apart[k] < NEAR_FIELD:
         raise ValueError(
             f"{what}, within its reactive near field, where path gain has no meaning (it would exceed one); expected "
-            f"more than {NEAR_FIELD * wavelength_m:.3g} m, better {FAR_FIELD * wavelength_m:.3g} m"
+            f"more than {NEAR_FIELD * wavelength_m:.3g} m, better {far_field * wavelength_m:.3g} m"
         )
     warnings.warn(
         f"{what}; within a wavelength ({wavelength_m:.3g} m) path gain by Friis's formula is a rough guide",
@@ -383,22 +363,24 @@ def _rooms(mesh: Mesh) -> list[int]:
     or are all that is left: the scene's only surface, or the inner one of its walls."""
     rooms = list[int]()
     volume = [abs(_volume(part)) for part in mesh.closed_parts]
-    least = _ROOM * float(np.ptp(mesh.bounds, axis=0).prod())
+    room = 0.1  # least share of the box around a scene that its room takes
+    least = room * float(np.ptp(mesh.bounds, axis=0).prod())
+    wall = 0.5  # least share of what a room's walls hold that their inner surface does
+    samples = 1000  # faces whose places tell what a surface holds
     for k in sorted(range(len(volume)), key=lambda k: -volume[k]):
         if volume[k] < least:
             break
         rest = np.flatnonzero(~np.isin(mesh.closed_part_of[mesh.distinct_faces], [*rooms, k]))
         rest = mesh.distinct_faces[
-            rest[np.argsort(-mesh.areas[mesh.distinct_faces[rest]], kind="stable")][:_SAMPLES]
+            rest[np.argsort(-mesh.areas[mesh.distinct_faces[rest]], kind="stable")][:samples]
         ]
-        places, area = mesh.triangles[rest].mean(axis=1), mesh.areas[rest]
-        held, left = area[holds(mesh.closed_parts[k], places)].sum(), area.sum()
-        fragments = left <= _FRAGMENTS * mesh.closed_parts[k].areas.sum() and not _is_amid(
-            mesh.closed_parts[k], places
-        )
+        places, area, part = mesh.triangles[rest].mean(axis=1), mesh.areas[rest], mesh.closed_parts[k]
+        held, left = area[holds(part, places)].sum(), area.sum()
+        # a tenth of a surface's area beside it is nothing to speak of
+        fragments = left <= 0.1 * part.areas.sum() and not _is_amid(part, places)
         if held > 0.5 * left or fragments:
             rooms.append(k)
-            least = _WALL * volume[k]
+            least = wall * volume[k]
     return rooms
 
 
@@ -411,14 +393,13 @@ def _is_amid(part: Mesh, points: np.ndarray) -> bool:
 
 def _is_cavity(part: Mesh, solids: list[Mesh]) -> bool:
     """Whether a closed surface bounds a hollow in one of ``solids``: it lies within that, and is wound the other way."""
-    for solid in solids:
-        if (part.bounds[0] >= solid.bounds[0]).all() and (part.bounds[1] <= solid.bounds[1]).all():
-            if (
-                _volume(part) * _volume(solid) < 0
-                and holds(solid, part.triangles.mean(axis=1)[:_DIRECTIONS]).mean() > 0.5
-            ):
-                return True
-    return False
+
+    def within(solid: Mesh) -> bool:
+        boxed = (part.bounds[0] >= solid.bounds[0]).all() and (part.bounds[1] <= solid.bounds[1]).all()
+        turned = boxed and _volume(part) * _volume(solid) < 0
+        return bool(turned and holds(solid, part.triangles.mean(axis=1)[:_DIRECTIONS]).mean() > 0.5)
+
+    return any(map(within, solids))
 
 
 def _volume(part: Mesh) -> float:
@@ -445,7 +426,8 @@ def _is_over(mesh: Mesh, points: np.ndarray, device: DeviceLike) -> np.ndarray:
 
 def _spread(mesh: Mesh) -> np.ndarray:
     """Places spread over the box around a scene, shape ``(N, 3)`` [m]."""
-    share = (np.arange(_PLACES) + 0.5) / _PLACES
+    places = 5  # along each side of a scene, at which the sky is looked for
+    share = (np.arange(places) + 0.5) / places
     grid = np.stack(np.meshgrid(share, share, share, indexing="ij"), axis=-1).reshape(-1, 3)
     return mesh.bounds[0] + grid * np.ptp(mesh.bounds, axis=0)
 
@@ -453,7 +435,8 @@ def _spread(mesh: Mesh) -> np.ndarray:
 def _sky_over(mesh: Mesh, points: np.ndarray, device: DeviceLike) -> np.ndarray:
     """Whether a third of the rays upward from ``points`` (N, 3) meets nothing, shape ``(N,)``, bool."""
     side = mesh.crossings(points, _upward(), device=device)[1]
-    return np.asarray((side == 0).mean(axis=1) >= _SKY)
+    sky = 1.0 / 3.0  # share of rays upward that meet nothing where there is sky
+    return np.asarray((side == 0).mean(axis=1) >= sky)
 
 
 @lru_cache(maxsize=4)
@@ -474,7 +457,8 @@ def _upward() -> np.ndarray:
 def _overhead() -> np.ndarray:
     """As many directions straight up, nearly, as a band of those has."""
     k = np.arange(_DIRECTIONS // _BANDS) + 0.5
-    return _turned(_OVERHEAD + (1.0 - _OVERHEAD) * k / len(k), k)
+    overhead = 0.98  # least sine of the elevation there
+    return _turned(overhead + (1.0 - overhead) * k / len(k), k)
 
 
 def _turned(height: np.ndarray, k: np.ndarray) -> np.ndarray:

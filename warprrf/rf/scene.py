@@ -8,20 +8,21 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_number, check_type, checked
+from warprrf.checks import check_array, check_arrays, check_number, check_type, checked, index_to
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import MeshOptions, is_mesh_file
 from warprrf.rf.em.materials import Material
 from warprrf.rf.positions import is_free
 from warprrf.rf.scene_parts import MaterialChoice, Materials, ScenePart, read_mesh_scene
-from warprrf.rf.scene_sionna import SIONNA_FREQUENCY_HZ, parts_of, to_sionna_scene
+from warprrf.rf.scene_sionna import parts_of, to_sionna_scene
 from warprrf.rf.scene_xml import read_scene_xml
 
 T = TypeVar("T")
@@ -67,14 +68,8 @@ class Scene:
         self.receivers = _positions("receivers", receivers)
         if len(set(self.object_names)) < len(self.object_names):
             raise ValueError("object_names: got a name twice, expected each once")
-        for name, index, table in (
-            ("face_material", self.face_material, self.materials),
-            ("face_object", self.face_object, self.object_names),
-        ):
-            if faces and (index.min() < 0 or index.max() >= len(table)):
-                raise ValueError(
-                    f"{name}: got indices {index.min()} to {index.max()}, expected 0 to {len(table) - 1}"
-                )
+        known = {"face_material": index_to("materials", "F"), "face_object": index_to("objects", "F")}
+        check_arrays(vars(self), known, materials=len(self.materials), objects=len(self.object_names))
 
     def __repr__(self) -> str:
         return (
@@ -130,7 +125,7 @@ class Scene:
         if is_mesh_file(path):
             found = read_mesh_scene(path, choice, MeshOptions(unit, up, simplify, allow_outside))
             choice.check_used()
-            return cls(**vars(found))
+            return cls(**found)
         if (unit, up, simplify) != (None, None, None):
             raise ValueError(f"unit, up, simplify: {path} is no mesh file; its units are metres, z up")
         parts = read_scene_xml(path, choice, allow_outside=allow_outside)
@@ -178,7 +173,7 @@ class Scene:
             **options,
         )
 
-    def to_sionna(self, *, frequency_hz: float = SIONNA_FREQUENCY_HZ) -> Any:
+    def to_sionna(self, *, frequency_hz: float = 3.5e9) -> Any:
         """The scene as a ``sionna.rt.Scene``, with scattering patterns, transmitters and receivers.
 
         Objects keep their names (with ``_`` for ``.``) and are not merged; one of several materials becomes one object
@@ -203,12 +198,10 @@ class Scene:
         found = []
         for (thing, material), faces in zip(key[starts], np.split(order, starts[1:]), strict=True):
             used, own = np.unique(self.mesh.faces[faces], return_inverse=True)
-            name = self.object_names[thing]
+            name, made_of = self.object_names[thing], self.materials[material]
             if several[thing]:
-                name = f"{name}-{self.materials[material].name}"
-            found.append(
-                ScenePart(name, self.mesh.vertices[used], own.reshape(-1, 3), self.materials[material])
-            )
+                name = f"{name}-{made_of.name}"
+            found.append(ScenePart(name, self.mesh.vertices[used], own.reshape(-1, 3), made_of))
         return found
 
     def with_materials(self, materials: Sequence[Material]) -> Scene:
@@ -220,16 +213,9 @@ class Scene:
         materials = _named_list("materials", materials, Material)
         if len(materials) != len(self.materials):
             raise ValueError(f"materials: got {len(materials)}, expected {len(self.materials)}, one for each")
-        return Scene(
-            self.mesh,
-            materials,
-            self.face_material,
-            face_object=self.face_object,
-            object_names=self.object_names,
-            xml_path=self.xml_path,
-            transmitters=self.transmitters,
-            receivers=self.receivers,
-        )
+        other = copy(self)
+        other.materials = materials
+        return other
 
     @property
     def bounds(self) -> np.ndarray:

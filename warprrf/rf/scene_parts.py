@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -103,23 +104,10 @@ class MaterialChoice:
             )
 
 
-NAMELESS = "surface"
-"""What faces are called whose file names no material."""
-
-
-@dataclass(frozen=True)
-class MeshScene:
-    """Surfaces, materials and objects of a mesh file, as :class:`~warprrf.rf.scene.Scene` has them."""
-
-    mesh: Mesh
-    materials: list[Material]
-    face_material: np.ndarray
-    face_object: np.ndarray
-    object_names: list[str]
-
-
-def read_mesh_scene(path: str | os.PathLike[str], choice: MaterialChoice, options: MeshOptions) -> MeshScene:
-    """Read a mesh file; errors as for :meth:`Mesh.load`.
+def read_mesh_scene(
+    path: str | os.PathLike[str], choice: MaterialChoice, options: MeshOptions
+) -> dict[str, Any]:
+    """Arguments of :class:`~warprrf.rf.scene.Scene` for a mesh file; errors as for :meth:`Mesh.load`.
 
     Where no material has a name, the objects' names stand for them.
     """
@@ -129,10 +117,11 @@ def read_mesh_scene(path: str | os.PathLike[str], choice: MaterialChoice, option
     if content.face_material is None and len(objects) > 1:
         face, names = things, objects
     else:
-        face, names = _used(content.face_material, content.material_names, len(mesh.faces), NAMELESS)
-    return MeshScene(
-        mesh, [choice.choose(name, partial(_declared, name)) for name in names], face, things, objects
-    )  # fmt: skip
+        face, names = _used(content.face_material, content.material_names, len(mesh.faces), "surface")
+    materials = [choice.choose(name, partial(_declared, name)) for name in names]
+    return {
+        "mesh": mesh, "materials": materials, "face_material": face, "face_object": things, "object_names": objects
+    }  # fmt: skip
 
 
 def _used(

@@ -27,14 +27,6 @@ from warprrf.rf.em.materials import Band, Material, itu_material
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.scene_parts import MaterialChoice, ScenePart
 
-SIONNA_FREQUENCY_HZ = 3.5e9  # that a scene of Sionna RT has before it is set
-
-NARROWEST_SIONNA_LOBE = 127
-"""Largest exponent of a lobe that Sionna RT can normalise: it divides by 2^alpha_r in single precision."""
-
-MIN_LLVM = 17
-"""Oldest LLVM whose code generator has what Dr.Jit 1.5 asks for ("Cannot select ... fminimum" before)."""
-
 _FOLDERS = (
     "/usr/lib/x86_64-linux-gnu",
     "/usr/lib/aarch64-linux-gnu",
@@ -57,9 +49,7 @@ def parts_of(rt_scene: Any, choice: MaterialChoice) -> tuple[list[ScenePart], Po
     """
     rt = sionna_rt()
     if not isinstance(rt_scene, rt.Scene):
-        raise TypeError(
-            f"rt_scene: got {type(rt_scene).__name__}, expected a sionna.rt.Scene (a path goes to Scene.load)"
-        )
+        raise TypeError(f"rt_scene: got {type(rt_scene).__name__}, expected a sionna.rt.Scene")
     if not rt_scene.objects:
         raise ValueError("rt_scene: got a scene without objects, expected surfaces")
     frequency = float(np.asarray(rt_scene.frequency).reshape(-1)[0])
@@ -137,23 +127,20 @@ def to_sionna_scene(
     frequency = check_frequency(frequency_hz)
     rt = sionna_rt()
     mi = select_variant()
-    taken = set(transmitters) | set(receivers)
-    names = []
-    for part in parts:
-        name = part.name.replace(".", "_")  # Mitsuba parts its paths by it
+    taken = {*transmitters, *receivers}  # Sionna's objects, materials and devices share one set of names
+
+    def free(name: str, end: str) -> str:
         while name in taken:
-            name += "_"
+            name += end
         taken.add(name)
-        names.append(name)
-    radio: dict[int, Any] = {}
-    for part in parts:
-        material = part.material
-        if id(material) not in radio:
-            name = material.name
-            while name in taken:  # Sionna's objects, materials and devices share one set of names
-                name = f"{name}-material"
-            taken.add(name)
-            radio[id(material)] = _radio_material(rt, material, name, frequency)
+        return name
+
+    names = [free(part.name.replace(".", "_"), "_") for part in parts]  # Mitsuba parts its paths by dots
+    materials = {id(part.material): part.material for part in parts}
+    radio = {
+        key: _radio_material(rt, one, free(one.name, "-material"), frequency)
+        for key, one in materials.items()
+    }
     shapes: dict[str, Any] = {"type": "scene"}
     for part, name in zip(parts, names, strict=True):
         properties = mi.Properties()
@@ -168,29 +155,26 @@ def to_sionna_scene(
         shapes[name] = mesh
     scene = rt.Scene(mi.load_dict(shapes, optimize=False))
     scene.frequency = frequency
-    for material in {id(part.material): part.material for part in parts}.values():
-        _follow_frequency(
-            radio[id(material)], material
-        )  # not before: a new scene has Sionna's default frequency
-    for name, position in transmitters.items():
-        scene.add(rt.Transmitter(name, position=np.asarray(position, float).tolist()))
-    for name, position in receivers.items():
-        scene.add(rt.Receiver(name, position=np.asarray(position, float).tolist()))
+    for key, material in materials.items():  # not before: a new scene has Sionna's default frequency
+        _follow_frequency(radio[key], material)
+    for kind, places in ((rt.Transmitter, transmitters), (rt.Receiver, receivers)):
+        for name, position in places.items():
+            scene.add(kind(name, position=np.asarray(position, float).tolist()))
     return scene
 
 
 def _radio_material(rt: Any, material: Material, name: str, frequency: float) -> Any:
     """Sionna's material of ours at this frequency."""
     directive = material.pattern == "directive"
-    if directive and material.alpha_r > NARROWEST_SIONNA_LOBE:
+    # Largest exponent of a lobe that Sionna RT can normalise: it divides by 2^alpha_r in single precision
+    narrowest_sionna_lobe = 127
+    if directive and material.alpha_r > narrowest_sionna_lobe:
         raise ValueError(
             f"material {material.name!r}: alpha_r is {material.alpha_r}, but in Sionna's single precision a lobe of more "
-            f'than {NARROWEST_SIONNA_LOBE} scatters nothing; take engine="exact" or a wider lobe'
+            f'than {narrowest_sionna_lobe} scatters nothing; take engine="exact" or a wider lobe'
         )
     if not np.isfinite(material.thickness_m):
-        raise ValueError(
-            f"material {material.name!r}: an infinite slab is unknown to Sionna; give a thickness"
-        )
+        raise ValueError(f"material {material.name!r}: Sionna knows no infinite slab; give a thickness")
     if material.reciprocal and material.scattering_coefficient(frequency) > 0:
         raise ValueError(
             f"material {material.name!r}: it scatters reciprocally, Sionna RT's patterns do not; set reciprocal=False to "
@@ -246,14 +230,16 @@ def select_llvm() -> Path | None:
     if chosen:
         return Path(chosen)
     found = installed_llvm()
-    usable = [version for version in found if version >= MIN_LLVM]
+    # Oldest LLVM whose code generator has what Dr.Jit 1.5 asks for ("Cannot select ... fminimum" before)
+    min_llvm = 17
+    usable = [version for version in found if version >= min_llvm]
     if usable:
         os.environ["DRJIT_LIBLLVM_PATH"] = str(found[max(usable)])
         return found[max(usable)]
     if found:
         versions = ", ".join(str(v) for v in sorted(found))
         raise ImportError(
-            f"Dr.Jit needs LLVM {MIN_LLVM} or newer, but only {versions} is installed and would abort the process: "
+            f"Dr.Jit needs LLVM {min_llvm} or newer, but only {versions} is installed and would abort the process: "
             "apt-get install libllvm19 (Debian, Ubuntu), or set DRJIT_LIBLLVM_PATH"
         )
     return None

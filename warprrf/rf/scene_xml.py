@@ -22,13 +22,10 @@ from scipy.spatial.transform import Rotation
 from warprrf.checks import LARGEST_M
 from warprrf.geometry.mesh_content import Folder
 from warprrf.geometry.mesh_files import read_mesh
-from warprrf.rf.em.materials import DEFAULT_THICKNESS_M, ITU_BANDS, Material, itu_material, itu_name
+from warprrf.rf.em.materials import ITU_BANDS, Material, itu_material, itu_name
 from warprrf.rf.scene_parts import MaterialChoice, ScenePart
 
-MOST_BYTES = 200_000_000  # of an XML file; that of 4735 objects has a million
 MOST_NESTED = 50  # elements within each other; expat and Python take thousands
-MOST_INCLUDED = 8
-MOST_LETTERS = 10_000  # of a value after $names are replaced
 ROUND = 64  # facets around a primitive that is round
 
 Element = ElementTree.Element
@@ -83,8 +80,9 @@ class _SceneFile:
     # files
 
     def _included(self, path: Path, depth: int) -> list[Element]:
-        if depth > MOST_INCLUDED:
-            raise ValueError(f"path: {self.path} includes files within files more than {MOST_INCLUDED} deep")
+        most_included = 8
+        if depth > most_included:
+            raise ValueError(f"path: {self.path} includes files within files more than {most_included} deep")
         found: list[Element] = []
         for element in read_xml(path):
             if element.tag == "include":
@@ -107,6 +105,8 @@ class _SceneFile:
         """Put the values of ``default`` elements where attributes hold their ``$names``."""
         values: dict[str, str] = {}
 
+        most_letters = 10_000  # of a value after $names are replaced
+
         def put(text: str) -> str:
             def value(found: re.Match[str]) -> str:
                 if found[1] not in values:
@@ -114,8 +114,8 @@ class _SceneFile:
                 return values[found[1]]
 
             text = re.sub(r"\$(\w+)", value, text)
-            if len(text) > MOST_LETTERS:
-                raise ValueError(f"path: {self.path} holds a value of more than {MOST_LETTERS} characters")
+            if len(text) > most_letters:
+                raise ValueError(f"path: {self.path} holds a value of more than {most_letters} characters")
             return text
 
         for element in self.top:
@@ -213,8 +213,9 @@ def read_xml(path: Path) -> Element:
     Raises:
         ValueError: naming the file, if it is not well-formed, too large or too deep, or declares a document type.
     """
-    if path.stat().st_size > MOST_BYTES:
-        raise ValueError(f"path: {path} has {path.stat().st_size} bytes, expected at most {MOST_BYTES}")
+    most_bytes = 200_000_000  # of an XML file; that of 4735 objects has a million
+    if path.stat().st_size > most_bytes:
+        raise ValueError(f"path: {path} has {path.stat().st_size} bytes, expected at most {most_bytes}")
     parser = ElementTree.XMLParser(target=_Builder())
     try:
         parser.feed(path.read_bytes())
@@ -284,7 +285,7 @@ def _radio_material(element: Element, label: str) -> Material | None:
     """
     kind, identifier = element.get("type"), element.get("id") or ""
     common: dict[str, Any] = {
-        "thickness_m": _value(element, "thickness", DEFAULT_THICKNESS_M),
+        "thickness_m": _value(element, "thickness", Material.thickness_m),
         "scattering": _value(element, "scattering_coefficient", 0.0),
         "xpd": _value(element, "xpd_coefficient", 0.0),
         "pattern": _text(element, "scattering_pattern") or "lambertian",

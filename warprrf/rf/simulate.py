@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -13,7 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from warprrf.cache import Cache, making
-from warprrf.checks import check_array, check_count, check_number, check_seed, check_type, checked
+from warprrf.checks import (
+    check_array,
+    check_choice,
+    check_count,
+    check_number,
+    check_seed,
+    check_type,
+    checked,
+)
 from warprrf.cluster import each
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import as_mesh
@@ -36,10 +44,6 @@ from warprrf.rf.tracing.model import Effects
 from warprrf.steps import Steps, digest
 
 ENGINES = ("exact", "sionna")
-# Receivers drawn at a time before those without clearance are dropped; a scene with less than one free place in
-# _TRIES * _BATCH has none worth the name.
-_BATCH = 1000
-_TRIES = 200
 
 
 @checked
@@ -103,8 +107,7 @@ def simulate(
     """
     if not hasattr(scene, "materials"):
         raise TypeError(f"scene: got {type(scene).__name__}, expected a Scene (a mesh and its materials)")
-    if engine not in ENGINES:
-        raise ValueError(f"engine: got {engine!r}, expected one of {', '.join(ENGINES)}")
+    check_choice("engine", engine, ENGINES)
     check_type("effects", effects, Effects)
     sampling = Sampling(depth=depth, samples=samples, refraction=refraction, seed=seed)
     points = np.atleast_2d(check_receivers("receivers", receivers))
@@ -120,7 +123,6 @@ def simulate(
 
     common: dict[str, Any] = {"transmitter": source, "frequency_hz": frequency}
     common |= {"shape": check_shape(shape), "beam_sigma_rad": check_beam(beam_sigma_rad)}
-    versions = _versions(engine)
     surfaces = (scene.mesh.vertices, scene.mesh.faces, scene.face_material, *vars(table).values())
     solver: Any = sampling, _versions(engine, solver_only=True)
     if engine == "exact":
@@ -138,7 +140,8 @@ def simulate(
         k = missing[at]
         results[k] = found if workspace is None else _kept(workspace, inputs, points[k], found)
         tell("simulate", len(results), len(points))
-    received = [results[k] for k in range(len(points))]
+    names = ("path_gain", "delay_s", "aod", "line_of_sight")
+    columns: Any = {n: np.stack([getattr(results[k], n) for k in range(len(points))]) for n in names}
     settings = {"depth": depth, "samples": samples, "refraction": int(refraction)}
     if engine == "exact":
         settings = {"sub_pixels": SUB_PIXELS} | {
@@ -148,10 +151,6 @@ def simulate(
         receivers=points,
         transmitter=source,
         frequency_hz=frequency,
-        path_gain=np.stack([r.path_gain.astype(np.float32) for r in received]),
-        delay_s=np.stack([r.delay_s for r in received]),
-        aod=np.stack([r.aod.astype(np.float32) for r in received]),
-        line_of_sight=np.array([r.line_of_sight for r in received]),
         beam_sigma_rad=beam_sigma_rad,
         engine=engine,
         seed=seed,
@@ -159,7 +158,8 @@ def simulate(
         floor=floor,
         attributes=settings
         | ({} if air is None else air.attributes)
-        | {f"version_{name}": value for name, value in versions.items()},
+        | {f"version_{name}": value for name, value in _versions(engine).items()},
+        **columns,
     )
 
 
@@ -186,7 +186,10 @@ def sample_receivers(
     Raises:
         ValueError: if there is no such place, or the range is empty.
     """
-    check_count("n", n, most=_TRIES * _BATCH)
+    # Drawn at a time before those without clearance are dropped; a scene with less than one free place in ``most`` has
+    # none worth the name.
+    batch, most = 1000, 200_000
+    check_count("n", n, most=most)
     check_number("clearance", clearance, 0.0)
     z = check_array("z", z, (2,))
     if z[0] > z[1]:
@@ -195,14 +198,12 @@ def sample_receivers(
     low, high = mesh.bounds.copy()
     low[2], high[2] = z if above_ground else (max(low[2], z[0]), min(high[2], z[1]))
     if low[2] > high[2]:
-        raise ValueError(
-            f"z: got {z.tolist()}, but the scene lies between {mesh.bounds[0, 2]:g} and {mesh.bounds[1, 2]:g} m"
-        )
+        raise ValueError(f"z: got {z.tolist()}, but the scene lies at {mesh.bounds[:, 2].tolist()}")
     rng = np.random.default_rng(check_seed(seed))
     found: list[np.ndarray] = []
     count = 0
-    for _ in range(_TRIES):
-        points = rng.uniform(low, high, (_BATCH, 3))
+    for _ in range(most // batch):
+        points = rng.uniform(low, high, (batch, 3))
         if above_ground:
             points[:, 2] += ground_height(mesh, points[:, 0], points[:, 1], device=device)
             points = points[np.isfinite(points[:, 2])]
@@ -211,9 +212,7 @@ def sample_receivers(
         count += len(points)
         if count >= n:
             return np.concatenate(found)[:n]
-    raise ValueError(
-        f"clearance: found {count} of {n} places {clearance:g} m from everything in {_TRIES * _BATCH} draws"
-    )
+    raise ValueError(f"clearance: found {count} of {n} places {clearance:g} m from all in {most} draws")
 
 
 def _versions(engine: str, solver_only: bool = False) -> dict[str, str]:
@@ -232,7 +231,7 @@ def _versions(engine: str, solver_only: bool = False) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class _Receiver:
-    """What a receiver (3,) gets; a pickle holds how the engine is built."""
+    """What a receiver (3,) gets, in single precision; a pickle holds how the engine is built."""
 
     scene: Scene
     common: dict[str, Any]
@@ -246,34 +245,20 @@ class _Receiver:
         how, common = self.how, {**self.common, "gas": self.air, "device": self.device}
         if isinstance(how, Effects):
             ours = partial(ExactEngine, self.scene, **common, effects=how, seed=self.seed)
-            return self._running.get("engine", ours).receive(point)
-        with making:  # Sionna RT's scene holds the receiver: one thread at a time
-            return self._running.get(
-                "engine", partial(SionnaEngine, self.scene, **common, sampling=how)
-            ).receive(point)
+            found = self._running.get("engine", ours).receive(point)
+        else:
+            theirs = partial(SionnaEngine, self.scene, **common, sampling=how)
+            with making:  # Sionna RT's scene holds the receiver: one thread at a time
+                found = self._running.get("engine", theirs).receive(point)
+        single: dict[str, Any] = {n: getattr(found, n).astype(np.float32) for n in ("path_gain", "aod")}
+        return replace(found, **single)
 
 
 def _kept(
     workspace: str | os.PathLike[str], inputs: str, point: np.ndarray, found: ReceivedPaths | None = None
 ) -> ReceivedPaths | None:
-    """What is on file for ``point``, in single precision: what an earlier run left there, else what was ``found``."""
-    made = None
-    if found is not None:
-        made = {
-            "path_gain": found.path_gain.astype(np.float32),
-            "delay_s": found.delay_s,
-            "aod": found.aod.astype(np.float32),
-            "line_of_sight": np.array(found.line_of_sight),
-        }
+    """What is on file for ``point``: what an earlier run left there, else what was ``found``."""
+    make: Any = None if found is None else partial(vars, found)
     with Steps(workspace, shared=True) as steps:
-        name = digest(inputs, point)[:24]
-        make: Any = None if made is None else partial(dict, made)
-        held = steps.arrays(name, make, version=REVISION, inputs=[inputs, point])
-    if not held:
-        return None
-    return ReceivedPaths(
-        path_gain=held["path_gain"],
-        delay_s=held["delay_s"],
-        aod=held["aod"],
-        line_of_sight=bool(held["line_of_sight"]),
-    )
+        held: Any = steps.arrays(digest(inputs, point)[:24], make, version=REVISION, inputs=[inputs, point])
+    return ReceivedPaths(**held) if held else None

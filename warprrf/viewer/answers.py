@@ -192,9 +192,7 @@ def reading_errors(field: RadioField, readings: Readings, progress: Progress | N
     links, own = np.unique(ends, axis=0, return_inverse=True)
     for k, link in enumerate(links):
         rows, paths = np.flatnonzero(own.reshape(-1) == k), field.paths(link[3:], link[:3])
-        arrival = directions_from_angles(paths.theta_r, paths.phi_r)
-        departure = directions_from_angles(paths.theta_t, paths.phi_t)
-        weight = path_weights(readings, rows, arrival, departure, paths.tau) * paths.power
+        weight = path_weights(readings, rows, paths.arrival, paths.departure, paths.tau) * paths.power
         power[rows] = weight.sum(axis=1)
         single = weight[:, paths.kind != "diffuse"] / np.maximum(power[rows], 1e-300)[:, None]
         steady[rows] = (single**2).sum(axis=1)
@@ -232,7 +230,7 @@ def best_beam(paths: Sequence[Paths], size: int, azimuth_rad: float) -> tuple[fl
         What it gains over one isotropic antenna [dB], and its power gain (K, M) along directions (K, M, 3).
     """
     codebook = dft_codebook(PlanarArray(size, size, orientation=(azimuth_rad, 0.0, 0.0)))
-    arrival = np.concatenate([directions_from_angles(p.theta_r, p.phi_r) for p in paths])
+    arrival = np.concatenate([p.arrival for p in paths])
     power = np.concatenate([p.power for p in paths])
     received = codebook.power(arrival, power)
     best = int(received.argmax())

@@ -157,5 +157,5 @@ def _folder(path: Path) -> list[Any]:
             fields = [path / "field.safetensors"]
             return [Reconstruction.load(folder), *(RadioField.load(f) for f in fields if f.is_file())]
     raise ValueError(
-        f"things: {path} holds no {RECONSTRUCTION_FILE}, expected a folder that Reconstruction.save wrote"
+        f"things: {path} holds no {RECONSTRUCTION_FILE}, expected what Reconstruction.save wrote"
     )

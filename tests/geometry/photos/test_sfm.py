@@ -12,7 +12,7 @@ from views import lobby_cameras
 from warprrf.geometry.photos import sfm
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.photo_files import find_photos, match_names, read_photo
-from warprrf.geometry.photos.sparse import SparseModel, align_to_known, fit_similarity
+from warprrf.geometry.photos.sparse import SparseModel, align_to_known, fit_similarity, posed_in_words
 from warprrf.geometry.splats.camera import Camera
 
 pytest.importorskip("pycolmap")
@@ -96,8 +96,57 @@ def test_bad_surveyed_positions_are_refused():
     with pytest.raises(ValueError, match="one line"):
         align_to_known(sparse, {"a.jpg": [0, 0, 0], "b.jpg": [1, 1, 1], "c.jpg": [2, 2, 2]})
     lost = replace(sparse, cameras=dict(list(sparse.cameras.items())[:2]), unposed=tuple(known)[2:])
-    with pytest.raises(ValueError, match=r"only 2 of the surveyed photos were posed.*c\.jpg"):
+    with pytest.raises(ValueError, match=r"2 of 8 photos were posed, but only 2 of the surveyed.*c\.jpg"):
         align_to_known(lost, known)
+
+
+def test_what_was_posed_is_said_in_words():
+    whole = model(np.random.default_rng(5))
+    assert posed_in_words(whole) == ""
+    cameras = {f"{n}.jpg": whole.cameras[f"{n}.jpg"] for n in "abcd"}
+    lost = replace(whole, cameras=cameras, unposed=("e.jpg", "f.jpg", "g.jpg", "h.jpg"))
+    assert posed_in_words(lost) == "photos: 4 of 8 posed; without a pose: e.jpg, f.jpg, g.jpg, h.jpg"
+    apart = replace(lost, pieces=(tuple(cameras), ("f.jpg", "g.jpg", "h.jpg")))
+    assert posed_in_words(apart) == (
+        "photos: 4 of 8 posed in the largest of 2 pieces that share no view: add photos between d.jpg and f.jpg"
+    )
+
+
+def test_models_that_share_a_photo_become_one_and_others_stay_apart(posed, lobby, tmp_path):
+    import pycolmap
+
+    folder, options = posed[0] / "sfm", pycolmap.IncrementalPipelineOptions(random_seed=0, num_threads=1)
+
+    def part(names):
+        found = pycolmap.Reconstruction(str(folder / "model"))
+        camera = found.cameras[1]  # as while mapping, before the lens was found to be straight
+        camera.model, camera.params = pycolmap.CameraModelId.SIMPLE_RADIAL, [*camera.params, 0.0]
+        for image in list(found.images.values()):
+            if image.name not in names:
+                found.deregister_frame(image.frame_id)
+        return found
+
+    for shared, joined in ((1, True), (0, False)):
+        first, second = part(VIEWS[:6]), part(VIEWS[6 - shared :])
+        second.transform(pycolmap.Sim3d(2.5, pycolmap.Rotation3d([0.1, 0.2, 0.3]), [3.0, -1.0, 2.0]))
+        source = folder / "matches.db", lobby[0][0].parent, options
+        both = sfm._joined(pycolmap, first, second, source, tmp_path)
+        assert (both is not None) == joined
+        if both is not None:
+            centres = {i.name: i.projection_center() for i in both.images.values()}
+            known = np.array([posed[1].cameras[name].position for name in VIEWS])
+            scale, rotation, shift = fit_similarity([centres[name] for name in VIEWS], known)
+            moved = scale * np.array([centres[name] for name in VIEWS]) @ rotation.T + shift
+            assert np.abs(moved - known).max() < 0.01 * np.ptp(known, axis=0).max()
+
+
+def test_pieces_that_share_no_view_are_named_and_kept(lobby, tmp_path):
+    photos = [LOBBY / "photos" / f"view_{k:03d}.jpg" for k in (*range(4, 10), *range(60, 64))]
+    with pytest.warns(UserWarning, match="of 10 posed in the largest of 2 pieces"):
+        found = made(tmp_path, photos)[0]
+    assert found.guessed[0].startswith("photos: ") and len(found.pieces) == 2
+    assert set(found.pieces[1]) <= set(found.unposed) and "model-2" in found.causes[found.pieces[1][0]]
+    assert set(sfm.read_known(tmp_path / "sfm" / "model-2")) == set(found.pieces[1])
 
 
 def test_poses_of_rendered_photos_agree_with_the_truth_and_straight_photos_are_taken_as_they_are(

@@ -7,8 +7,10 @@ from trimesh.remesh import subdivide_to_size
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.cells import occupancy
+from warprrf.geometry.photos.fusion import fuse_depth
 from warprrf.geometry.planes import Plane, detect_planes, plane_axes
 from warprrf.geometry.scans import find_patches
+from warprrf.geometry.splats.camera import Camera
 
 
 def grid_on(plane_normal, offset, size=1.0, step=0.05):
@@ -113,3 +115,13 @@ def test_faces_go_to_the_planes_that_are_given():
     patches = find_patches(mesh, planes)
     np.testing.assert_array_equal(patches.normal, [[0, 0, 1], [1, 0, 0]])
     assert patches.area == pytest.approx([12, 7.5], rel=0.05)
+
+
+def test_a_depth_map_with_few_known_pixels_does_not_end_the_fusion():
+    camera = Camera.pinhole(64, 48, fx=50, fy=50, cx=32, cy=24, world_to_camera=np.eye(4))
+    wall = 2.0 / camera.directions()[..., 2]  # at z = 2
+    few = np.zeros_like(wall)
+    few[9:12, 9:12] = wall[9:12, 9:12]
+    few[8, 8] = 100.0  # beyond the largest range
+    mesh = fuse_depth([wall, few, wall], [camera] * 3)
+    assert np.abs(mesh.vertices[:, 2] - 2).max() < 0.01

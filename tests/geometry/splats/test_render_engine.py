@@ -13,7 +13,6 @@ from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import RADIO, Blending, Rasterizer
 from warprrf.geometry.splats.render import render
-from warprrf.kernels.raster.blocks import BLOCK
 
 CAMERAS = {
     "pinhole": photo(70, 45),
@@ -63,15 +62,6 @@ def test_the_number_of_threads_changes_no_bit(camera, monkeypatch):
     for other in results[1:]:
         for a, b in zip(results[0], other, strict=True):
             assert np.array_equal(a, b)
-
-
-@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
-def test_seen_weights_are_those_of_pixels_of_the_image(camera):
-    """Blocks reach beyond the image where its size is no multiple of four: nothing there counts."""
-    image, alpha, _, _, _, seen, *_ = image_and_gradients(mixed(7, 400), camera, real=wp.float64)
-    assert camera.width % BLOCK or camera.height % BLOCK or camera.width % 16
-    assert np.isclose(seen.sum(), alpha.sum(), rtol=1e-12)
-    assert alpha.sum() > 0.1 * alpha.size
 
 
 def test_the_exponential_of_float32_errs_by_less_than_1e_6():

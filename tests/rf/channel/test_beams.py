@@ -144,17 +144,6 @@ def test_multi_user_choice_is_as_good_as_trying_everything() -> None:
     np.testing.assert_allclose(np.log2(1.0 + found.sinr).sum(), best, rtol=1e-12)
 
 
-def test_a_single_user_gets_its_best_pair() -> None:
-    tx, rx = wr.PlanarArray(4, 4), wr.PlanarArray(2, 2)
-    paths = paths_along(random_directions(4), random_directions(4, seed=1), np.array([1, 2, 3, 4]))
-    one, user = (
-        wr.channel.select_beams(paths, tx, rx),
-        wr.channel.select_beams_multiuser(paths, tx, rx, noise=2.0),
-    )
-    assert (user.tx[0], user.rx[0]) == (one.tx[0], one.rx[0])
-    np.testing.assert_allclose(user.sinr, one.gain / 2.0)
-
-
 def test_what_no_codebook_can_be_made_of_is_named() -> None:
     array = wr.PlanarArray(2, 2)
     with pytest.raises(ValueError, match="array: got polarisation 'V'"):

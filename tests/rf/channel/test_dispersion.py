@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from path_makers import random_paths
@@ -49,6 +49,7 @@ def test_delay_spread_ignores_shift_and_scale(p, t, shift, scale):
 
 
 @given(powers, delays)
+@example(np.array([1.0, *[0.5] * 5]), np.array([0.0, *[1.2e-308] * 5]))
 def test_correlation_falls_no_faster_than_the_delay_spread_allows(p, t):
     """|R(f)| >= 1 - (2 pi f S)^2 / 2, so half is not reached before f = 1 / (2 pi S)."""
     spread = delay_spread(p, t)[1]

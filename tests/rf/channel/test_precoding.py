@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from path_makers import CARRIER, random_paths
+from path_makers import random_paths
 from scipy.linalg import eigh
 
 import warprrf as wr
@@ -72,22 +72,12 @@ def test_slnr_is_the_generalised_eigenvector_and_for_channels_the_mmse_precoder(
     np.testing.assert_allclose(alike(w, mmse.T / np.linalg.norm(mmse.T, axis=1)[:, None]), 1.0, rtol=1e-12)
 
 
-def test_slnr_lies_between_maximum_ratio_and_zero_forcing() -> None:
+def test_slnr_goes_from_zero_forcing_to_maximum_ratio_with_the_noise() -> None:
     h = rayleigh()
     for channels in (h, rank_one(h)):
         loud, quiet = (wr.channel.precoders(channels, "slnr", noise=n) for n in (1.0, 1e-18))
         np.testing.assert_allclose(alike(loud, wr.channel.precoders(h, "mr", noise=1.0)), 1.0, rtol=1e-9)
         np.testing.assert_allclose(alike(quiet, wr.channel.precoders(h, "zf", noise=1.0)), 1.0, rtol=1e-6)
-    for noise in (1e-11, 1e-9, 1e-7):
-        rate = {}
-        for method in ("mr", "zf", "slnr"):
-            rates = []
-            for seed in range(40):
-                h = rayleigh(users=8, seed=seed)
-                w = wr.channel.precoders(h, method, noise=noise)
-                rates.append(np.log2(1.0 + wr.channel.precoded_sinr(h, w, noise=noise)).sum())
-            rate[method] = np.mean(rates)
-        assert rate["slnr"] > max(rate["mr"], rate["zf"]) - 1e-9
 
 
 def test_covariance_gives_every_pair_of_beams_its_mean_gain() -> None:
@@ -104,17 +94,6 @@ def test_covariance_gives_every_pair_of_beams_its_mean_gain() -> None:
     one = wr.channel.transmit_covariance(users[0], wr.PlanarArray(1, 1))
     assert one.shape == (1, 1, 1)
     assert one[0, 0, 0].real == pytest.approx(users[0].power.sum(), rel=1e-12)
-
-
-def test_covariance_is_the_mean_over_phases() -> None:
-    array = wr.PlanarArray(2, 3)
-    user = diffuse(1)
-    drawn = np.stack(
-        [user.cfr([CARRIER], tx_array=array, diffuse="random_phase", seed=s)[0, :, 0] for s in range(3000)]
-    )
-    mean = np.einsum("si,sj->ij", drawn.conj(), drawn) / len(drawn)
-    found = wr.channel.transmit_covariance(user, array)[0]
-    assert np.linalg.norm(mean - found) < 0.05 * np.linalg.norm(found)
 
 
 def test_sinr_of_beams_is_that_of_the_multi_user_choice() -> None:

@@ -217,16 +217,6 @@ def test_polarised_ports():
         replace(p, jones=None).cfr([CARRIER], tx_array=vertical, rx_array=vertical)
 
 
-def test_traced_jones_matrices_hold_the_path_gain():
-    scene = far_square(SlabMaterial())
-    p = trace_paths(scene, transmitter=[0, 0, 2], receivers=[[5, 1, 1], [9, -2, 3]], frequency_hz=F)
-    half = 0.5 * (np.abs(p.jones) ** 2).sum(axis=(-2, -1))
-    np.testing.assert_allclose(half, p.power, rtol=1e-12)
-    assert (p.kind == [["los", "mirror"]] * 2).all()
-    bare = trace_paths(scene.mesh, transmitter=[0, 0, 2], receivers=[5, 1, 1], frequency_hz=F)
-    assert bare.jones is None
-
-
 def test_diffuse_phases_must_be_chosen():
     p = Paths.concatenate([random_paths(3), random_paths(5000, seed=1, kind="diffuse")])
     f = BAND.frequencies_hz(16)

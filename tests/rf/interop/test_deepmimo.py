@@ -9,7 +9,6 @@ from radio_scenes import box_mesh
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.materials import Material
-from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.interop.deepmimo import write_deepmimo
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.trace import trace_paths
@@ -74,35 +73,6 @@ def test_package_reads_what_was_written(loaded):
     assert data.rt_params["frequency"] == F
     assert [o.name for o in data.scene.objects] == ["room"]
     assert list(data.materials.name) == ["stone"]
-
-
-def test_package_makes_our_channels(loaded, deepmimo):
-    """DeepMIMO counts array phases from an array's first element (lowest row, first column), we from its centre."""
-    paths, data = loaded
-    wide, count = 1e9, 1024
-    chosen = np.arange(0, 64, 4)
-    parameters = deepmimo.ChannelParameters(
-        bs_antenna={"shape": [2, 3], "spacing": 0.5},
-        ue_antenna={"shape": [2, 1], "spacing": 0.5},
-        num_paths=100,
-        freq_domain=1,
-        ofdm={"subcarriers": count, "selected_subcarriers": chosen, "bandwidth": wide, "rx_filter": 0},
-    )
-    theirs = data.compute_channels(parameters) * np.sqrt(count)
-    lam = SPEED_OF_LIGHT / F
-
-    def phases(shape, directions):
-        y, z = np.tile(np.arange(shape[0]), shape[1]), np.repeat(np.arange(shape[1]), shape[0])
-        place = 0.5 * lam * np.stack([0 * y, y, z], axis=1)
-        return np.exp(2j * np.pi / lam * place @ directions.T)
-
-    for r in range(len(paths.gain)):
-        p = paths[r]
-        waves = np.exp(-2j * np.pi * np.outer(p.tau, chosen * wide / count))
-        ours = np.einsum(
-            "mp,np,p,pf->mnf", phases((2, 1), p.arrival), phases((2, 3), p.departure), p.gain, waves
-        )
-        np.testing.assert_allclose(theirs[r], ours, atol=1e-4 * np.abs(ours).max())
 
 
 def test_folder_without_the_package(tmp_path):

@@ -35,7 +35,7 @@ def engines(scene):
 def test_total_diffuse_power_agrees_within_half_a_percent(engines, rx):
     ours, theirs = engines
     found = theirs.solve(rx, specular=False)
-    assert ours.diffuse(rx).power.sum() == pytest.approx(found["power"][found["diffuse"]].sum(), rel=5e-3)
+    assert ours.diffuse(rx).power.sum() == pytest.approx(found.power[found.kind == "diffuse"].sum(), rel=5e-3)
 
 
 def test_one_seed_gives_the_same_paths_in_the_same_order(scene):
@@ -45,18 +45,18 @@ def test_one_seed_gives_the_same_paths_in_the_same_order(scene):
         scene, sampling=Sampling(depth=2, samples=20_000), transmitter=TX, frequency_hz=F, shape=SHAPE
     )
     first = engine.solve(SEES)
-    assert len(first["tau"]) > 5000 and (np.diff(first["tau"]) >= 0).all()
+    assert len(first.tau) > 5000 and (np.diff(first.tau) >= 0).all()
     for _ in range(4):
         again = engine.solve(SEES)
-        for name, values in first.items():
-            np.testing.assert_array_equal(again[name], values, err_msg=name)
+        for name, values in vars(first).items():
+            np.testing.assert_array_equal(getattr(again, name), values, err_msg=name)
 
 
 def test_spectra_have_the_same_shape_and_the_same_strongest_pixel(engines):
     ours, theirs = (engine.receive(SEES) for engine in engines)
     pixel = pixel_of(TX - SEES, SHAPE)
     distance = np.linalg.norm(TX - SEES)
-    assert theirs.path_gain.sum() == pytest.approx(engines[1].solve(SEES)["power"].sum(), rel=1e-9)
+    assert theirs.path_gain.sum() == pytest.approx(engines[1].solve(SEES).power.sum(), rel=1e-9)
     for got in (ours, theirs):
         assert np.unravel_index(got.path_gain.argmax(), SHAPE) == pixel
         assert got.delay_s[pixel] == pytest.approx(distance / SPEED_OF_LIGHT, rel=1e-6)
@@ -83,7 +83,7 @@ def test_a_scene_needs_no_file_and_its_own_devices_play_no_part(engines, scene):
         scene.mesh, scene.materials, scene.face_material, transmitters={"tx": TX + 1}, receivers={"rx": SEES}
     )
     engine = type(engines[1])(bare, transmitter=TX, frequency_hz=F, shape=SHAPE, sampling=Sampling(depth=1))
-    found, usual = (e.solve(SEES)["power"].sum() for e in (engine, engines[1]))
+    found, usual = (e.solve(SEES).power.sum() for e in (engine, engines[1]))
     assert found == pytest.approx(usual, rel=2e-3)
 
 

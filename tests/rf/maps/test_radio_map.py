@@ -48,7 +48,9 @@ def db(ratio: np.ndarray) -> np.ndarray:
 
 def test_an_empty_room_of_line_of_sight_alone_is_friis() -> None:
     room = Mesh(*box_mesh([0, 0, 0], [5, 4, 3], inward=True))
-    m = prior(room, Effects(mirrors=0, scatterings=0)).radio_map(1.5, 0.4, transmit_power_dbm=10.0)
+    m = prior(room, Effects(mirrors=0, scatterings=0, transmissions=0)).radio_map(
+        1.5, 0.4, transmit_power_dbm=10.0
+    )
     length = np.linalg.norm(m.positions - TX, axis=-1)
     friis = (WAVELENGTH / (4.0 * np.pi * length)) ** 2
     assert m.free.sum() == 12 * 10  # the thirteenth column's centre is at the wall
@@ -127,14 +129,6 @@ def test_fewer_mirrors_are_those_of_a_field_with_fewer(whole: BistaticField, ord
     )
 
 
-def test_another_transmitter_moves_the_map(whole: BistaticField) -> None:
-    other = np.array([4.3, 3.2, 2.0])
-    m = whole.radio_map(1.2, 0.5, transmitter=other)
-    peak = m.positions.reshape(-1, 3)[np.nanargmax(m.total_path_gain)]
-    assert np.abs(peak[:2] - other[:2]).max() <= 0.5
-    np.testing.assert_array_equal(m.transmitter, other)
-
-
 def test_a_harmonic_field_has_maps_too(scene: RadioScene) -> None:
     ds = spectra(scene, PLACES, shape=(12, 24), sigma=np.radians(10.0), sub_pixels=2)
     field = RadioField.fit(scene, ds, model="rf3dgs+", iterations=3)
@@ -160,13 +154,6 @@ def test_solids_are_no_cells_even_of_a_torn_mesh(scene: RadioScene) -> None:
     clear = scene.mesh.distance(points) > 0.1  # nearer to a wall one missing face fills half the view
     for mesh in (scene.mesh, torn, Mesh(torn.vertices, torn.faces[:, ::-1])):
         np.testing.assert_array_equal(is_free(mesh, points, TX)[clear], (room & ~box)[clear])
-
-
-def test_map_of_a_furnished_room_has_a_hole(found: RadioMap) -> None:
-    inside = (np.abs(found.x - 2.6) < 0.4)[None, :] & (np.abs(found.y - 2.0) < 0.4)[:, None]
-    for name in ("total_path_gain", "best_path_gain", "delay_spread_s", "best_beam_gain"):
-        np.testing.assert_array_equal(np.isnan(getattr(found, name)), inside)
-    assert (found.total_path_gain[found.free] >= 0.999999 * found.best_path_gain[found.free]).all()
 
 
 def test_a_map_that_other_tools_turned_is_read_by_its_coordinates(found: RadioMap, tmp_path: Path) -> None:

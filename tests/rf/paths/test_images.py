@@ -6,13 +6,12 @@ import warnings
 import numpy as np
 import pytest
 from radio_scenes import box_mesh, joined, tube
-from told import check_told
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.rf.paths import images as images_module
 from warprrf.rf.paths.images import MirrorImages
-from warprrf.rf.paths.mirror_paths import exact_paths, zone_paths
+from warprrf.rf.paths.mirror_paths import exact_paths
 from warprrf.rf.paths.trace import MirrorTracer, trace_paths
 
 TX = np.array([0.2, -0.1, 0.3])
@@ -92,34 +91,6 @@ def test_a_search_without_end_is_refused_before_it_begins():
         trace_paths(mesh, receivers=[1.0, 0.2, 0.1], mirror_order=12, **words)
     with pytest.raises(ValueError, match="expected at most 10:.*max_chains"):
         MirrorTracer(mesh, max_chains=10, **words).find(np.array([[1.0, 0.2, 0.1]]), 1)
-
-
-def test_progress_of_a_search_in_blocks_goes_from_patches_to_the_end_of_the_mirrors(monkeypatch):
-    monkeypatch.setattr(images_module, "MOST_KEPT", 0)
-    monkeypatch.setattr(images_module, "_FIRST", 3)
-    told = []
-    points = np.random.default_rng(9).normal(0, 1.5, (2, 3))
-    trace_paths(
-        shards(2, 40), transmitter=TX, receivers=points, frequency_hz=3e9, mirror_order=3,
-        progress=lambda *words: told.append(words),
-    )  # fmt: skip
-    check_told(told, ["patches", "mirrors"])
-    assert told[-1][1:] == (1000, 1000) and len(set(told)) > 10
-
-
-def test_soft_blocking_finds_what_hard_blocking_does_where_zones_are_free():
-    mesh = Mesh(*box_mesh([-3, -2, -1], [4, 3, 2], inward=True))
-    patches = planar_patches(mesh)
-    points = np.random.default_rng(7).uniform([-2.5, -1.5, -0.5], [3.5, 2.5, 1.5], (6, 3))
-    images = MirrorImages(patches, TX, slack_m=0.1)
-    hard, soft = exact_paths(images, points, 2), zone_paths(images, points, 2, 1e-5, 1e-4)
-    whole = soft.subset(np.flatnonzero(soft.share == 1.0))
-    assert len(whole) >= 0.95 * len(hard)
-
-    def rows(paths):
-        return {(int(r), *p.tolist()) for r, p in zip(paths.receiver, paths.patch, strict=True)}
-
-    assert rows(whole) <= rows(hard) <= rows(soft)
 
 
 def test_patches_with_a_back_mirror_on_their_front_alone():

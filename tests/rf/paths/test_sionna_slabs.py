@@ -76,7 +76,6 @@ def way(paths, k, material, frequency_hz):
     return length.sum(), (material.thickness_m * (inside - cos)).sum() / SPEED_OF_LIGHT
 
 
-@pytest.mark.xfail(strict=True, raises=TypeError, reason="trace_paths has no transmissions yet")
 @pytest.mark.parametrize("name, ghz", [*(("glass", f) for f in (28, 60, 140, 300)), ("plasterboard", 28)])
 def test_every_path_through_sheets_is_found(rt, name, ghz):
     scene, f = room(name), 1e9 * ghz

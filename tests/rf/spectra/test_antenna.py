@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import warprrf as wr
-from warprrf.rf.spectra.antenna import deembed, scanned_kernel
+from warprrf.rf.spectra.antenna import deembed
 from warprrf.rf.spectra.spectrum import directions_from_angles, pixel_directions, pixel_solid_angles, spread
 
 SHAPE = (90, 180)
@@ -110,12 +110,6 @@ def test_deembedding_comes_closer_to_the_true_spectrum_than_the_measurement():
     out = deembed(measured[None], horn, SIGMA)
     error, before = (np.abs(x - truth).sum() / truth.sum() for x in (out.path_gain[0], naive))
     assert error < 0.2 and error < 0.2 * before
-
-
-def test_a_pattern_as_samples_is_the_pattern_as_a_function():
-    samples = horn(np.linspace(0, np.pi, 3601))
-    one, other = (scanned_kernel(p, (30, 60)) for p in (horn, samples))
-    np.testing.assert_allclose(one, other, atol=1e-3 * one.max())
 
 
 def test_a_needle_leaves_the_spectrum_as_it_is_but_for_the_beam():

@@ -243,12 +243,6 @@ def test_attributes_are_text_and_numbers(value):
         replace(dataset(), attributes={"mine": value})
 
 
-def test_a_data_set_says_what_it_is_in_a_line():
-    text = repr(dataset())
-    assert len(text) < 250 and "\n" not in text
-    assert "40 receivers: 30 train, 10 test; 12 x 24 pixels of 'exact' at 300 GHz" in text
-
-
 def test_compact_files_of_the_faintest_floors_hold_numbers(tmp_path):
     before = dataset(4)
     faint = replace(before, path_gain=before.path_gain * 1e-28, floor=1e-44)

@@ -1,28 +1,26 @@
 """Lookups against averages written out by hand."""
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from warprrf.rf.spectra import lookups
+from warprrf.rf.spectra.dataset import SpectrumDataset
 
 SHAPE = (10, 20)
 FLOOR = 1e-12
 
 
-def training_set(positions: list[list[float]], gains: list[float]) -> SimpleNamespace:
-    count = len(positions)
-    return SimpleNamespace(
-        receivers=np.array(positions, dtype=float),
-        path_gain=np.stack([np.full(SHAPE, g) for g in gains]) if gains else np.zeros((0, *SHAPE)),
-        delay_s=np.stack([np.full(SHAPE, 1e-9 * i) for i in range(count)])
-        if count
-        else np.zeros((0, *SHAPE)),
-        aod=np.zeros((count, *SHAPE, 2)),
-        floor=FLOOR,
-        range_db=(-120.0, -60.0),
-    )
+def training_set(positions: list[list[float]], gains: list[float]) -> SpectrumDataset:
+    if not gains:
+        return SpectrumDataset.empty(transmitter=[9.0, 9.0, 9.0], frequency_hz=1e9, shape=SHAPE)
+    found = SpectrumDataset.from_spectra(
+        receivers=np.array(positions, float), transmitter=np.full(3, 9.0), frequency_hz=1e9, beam_sigma_rad=0.1, floor=FLOOR,
+        path_gain=np.stack([np.full(SHAPE, g) for g in gains]),
+        delay_s=np.stack([np.full(SHAPE, 1e-9 * i) for i in range(len(gains))]),
+    )  # fmt: skip
+    return replace(found, range_db=(-120.0, -60.0))
 
 
 def test_nearest_copies_gain_and_delay_of_the_nearest_receiver() -> None:

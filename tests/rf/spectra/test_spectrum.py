@@ -127,27 +127,3 @@ def test_beams_made_at_once_are_those_made_one_by_one(sigma: float) -> None:
     for beam, direction in zip(together, directions, strict=True):
         alone = spread(direction[None], np.ones(1), (30, 60), sigma)
         assert np.allclose(beam, alone, rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.usefixtures("device")
-def test_strongest_ray_of_a_pixel_is_that_of_the_spread_paths() -> None:
-    import warp as wp
-
-    from warprrf.rf.spectra.spectrum import strongest_rays, sub_pixel_directions
-
-    shape, sigma = (36, 72), 0.1
-    directions = sub_pixel_directions(shape, 3)[0]
-    rng = np.random.default_rng(3)
-    power = 10.0 ** rng.uniform(-9.0, 0.0, len(directions))
-    power[rng.random(len(power)) < 0.5] = 0.0
-    power.reshape(*shape, 9)[2:5, 3:9] = 0.0  # dark cells, lit by their neighbours' beams
-    expected = spread_paths(directions, power, shape, sigma).strongest
-    found = strongest_rays(
-        wp.array(directions, dtype=wp.vec3d, device="cpu"), power, shape, sigma, device="cpu"
-    )
-    assert (found == expected).mean() > 0.98  # a beam's normalisation varies a little over the grid
-    assert found[3, 5] == expected[3, 5] >= 0
-    dark = strongest_rays(
-        wp.array(directions, dtype=wp.vec3d, device="cpu"), 0.0 * power, shape, sigma, device="cpu"
-    )
-    assert (dark == -1).all()

@@ -44,6 +44,9 @@ EDGE_TOLERANCE = 8.0
 """A pixel is left out where inverse depth bends by more than this part of itself, per focal length in pixels: on a plane
 it is linear in the image, in a corner it bends, across an occluding edge it jumps."""
 MIN_VIEWS = 2  # a surface is kept where at least this many depth maps saw it
+TOUCHED = (
+    4  # Open3D looks for blocks along every so many-th row and column, and refuses a map that shows none
+)
 BLOCK_VOXELS, BLOCKS = 16, 20_000  # voxels along a block's side; blocks set aside at first, the grid grows
 
 
@@ -161,8 +164,8 @@ def fuse_depth(
             raise ValueError(f"cameras[{k}]: got a {camera.kind} camera, expected pinhole cameras")
         depth = check_array(f"depths[{k}]", given, (camera.height, camera.width), np.float64, finite=False)
         z = range_to_depth(np.where(np.isfinite(depth), depth, 0.0), camera)
-        z[(depth > config.max_range_m) | ~_smooth(z, EDGE_TOLERANCE / camera.fx)] = 0.0
-        if not (z > 0).any():
+        z[(depth >= config.max_range_m) | ~_smooth(z, EDGE_TOLERANCE / camera.fx)] = 0.0
+        if not (z[::TOUCHED, ::TOUCHED] > 0).any():
             continue
         image = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(z, dtype=np.float32)))
         # The grid reads the pixel that a voxel's projection falls into: pixel centres at +0.5, as ours.

@@ -12,6 +12,7 @@ import itertools
 import os
 import shutil
 import sqlite3
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -21,7 +22,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from warprrf.checks import check_count
+from warprrf.checks import check_choice, check_count
 from warprrf.device import Progress, require
 from warprrf.geometry.photos.config import LENSES, ReconstructionConfig
 from warprrf.geometry.photos.photo_files import (
@@ -37,7 +38,7 @@ from warprrf.geometry.photos.photo_files import (
     turns_of,
 )
 from warprrf.geometry.photos.poses import KnownCamera, KnownPoses
-from warprrf.geometry.photos.sparse import SparseModel
+from warprrf.geometry.photos.sparse import SparseModel, fit_similarity, posed_in_words
 from warprrf.geometry.photos.undistort import (
     FREE_MODEL,
     Lens,
@@ -52,7 +53,7 @@ from warprrf.geometry.photos.undistort import (
 from warprrf.steps import Attempt, Steps
 from warprrf.tensor_files import named as naming
 
-VERSIONS = {"features": 2, "matches": 1, "model": 2, "photos": 1}
+VERSIONS = {"features": 2, "matches": 2, "model": 3, "photos": 1}
 """Of the steps: counted up by whoever changes what a step computes."""
 
 LEAST_PIXELS = 10_000  # of max_pixels
@@ -63,8 +64,17 @@ MAX_EXHAUSTIVE_PAIRS = 2000
 COARSE_FEATURES = 300  # the largest features of a photo take part in the coarse comparison
 COARSE_NEIGHBOURS = 16  # pairs kept for a photo; on the lobby 24 takes half as long again for the same errors
 PEAK_THRESHOLD = 0.004  # COLMAP's 0.0067 finds too little on bare walls
+IN_ORDER = (1, 2, 4, 8)  # photos so many places apart by name, as a film has them, are always matched
 FEWEST_FEATURES = 8  # of a photo that can be matched
 FEWEST_MATCHES = 15  # of a pair that COLMAP counts as matched
+LENIENT = {
+    "init_min_num_inliers": 40, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15,
+    "abs_pose_min_inlier_ratio": 0.15,
+}  # fmt: skip
+"""Of COLMAP's mapper, where its own limits leave photos without a pose: of a film of monitors and desks they pose 7 of 25, these
+22; on three films whose poses are known, cameras are no worse."""
+SHARED_ROUNDS = 5  # of fitting one model to another, each without what the last one fits badly
+SHARED_ERROR = 0.01  # median of points that two models share, over their extent, up to which the two are one
 EXTRACT_BATCH = 12
 MATCH_BATCH = 400
 
@@ -104,8 +114,7 @@ def structure_from_motion(
     config = config or ReconstructionConfig()
     lens, pairs = config.lens, config.pairs
     for name, value, known_values in (("lens", lens, LENSES), ("pairs", pairs, ("auto", "exhaustive"))):
-        if value not in known_values:
-            raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(known_values)}")
+        check_choice(name, value, known_values)
     max_features = check_count("max_features", config.max_features, 100)
     max_pixels = check_count("max_pixels", config.max_pixels, LEAST_PIXELS)
     everything = named = find_photos(photos)
@@ -130,10 +139,9 @@ def structure_from_motion(
 
     def model(attempt: Attempt) -> dict[str, Any]:
         if known is None:
-            _map(colmap, folder, named, (lens, seed), attempt)
-        else:
-            _keep_known(colmap, folder, named, (known, match, seed), attempt)
-        return {}
+            return {"pieces": _map(colmap, folder, named, (lens, seed), attempt)}
+        _keep_known(colmap, folder, named, (known, match, seed), attempt)
+        return {"pieces": []}
 
     folder = Path(workspace).absolute() / "sfm"
     kept = folder / "photos"
@@ -153,7 +161,7 @@ def structure_from_motion(
             inputs = [steps.key("matches"), lens, seed]
         if known is not None:
             inputs += [list(named.values()), *_content(known)]
-        steps.run("model", model, version=VERSIONS["model"], inputs=inputs, outputs=["model"])
+        made = steps.run("model", model, version=VERSIONS["model"], inputs=inputs, outputs=["model"])
         result = _straightened(colmap, steps, named, max_pixels)
         unposed = [name for name in named if name not in result.cameras]
         if poses is not None:
@@ -161,7 +169,15 @@ def structure_from_motion(
             causes = dict.fromkeys(unposed, "the poses given have none of it")
         else:
             causes = _causes(colmap, folder / "matches.db", result) if unposed else {}
-        return replace(result, unposed=tuple(unposed), causes=causes)
+        for k, piece in enumerate(made["pieces"][1:], 2):
+            text = f"one of {len(piece)} photos in a piece of their own; poses={folder / f'model-{k}'} gives that"
+            causes |= dict.fromkeys(piece, text)
+        pieces = tuple(map(tuple, made["pieces"]))
+        result = replace(result, unposed=tuple(unposed), causes=causes, pieces=pieces)
+        said = posed_in_words(result)
+        if said:
+            warnings.warn(said, stacklevel=3)
+        return replace(result, guessed=(*result.guessed, *filter(None, [said])))
 
 
 def _straightened(
@@ -394,7 +410,7 @@ def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[
     """Pairs worth matching: each photo with those that share the most of its largest features.
 
     The largest features of two photos are compared by brute force, one matrix product a pair; a mutual nearest
-    neighbour that passes the ratio test is a vote. Consecutive photos are always kept.
+    neighbour that passes the ratio test is a vote. Photos that follow one another are always kept.
     """
     ids = {i.name: i.image_id for i in database.read_all_images()}
     descriptors = []
@@ -429,16 +445,18 @@ def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[
     order = np.argsort(-votes, axis=1, kind="stable")[:, :COARSE_NEIGHBOURS]
     np.put_along_axis(keep, order, True, axis=1)
     keep &= votes >= 4
-    step = np.arange(len(names) - 1)
-    keep[step, step + 1] = True
+    for apart in IN_ORDER:
+        step = np.arange(len(names) - apart)
+        keep[step, step + apart] = True
     keep |= keep.T
     return [(names[i], names[j]) for i, j in itertools.combinations(range(len(names)), 2) if keep[i, j]]
 
 
 def _map(
     colmap: ModuleType, folder: Path, named: Mapping[str, Path], settings: tuple[str, int], attempt: Attempt
-) -> None:
-    """Poses and points from the matches, into the folder ``model``: the largest of the models found."""
+) -> list[list[str]]:
+    """Poses and points from the matches, into the folder ``model``: the largest of the models found, with those that
+    photos join to it; the others into ``model-2`` and so on. Names of the photos of each."""
     lens, seed = settings
     working = _copied(folder / "matches.db", attempt.folder / "matches.db")
     images, report = _root(named), attempt.progress
@@ -446,31 +464,28 @@ def _map(
     options.random_seed = seed
     options.num_threads = 1  # sums in a fixed order: the same poses every time
     options.min_model_size = MIN_PHOTOS
-    models: list[Any] = []
-    for relaxed in (False, True):
-        # Few photos, or all from nearly one direction: a weaker first pair, when COLMAP's own limits find none.
-        if relaxed:
-            options.mapper.init_min_num_inliers = 40
-            options.mapper.init_min_tri_angle = 4.0
-            options.mapper.abs_pose_min_num_inliers = 20
+    best: list[Any] = []
+    for limits in ({}, LENIENT):
+        for name, limit in limits.items():
+            setattr(options.mapper, name, limit)
         posed = itertools.count(2)
         report("mapping", 0, len(named))
-        output = attempt.folder / "mapping"
-        shutil.rmtree(output, ignore_errors=True)
-        output.mkdir()
         found = colmap.incremental_mapping(
             working,
             images,
-            output,
+            _fresh(attempt.folder / "mapping"),
             options,
             next_image_callback=lambda posed=posed: report(
                 "mapping", min(next(posed), len(named)), len(named)
             ),
         )
         models = [m for m in found.values() if m.num_reg_images() >= MIN_PHOTOS]
-        if models:
+        models.sort(key=lambda m: (m.num_reg_images(), m.num_points3D()), reverse=True)
+        if models and (not best or models[0].num_reg_images() > best[0].num_reg_images()):
+            best = models
+        if best and best[0].num_reg_images() == len(named):
             break
-    if not models:
+    if not best:
         with colmap.Database.open(str(working)) as database:
             inliers = np.array(database.read_two_view_geometry_num_inliers()[1])
         raise ValueError(
@@ -478,13 +493,77 @@ def _map(
             f"({(inliers >= options.min_num_matches).sum()} pairs of photos match); expected photos of one textured "
             f"place that overlap by half or more: {some(list(named))}"
         )
-    largest = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()))
-    whole = _fresh(attempt.folder / "model")
-    largest.write_binary(str(whole))
-    choose_lens(colmap, whole, lens).write_binary(str(whole))
-    shutil.rmtree(folder / "model", ignore_errors=True)
-    os.replace(whole, folder / "model")
+    kept: list[Any] = []
+    for model in best:
+        if not kept or not _names(model) <= set().union(*map(_names, kept)):
+            kept.append(model)
+    for model in kept[1:]:
+        both = _joined(colmap, kept[0], model, (working, images, options), _fresh(attempt.folder / "joined"))
+        if both is not None:
+            kept = [both, *(other for other in kept[1:] if other is not model)]
+    pieces: list[list[str]] = []
+    for old in folder.glob("model*"):
+        shutil.rmtree(old)
+    for model in kept:
+        names = sorted(_names(model).difference(*pieces))
+        if len(names) < MIN_PHOTOS:
+            continue
+        whole = _fresh(attempt.folder / "model")
+        model.write_binary(str(whole))
+        if not pieces:
+            choose_lens(colmap, whole, lens).write_binary(str(whole))
+        pieces.append(names)
+        os.replace(whole, folder / ("model" if len(pieces) == 1 else f"model-{len(pieces)}"))
     report("mapping", len(named), len(named))
+    return pieces
+
+
+def _names(model: Any) -> set[str]:
+    """Names of the posed photos of a model."""
+    return {image.name for image in model.images.values() if image.has_pose}
+
+
+def _joined(
+    colmap: ModuleType, model: Any, other: Any, source: tuple[Path, Path, Any], scratch: Path
+) -> Any | None:
+    """``model`` with the photos of ``other`` (which is moved), where they agree on points of a photo that both have; None
+    elsewhere.
+
+    Args:
+        source: matches, photos and options of the mapping.
+    """
+    pairs = []
+    for point in other.points3D.values():
+        seen = [e for e in point.track.elements if model.exists_image(e.image_id)]
+        there = [model.images[e.image_id].points2D[e.point2D_idx] for e in seen]
+        same = [p.point3D_id for p in there if p.has_point3D()][:1]
+        pairs += [(point.xyz, model.points3D[key].xyz) for key in same]
+    if len(pairs) < FEWEST_MATCHES:
+        return None
+    ours, theirs = np.array(pairs).transpose(1, 0, 2)
+    right = np.full(len(pairs), True)
+    for _ in range(SHARED_ROUNDS):
+        scale, rotation, shift = fit_similarity(ours[right], theirs[right])
+        error = np.linalg.norm(scale * ours @ rotation.T + shift - theirs, axis=1)
+        right = error <= 3 * np.median(error)
+    if np.median(error) > SHARED_ERROR * np.ptp(theirs, axis=0).max():
+        return None
+    other.transform(colmap.Sim3d(scale, colmap.Rotation3d(rotation), shift))
+    both = colmap.Reconstruction()
+    for part in (model, other):
+        for key, camera in part.cameras.items():
+            if not both.exists_camera(key):
+                both.add_camera_with_trivial_rig(camera)
+        for key, image in part.images.items():
+            if image.has_pose and not both.exists_image(key):
+                bare = colmap.Image(name=image.name, camera_id=image.camera_id, image_id=key)
+                both.add_image_with_trivial_frame(bare, image.cam_from_world())
+    both = colmap.triangulate_points(both, *source[:2], scratch, options=source[2])
+    adjustment = colmap.BundleAdjustmentOptions()
+    adjustment.ceres.solver_options.num_threads = 1  # as in _map
+    colmap.bundle_adjustment(both, adjustment)
+    both.extract_colors_for_all_images(str(source[1]))
+    return both
 
 
 def _fresh(folder: Path) -> Path:

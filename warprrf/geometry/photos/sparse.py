@@ -36,6 +36,7 @@ class SparseModel:
         track_camera: photos (position in ``list(cameras)``) that see the points, shape ``(sum of track lengths,)``.
         unposed: names of the photos that no pose was found for, or that lie in a smaller, separate model.
         causes: why each of these has no pose, by name, where that is known.
+        pieces: names of the photos of each model that shares no view with the others; ``cameras`` are those of the first.
         metric: whether lengths are metres.
         upright: whether z is up.
         scale_rms_m: rms distance between surveyed and reconstructed camera positions after alignment [m], else NaN.
@@ -53,6 +54,7 @@ class SparseModel:
     track_camera: np.ndarray
     unposed: tuple[str, ...] = ()
     causes: Mapping[str, str] = field(default_factory=dict)
+    pieces: tuple[tuple[str, ...], ...] = ()
     metric: bool = False
     upright: bool = False
     scale_rms_m: float = float("nan")
@@ -79,6 +81,24 @@ class SparseModel:
             track_start=np.concatenate([[0], np.cumsum(length)]),
             track_camera=self.track_camera[seen],
         )
+
+
+def posed_in_words(sparse: SparseModel) -> str:
+    """How many photos were posed, and between which more are missing; empty where all were."""
+    if not sparse.unposed:
+        return ""
+    order = sorted((*sparse.cameras, *sparse.unposed))
+    said = f"photos: {len(sparse.cameras)} of {len(order)} posed"
+    if len(sparse.pieces) < 2:
+        return f"{said}; without a pose: {some(sparse.unposed)}"
+    main, gaps = [order.index(name) for name in sparse.cameras], []
+    for piece in sparse.pieces[1:]:
+        near = min((abs(k - m), m, k) for k in map(order.index, piece) for m in main)
+        gaps.append(" and ".join(order[k] for k in sorted(near[1:])))
+    return (
+        f"{said} in the largest of {len(sparse.pieces)} pieces that share no view: "
+        f"add photos between {'; between '.join(gaps)}"
+    )
 
 
 def align_to_known(sparse: SparseModel, known_positions: Mapping[str, ArrayLike]) -> SparseModel:
@@ -113,7 +133,8 @@ def known_similarity(
     usable = {n: p for n, p in zip(names, known_positions.values(), strict=True) if n in cameras}
     if len(usable) < 3:
         raise ValueError(
-            f"known_positions: only {len(usable)} of the surveyed photos were posed, expected at least 3; "
+            f"known_positions: {len(cameras)} of {len(cameras) + len(unposed)} photos were posed, but only {len(usable)} of "
+            "the surveyed ones, expected at least 3; "
             f"without pose: {some(lost)}"
         )
     source = np.array([cameras[n].position for n in usable])

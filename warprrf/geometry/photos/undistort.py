@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count, check_number, check_positive, checked
+from warprrf.checks import check_array, check_choice, check_count, check_number, check_positive, checked
 from warprrf.device import require
 from warprrf.geometry.photos.photo_files import mask_beside, mask_name, open_photo, turns_of
 from warprrf.geometry.splats.camera import Camera
@@ -61,8 +61,7 @@ class Lens:
     coefficients: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.model not in COEFFICIENTS:
-            raise ValueError(f"model: got {self.model!r}, expected one of {', '.join(COEFFICIENTS)}")
+        check_choice("model", self.model, COEFFICIENTS)
         for name in ("width", "height"):
             check_count(name, getattr(self, name))
         for name in ("fx", "fy"):

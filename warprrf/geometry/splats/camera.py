@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from warprrf.checks import (
     check_array,
+    check_choice,
     check_count,
     check_number,
     check_positive,
@@ -51,8 +52,7 @@ class Camera:
     cy: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"kind: got {self.kind!r}, expected one of {', '.join(KINDS)}")
+        check_choice("kind", self.kind, KINDS)
         checked: dict[str, object] = {
             "width": check_count("width", self.width),
             "height": check_count("height", self.height),

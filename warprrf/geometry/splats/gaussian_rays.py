@@ -20,7 +20,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count, checked
+from warprrf.checks import check_array, check_choice, check_count, checked
 from warprrf.device import DeviceLike, active_tape, gradient, launch, record, resolve
 from warprrf.geometry.rays import check_rows
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -203,8 +203,7 @@ class GaussianRays:
     ) -> tuple[Traced, Callable[[], None]]:
         start, toward = _pairs("origins", origins, "directions", directions)
         places = check_count("k", k)
-        if order not in ORDERS:
-            raise ValueError(f"order: got {order!r}, expected one of {', '.join(ORDERS)}")
+        check_choice("order", order, ORDERS)
         still = int(np.count_nonzero(np.linalg.norm(toward, axis=1) == 0))
         if still:
             raise ValueError(f"directions: got {still} of length zero, expected directions")

@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count, checked
+from warprrf.checks import check_array, check_choice, check_count, checked
 from warprrf.device import DeviceLike, active_tape, gradient, launch, record, resolve
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -62,8 +62,7 @@ class Blending:
             value = getattr(self, name)
             if not low < value <= high:
                 raise ValueError(f"{name}: got {value!r}, expected a number in ({low}, {high}]")
-        if self.rule not in RULES:
-            raise ValueError(f"rule: got {self.rule!r}, expected one of {sorted(RULES)}")
+        check_choice("rule", self.rule, RULES)
 
     @property
     def rules(self) -> Rules:

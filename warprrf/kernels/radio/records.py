@@ -1,13 +1,14 @@
 """Power of path records and its logarithmic slopes: the one place where an interaction is written down.
 
 A record is a power that geometry fixes and up to :data:`MOST` interactions from the transmitter to the receiver. Mirrors
-multiply Jones matrices in (TE, TM), real because half-spaces have no phase but their sign (ITU-R P.2040-4, eqs. (37a),
-(37b)); between two of them the axes turn. One interaction may be rough, which leaves light unpolarised: a surface that
-scatters, after Degli-Esposti et al. (2007), or an element that sends what it got of others. All records of a table have
-the same sequence, so its rough interaction stands in one column.
+and slabs multiply Jones matrices in (TE, TM), real: half-spaces have no phase but their sign (ITU-R P.2040-4, eqs. (37a),
+(37b)), and of slabs the sizes of both fields count. Between two of them the axes turn. One interaction may be rough, which
+leaves light unpolarised: a surface that scatters, after Degli-Esposti et al. (2007), or an element that sends what it got
+of others. All records of a table have it in the same column.
 
-Angles of a mirror: cosine of incidence, turn of the plane of incidence [rad]; of a scattering surface: cosines of incidence
-and of scattering, and that of the angle to the mirror direction.
+Angles of a mirror: cosine of incidence, turn of the plane of incidence [rad]; of a slab these, and its thickness in
+wavelengths if it has one of its own, else 0; of a scattering surface: cosines of incidence and of scattering, and that of
+the angle to the mirror direction.
 """
 
 from types import SimpleNamespace
@@ -17,10 +18,11 @@ import warp as wp
 
 from warprrf.cache import once
 
-MOST = 3
+MOST = 7
 """Interactions on a record at most."""
-SCATTER, SOURCE = 1, 2
-"""Kinds of a rough interaction: a surface that scatters, an element that sends."""
+MIRROR, SCATTER, SLAB, SOURCE = 1, 2, 4, 16
+"""Kinds of interactions, as far as it has them Sionna RT's: a mirror, a surface that scatters, a slab that is passed, an element
+that sends. 0 for none."""
 MOMENTS = 3
 """Components that a family of Fresnel curves is resolved into."""
 
@@ -33,14 +35,16 @@ def build(real: type) -> Any:
 
     @wp.struct
     class Materials:
-        """Rows are materials: lobe weights, epsilon_r - 1, mirrored share, slope of ln even reflection to ln(epsilon_r - 1),
-        1 where lobes are reciprocal; if ``slab`` is 1, complex permittivity and thickness in wavelengths;
-        ``scale`` is a table over the cosine for each lobe; ``row`` and ``side_row`` are the material of each group and
-        of each element's side, ``radiance`` what that sends."""
+        """Rows are materials: lobe weights, epsilon_r - 1, mirrored share, share let through, slope of ln even reflection to
+        ln(epsilon_r - 1), 1 where lobes are reciprocal; ``scale`` is a table over the cosine for each lobe; ``row`` and
+        ``side_row`` are the material of each group and of each element's side, ``radiance`` what that sends. Of groups:
+        complex permittivity, 0 where it is not known, and thickness in wavelengths; slabs are of these, and mirrors too if
+        ``slab`` is 1."""
 
         weight: wp.array2d(dtype=real)
         excess: wp.array(dtype=real)
         mirror: wp.array(dtype=real)
+        through: wp.array(dtype=real)
         even_slope: wp.array(dtype=real)
         row: wp.array(dtype=wp.int32)
         side_row: wp.array(dtype=wp.int32)
@@ -55,14 +59,23 @@ def build(real: type) -> Any:
     @wp.struct
     class Table:
         """Records of one sequence: power without interactions; group of each interaction, side of an element where it
-        sends, -1 for none; angles; column and kind of the rough one; half the cosine's stretch that a ray stands for."""
+        sends, -1 for none; angles; kinds, one row for each or one for all; column of the rough one; half the cosine's
+        stretch that a ray stands for."""
 
         power: wp.array(dtype=real)
         index: wp.array2d(dtype=wp.int32)
         angle: wp.array2d(dtype=vec3)
+        kind: wp.array2d(dtype=wp.int32)
         rough: int
-        kind: int
         half_width: real
+
+    @wp.func
+    def kind_of(t: Table, i: int, k: int):
+        """Kind of interaction k of record i; 0 past the last."""
+        found = int(0)
+        if k < t.kind.shape[1]:
+            found = t.kind[wp.min(i, t.kind.shape[0] - 1), k]
+        return found
 
     @wp.func
     def half_space(x: real, c: real):
@@ -92,8 +105,9 @@ def build(real: type) -> Any:
         return times(a, vec2(b[0], -b[1])) / wp.length_sq(b)
 
     @wp.func
-    def slab(eta: vec2, thickness: real, c: real):
-        """Size of the reflection (TE, TM) of a slab of ``thickness`` wavelengths. ITU-R P.2040-4, eqs. (37), (43a), (44)."""
+    def slab(eta: vec2, thickness: real, c: real, through: int):
+        """Size of the reflection (TE, TM) of a slab of ``thickness`` wavelengths, or of what it lets ``through``. ITU-R P.2040-4,
+        eqs. (37), (43), (44)."""
         a = eta - vec2(real(1.0) - c * c, real(0.0))
         size = wp.length(a)
         root = vec2(
@@ -102,10 +116,11 @@ def build(real: type) -> Any:
         )
         if a[1] < real(0.0):
             root = vec2(root[0], -root[1])
-        echo = vec2(real(0.0), real(0.0))  # a half-space sends none back
+        once = vec2(real(0.0), real(0.0))  # nothing comes back from, or through, a half-space
         if not wp.isinf(thickness):
-            q = real(12.566370614359172) * thickness * root
-            echo = wp.exp(q[1]) * vec2(wp.cos(q[0]), -wp.sin(q[0]))
+            q = real(6.283185307179586) * thickness * root
+            once = wp.exp(q[1]) * vec2(wp.cos(q[0]), -wp.sin(q[0]))
+        echo = times(once, once)
         one = vec2(real(1.0), real(0.0))
         found = vec2()
         for k in range(2):
@@ -113,30 +128,62 @@ def build(real: type) -> Any:
             if k == 1:
                 near = c * eta
             face = over(near - root, near + root)
-            found[k] = wp.length(over(times(face, one - echo), one - times(times(face, face), echo)))
+            wave = times(face, one - echo)
+            if through == 1:
+                wave = times(one - times(face, face), once)
+            found[k] = wp.length(over(wave, one - times(times(face, face), echo)))
         return found
 
     @wp.func
     def reflection(m: Materials, x: real, row: int, c: real):
         """Reflection (TE, TM) of a material: of a half-space with its sign; of a slab its size, as one mirror needs."""
         if m.slab == 1:
-            return slab(m.permittivity[row], m.thickness[row], c)
+            return slab(m.permittivity[row], m.thickness[row], c, 0)
         return half_space(x, c)
 
     @wp.func
-    def mirrors(
+    def fields(t: Table, m: Materials, x: real, i: int, k: int):
+        """What interaction k of record i, a mirror or a slab, makes of (TE, TM) but for the share of its material. A slab of which
+        nothing is known lets pass what neither face reflects."""
+        g, angle = t.index[i, k], t.angle[i, k]
+        if kind_of(t, i, k) == wp.static(MIRROR):
+            return reflection(m, x, m.row[g], angle[0])
+        if m.permittivity.shape[0] > 0:
+            if m.permittivity[g][0] > real(0.0):
+                thickness = m.thickness[g]
+                if angle[2] > real(0.0):
+                    thickness = angle[2]
+                return slab(m.permittivity[g], thickness, angle[0], 1)
+        r = half_space(x, angle[0])
+        return vec2(real(1.0) - r[0] * r[0], real(1.0) - r[1] * r[1])
+
+    @wp.func
+    def fields_slope(t: Table, m: Materials, x: real, i: int, k: int):
+        """The derivative of that to ln x."""
+        g, angle = t.index[i, k], t.angle[i, k]
+        rise = half_space_slope(x, angle[0])
+        if kind_of(t, i, k) == wp.static(SLAB):
+            r = half_space(x, angle[0])
+            rise = vec2(real(-2.0) * r[0] * rise[0], real(-2.0) * r[1] * rise[1])
+            if m.permittivity.shape[0] > 0:
+                if m.permittivity[g][0] > real(0.0):
+                    rise = vec2(real(0.0), real(0.0))
+        return rise
+
+    @wp.func
+    def smooth(
         t: Table, m: Materials, excess: wp.array(dtype=real), i: int, begin: int, end: int, raised: int
     ):
-        """Jones matrix of the mirrors in columns ``begin`` to ``end``; of ``raised`` the derivative to ln x."""
+        """Jones matrix of the mirrors and slabs in columns ``begin`` to ``end``; of ``raised`` the derivative to ln x."""
         whole = mat2(real(1.0), real(0.0), real(0.0), real(1.0))
         for k in range(wp.static(MOST)):
             if k >= begin and k < end and k < t.index.shape[1]:
                 g = t.index[i, k]
                 if g >= 0:
                     x = excess[m.row[g]]
-                    r = reflection(m, x, m.row[g], t.angle[i, k][0])
+                    r = fields(t, m, x, i, k)
                     if k == raised:
-                        r = half_space_slope(x, t.angle[i, k][0])
+                        r = fields_slope(t, m, x, i, k)
                     c = wp.cos(t.angle[i, k][1])
                     s = wp.sin(t.angle[i, k][1])
                     whole = wp.diag(r) * (mat2(c, s, -s, c) * whole)
@@ -193,20 +240,24 @@ def build(real: type) -> Any:
         weight: wp.array2d(dtype=real),
         excess: wp.array(dtype=real),
         mirror: wp.array(dtype=real),
+        through: wp.array(dtype=real),
         i: int,
     ):
         """Power of record i."""
-        before = mirrors(t, m, excess, i, 0, t.rough, -1)
-        after = mirrors(t, m, excess, i, t.rough + 1, wp.static(MOST), -1)
+        before = smooth(t, m, excess, i, 0, t.rough, -1)
+        after = smooth(t, m, excess, i, t.rough + 1, wp.static(MOST), -1)
         p = t.power[i] * real(0.5) * wp.ddot(before, before) * real(0.5) * wp.ddot(after, after)
         for k in range(wp.static(MOST)):
             if k != t.rough and k < t.index.shape[1]:
                 if t.index[i, k] >= 0:
-                    p = p * mirror[m.row[t.index[i, k]]]
-        if t.kind == wp.static(SCATTER):
+                    if kind_of(t, i, k) == wp.static(MIRROR):
+                        p = p * mirror[m.row[t.index[i, k]]]
+                    else:
+                        p = p * through[m.row[t.index[i, k]]]
+        if kind_of(t, i, t.rough) == wp.static(SCATTER):
             row = m.row[t.index[i, t.rough]]
             p = p * mixed(t, m, weight, i, row) * unpolarised(m, excess[row], row, t.angle[i, t.rough])
-        if t.kind == wp.static(SOURCE):
+        if kind_of(t, i, t.rough) == wp.static(SOURCE):
             p = p * m.radiance[t.index[i, t.rough]]
         return p
 
@@ -218,11 +269,12 @@ def build(real: type) -> Any:
         weight: wp.array2d(dtype=real),
         excess: wp.array(dtype=real),
         mirror: wp.array(dtype=real),
+        through: wp.array(dtype=real),
         out: wp.array(dtype=real),
     ):
         """Power of each record. What is differentiated stands beside the struct, where Warp's tape sees it."""
         i = offset + wp.tid()
-        out[i] = power_of(t, m, weight, excess, mirror, i)
+        out[i] = power_of(t, m, weight, excess, mirror, through, i)
 
     @wp.kernel(module="unique", enable_backward=False)
     def bin_slopes(
@@ -235,12 +287,12 @@ def build(real: type) -> Any:
         slope: wp.array2d(dtype=real),
     ):
         """Derivatives of the power of each bin's records, ``order[first[b]]`` on, to the logarithms of a material's
-        lobe weights, epsilon_r - 1 and mirrored share, which stand from column ``place`` of it on."""
+        lobe weights, epsilon_r - 1, mirrored share and share let through, which stand from column ``place`` of it on."""
         b = offset + wp.tid()
         lobes = m.exponent.shape[0]
         for s in range(first[b], first[b + 1]):
             i = order[s]
-            p = power_of(t, m, m.weight, m.excess, m.mirror, i)
+            p = power_of(t, m, m.weight, m.excess, m.mirror, m.through, i)
             if p > real(0.0):
                 for k in range(wp.static(MOST)):
                     if k != t.rough and k < t.index.shape[1]:
@@ -251,13 +303,16 @@ def build(real: type) -> Any:
                             if k > t.rough:
                                 begin = t.rough + 1
                                 end = wp.static(MOST)
-                            run = mirrors(t, m, m.excess, i, begin, end, -1)
-                            raised = mirrors(t, m, m.excess, i, begin, end, k)
+                            run = smooth(t, m, m.excess, i, begin, end, -1)
+                            raised = smooth(t, m, m.excess, i, begin, end, k)
                             size = wp.ddot(run, run)
                             if size > real(0.0):
                                 slope[b, column] += real(2.0) * p * wp.ddot(run, raised) / size
-                            slope[b, column + 1] += p
-                if t.kind == wp.static(SCATTER):
+                            if kind_of(t, i, k) == wp.static(MIRROR):
+                                slope[b, column + 1] += p
+                            else:
+                                slope[b, column + 2] += p
+                if kind_of(t, i, t.rough) == wp.static(SCATTER):
                     row = m.row[t.index[i, t.rough]]
                     angle = t.angle[i, t.rough]
                     sum = mixed(t, m, m.weight, i, row)
@@ -271,7 +326,7 @@ def build(real: type) -> Any:
                         r2 = half_space(m.excess[row], angle[1])
                         rise = real(0.5) * (rise + wp.dot(r2, half_space_slope(m.excess[row], angle[1])))
                     slope[b, place[row] + lobes] += p * rise / unpolarised(m, m.excess[row], row, angle)
-                if t.kind == wp.static(SOURCE):
+                if kind_of(t, i, t.rough) == wp.static(SOURCE):
                     row = m.side_row[t.index[i, t.rough]]
                     whole = real(0.0)
                     for j in range(lobes):

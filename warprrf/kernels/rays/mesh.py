@@ -309,6 +309,38 @@ def find_crossings(
     side[i] = first
 
 
+@wp.kernel(enable_backward=False)
+def find_touching(
+    offset: int,
+    bvh: wp.uint64,
+    corners: wp.array2d(dtype=wp.vec3d),
+    points: wp.array(dtype=wp.vec3d),
+    reach: wp.float64,
+    start: wp.array(dtype=wp.int32),
+    count: wp.array(dtype=wp.int32),
+    face: wp.array(dtype=wp.int32),
+):
+    """How many faces have each point within ``reach`` [m] of their plane and of the inner side of each border; and, where
+    ``face`` has room, which, from ``start`` on."""
+    i = offset + wp.tid()
+    p = points[i]
+    around = wp.vec3d(reach, reach, reach)
+    query = wp.bvh_query_aabb(bvh, narrow(p - around), narrow(p + around))
+    found = int(0)
+    j = int(0)
+    while wp.bvh_query_next(query, j):
+        normal = wp.normalize(wp.cross(corners[j, 1] - corners[j, 0], corners[j, 2] - corners[j, 0]))
+        least = reach - wp.abs(wp.dot(normal, p - corners[j, 0]))
+        for k in range(3):
+            across = wp.normalize(wp.cross(normal, corners[j, (k + 1) % 3] - corners[j, k]))
+            least = wp.min(least, wp.dot(across, p - corners[j, k]) + reach)
+        if least >= wp.float64(0.0):
+            if face.shape[0] > 0:
+                face[start[i] + found] = j
+            found += 1
+    count[i] = found
+
+
 @wp.struct
 class OverlapFaces:
     """Faces: corners [m], unit normals, areas [m^2], the part and the group that each is of; and the areas of parts."""

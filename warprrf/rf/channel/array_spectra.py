@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,21 +20,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from warprrf.checks import check_array, check_chosen, check_number, check_positive, check_type, checked
+from warprrf.checks import check_array, check_number, check_positive, check_type, checked
 from warprrf.device import require
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Air
-from warprrf.rf.em.waves import check_frequency
+from warprrf.rf.spectra.readings import PowerTable
 
-MOST_PIXELS = 4_000_000
-"""Larger pictures are refused: NeRF2's have 32,400."""
 UP = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 """Turns an array to lie in x and y and look along z, as a gateway's does."""
 
 
 @checked
 @dataclass(frozen=True, repr=False)
-class ArraySpectra:
+class ArraySpectra(PowerTable):
     """N angular spectra of one array, which stands at ``receivers``.
 
     An array that sends to a single antenna hears the same by reciprocity: give its place as the receiver's.
@@ -59,10 +57,6 @@ class ArraySpectra:
         TypeError, ValueError: naming the argument.
     """
 
-    transmitters: np.ndarray
-    receivers: np.ndarray
-    power: np.ndarray
-    frequency_hz: float
     array: PlanarArray
     directions: np.ndarray
     floor: float = 0.01
@@ -73,43 +67,19 @@ class ArraySpectra:
 
     def __post_init__(self) -> None:
         directions = check_steering(self.array, self.directions)
-        power = check_array("power", self.power, (None, *directions.shape[:-1]), finite=False)
-        count = len(power)
-        if count == 0 or not (np.isnan(power) | (np.isfinite(power) & (power >= 0))).all():
-            raise ValueError(
-                f"power: got {count} spectra, expected one or more of linear powers, NaN where not measured"
-            )
+        fields = self._checked(*directions.shape[:-1])
         floor = check_positive("floor", self.floor)
-        if not (power > floor).any():
+        if not (fields["power"] > floor).any():
             raise ValueError(f"power: got no value above the floor of {floor:g}")
         check_number("length_std_m", self.length_std_m, 0.0)
-        object.__setattr__(self, "frequency_hz", check_frequency(self.frequency_hz))
-        object.__setattr__(self, "power", power)
-        object.__setattr__(self, "directions", directions)
-        for name in ("transmitters", "receivers"):
-            value = check_array(name, getattr(self, name))
-            if value.shape not in ((3,), (count, 3)):
-                raise ValueError(f"{name}: got shape {value.shape}, expected (3,) or ({count}, 3)")
-            object.__setattr__(self, name, np.broadcast_to(value, (count, 3)).copy())
-
-    def __len__(self) -> int:
-        return len(self.power)
+        for name, value in (fields | {"directions": directions}).items():
+            object.__setattr__(self, name, value)
 
     def __repr__(self) -> str:
         size = " x ".join(map(str, self.power.shape[1:]))
         return (
             f"ArraySpectra({len(self)} of {size} directions, {self.array.rows} x {self.array.cols} elements, at "
             f"{self.frequency_hz / 1e9:g} GHz)"
-        )
-
-    def subset(self, rows: ArrayLike) -> ArraySpectra:
-        """Some of the spectra, by index or mask."""
-        chosen = check_chosen("rows", rows, len(self), 1)
-        return replace(
-            self,
-            transmitters=self.transmitters[chosen],
-            receivers=self.receivers[chosen],
-            power=self.power[chosen],
         )
 
     @classmethod
@@ -193,9 +163,7 @@ def check_steering(array: PlanarArray, directions: ArrayLike) -> np.ndarray:
     """
     check_type("array", array, PlanarArray)
     if array.polarisation is not None:
-        raise ValueError(
-            f"array: got polarisation {array.polarisation!r}, expected None: vertical antennas are meant"
-        )
+        raise ValueError(f"array: got polarisation {array.polarisation!r}, expected None: all are vertical")
     found = check_array("directions", directions, (..., 3))
     if found.ndim < 2 or found.size == 0:
         raise ValueError(f"directions: got shape {found.shape}, expected (..., 3)")
@@ -214,15 +182,14 @@ def _number(name: str, folder: Path) -> int:
 def _picture(path: Path, shape: tuple[int, ...] | None) -> np.ndarray:
     """Grey levels of 8 bits as [0, 1]; the header is looked at before anything is decoded."""
     image = require("PIL.Image", extra="mesh")
+    most = 4_000_000  # pixels; NeRF2's have 32,400
     if not path.is_file():
         raise FileNotFoundError(f"path: {path} is missing, though an index names it")
     try:
         with image.open(path, formats=["PNG"]) as opened:
             width, height = opened.size
-            if opened.mode != "L" or width * height > MOST_PIXELS:
-                raise ValueError(
-                    f"got {width} x {height} pixels of mode {opened.mode}, expected grey of 8 bits"
-                )
+            if opened.mode != "L" or width * height > most:
+                raise ValueError(f"got {width} x {height} of mode {opened.mode}, expected grey of 8 bits")
             if shape not in (None, (height, width)):
                 raise ValueError(f"got {height} rows of {width}, expected {shape} as of the first spectrum")
             return np.asarray(opened, np.float32) / np.float32(255.0)
@@ -247,9 +214,7 @@ def _gateway(path: Path) -> tuple[np.ndarray, np.ndarray]:
                 raise ValueError(f"got {len(entries)} of it")
             found.append(check_array(key, [float(value) for value in entries[0].split(",")], (size,)))
         except ValueError as error:
-            raise ValueError(
-                f"path: {path}: expected one gateway with {key}: [{size} numbers] ({error})"
-            ) from error
+            raise ValueError(f"path: {path}: expected one {key}: [{size} numbers] ({error})") from error
     if not np.linalg.norm(found[1]) > 0:
         raise ValueError(f"path: {path}: got an orientation of length zero, expected a quaternion xyzw")
     return found[0], Rotation.from_quat(found[1]).as_matrix()

@@ -70,7 +70,7 @@ class PlanarArray:
             raise ValueError(f"spacing: got {self.spacing!r}, expected one or two positive numbers")
         if isinstance(self.pattern, str) and self.pattern not in PATTERNS:
             raise ValueError(
-                f"pattern: got {self.pattern!r}, expected one of {', '.join(PATTERNS)}, a function or samples"
+                f"pattern: got {self.pattern!r}, expected {', '.join(PATTERNS)}, a function or samples"
             )
         if self.polarisation is not None and self.polarisation not in SLANTS_RAD:
             raise ValueError(
@@ -96,7 +96,7 @@ class PlanarArray:
             return rotation_matrix(value)
         if value.shape != (3, 3) or not np.allclose(value @ value.T, np.eye(3), atol=1e-9):
             raise ValueError(
-                f"orientation: got shape {value.shape}, expected yaw, pitch and roll (3,) or a rotation (3, 3)"
+                f"orientation: got shape {value.shape}, expected three angles (3,) or a rotation (3, 3)"
             )
         if np.linalg.det(value) < 0:
             raise ValueError(

@@ -15,12 +15,6 @@ import numpy as np
 
 from warprrf.checks import check_count, checked
 
-LOW_HZ, HIGH_HZ = 252.72e9, 321.84e9
-"""Edges of the band [Hz]."""
-UNIT_HZ = 2.16e9
-"""All bandwidths are multiples of it [Hz]."""
-_UNITS = (1, 2, 4, 6, 8, 12, 24, 32)  # bandwidths, in units, in the order of the numbering
-
 
 @checked
 @dataclass(frozen=True)
@@ -59,7 +53,7 @@ class ThzChannel:
 
 def _plan() -> dict[int, ThzChannel]:
     plan: dict[int, ThzChannel] = {}
-    for units in _UNITS:
+    for units in (1, 2, 4, 6, 8, 12, 24, 32):  # bandwidths in 2.16 GHz, in the order of the numbering
         for k in range(32 // units):
             number = len(plan) + 1
             # In steps of 10 MHz, so that edges are those of the standard to the last bit.

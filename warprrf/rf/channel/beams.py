@@ -30,9 +30,6 @@ from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.waves import carrier_phase
 from warprrf.rf.spectra.spectrum import Spectrum, directions_from_angles, pixel_directions
 
-MAX_ROUNDS = 20  # of the multi-user search, which ends by itself once no user gains; a few are usual
-_TERMS = 1 << 18  # numbers held at once while paths are summed: what fits a cache
-
 
 @checked
 @dataclass(frozen=True, eq=False)
@@ -304,9 +301,8 @@ def select_beams_multiuser(
         raise ValueError("sources: got none, expected a spectrum or paths for every user")
     served = _search(gains, noise * len(gains))
     received, transmitted = (np.array([served[u][k] for u in range(len(gains))]) for k in (0, 1))
-    return MultiUserChoice(
-        transmitted, received, signal_over_interference(gains, transmitted, received, noise)
-    )
+    sinr = signal_over_interference(gains, transmitted, received, noise)
+    return MultiUserChoice(transmitted, received, sinr)
 
 
 @checked
@@ -344,7 +340,8 @@ def _search(gains: list[np.ndarray], noise: float) -> dict[int, tuple[int, int]]
     """Receiving and transmitting beam of each user, by ascent on the sum of rates."""
     served: dict[int, tuple[int, int]] = {}
     order = sorted(range(len(gains)), key=lambda u: -gains[u].max())
-    for _ in range(1 + MAX_ROUNDS):
+    max_rounds = 20  # of the multi-user search, which ends by itself once no user gains; a few are usual
+    for _ in range(1 + max_rounds):
         before = dict(served)
         for u in order:
             others = {v: pair for v, pair in served.items() if v != u}
@@ -393,9 +390,7 @@ def rays_of(source: Source, tx: Codebook) -> Iterator[Rays]:
         departure = None
         if directed:
             if source.aod is None:
-                raise ValueError(
-                    "source: got a spectrum without aod, expected departure angles with a tx_array"
-                )
+                raise ValueError("source: got a spectrum without aod, expected departures with a tx_array")
             positive &= np.isfinite(source.aod).all(axis=-1)
             departure = directions_from_angles(source.aod[positive][:, 0], source.aod[positive][:, 1])
         yield departure, pixel_directions(source.shape)[positive], power[positive]
@@ -445,7 +440,7 @@ def _unpolarised(name: str, array: PlanarArray) -> None:
         raise TypeError(f"{name}: got {type(array).__name__}, expected a PlanarArray")
     if array.polarisation is not None:
         raise ValueError(
-            f"{name}: got polarisation {array.polarisation!r}, expected None: beams are chosen from powers"
+            f"{name}: got polarisation {array.polarisation!r}, expected None: powers choose beams"
         )
 
 
@@ -460,5 +455,6 @@ def squared(values: np.ndarray) -> np.ndarray:
 
 def chunks(count: int, width: int) -> Iterator[slice]:
     """Stretches of ``count`` paths whose ``width`` numbers each fit a cache together."""
-    step = max(1, _TERMS // max(width, 1))
+    terms = 1 << 18  # numbers held at once while paths are summed: what fits a cache
+    step = max(1, terms // max(width, 1))
     return (slice(k, k + step) for k in range(0, count, step))

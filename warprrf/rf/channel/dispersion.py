@@ -17,12 +17,6 @@ from scipy.optimize import brentq
 from warprrf.checks import check_array, checked, one_line
 from warprrf.rf.channel.path_arrays import PathArrays
 
-COHERENCE = 0.5
-"""Default share of the maximum that defines the coherence bandwidth."""
-
-_STEPS = 16  # trials of the correlation over the shortest period that it can have
-_MOST_PERIODS = 4096  # searched for the first crossing
-
 
 @checked
 @dataclass(frozen=True)
@@ -97,7 +91,7 @@ def angular_spread(power: ArrayLike, angle: ArrayLike) -> np.ndarray:
 
 
 @checked
-def coherence_bandwidth(power: ArrayLike, tau: ArrayLike, level: float = COHERENCE) -> np.ndarray:
+def coherence_bandwidth(power: ArrayLike, tau: ArrayLike, level: float = 0.5) -> np.ndarray:
     """Least frequency shift at which |sum P exp(-j 2 pi shift tau)| falls to ``level`` of sum P [Hz], shape ``(...)``.
 
     inf where it does not within 4096 periods of the longest difference of delays; NaN where there is no power.
@@ -127,16 +121,18 @@ def _first_fall(weight: np.ndarray, tau: np.ndarray, level: float) -> float:
     tau, weight = tau[weight > 0], weight[weight > 0]
     tau = tau - tau.min(initial=np.inf)
     longest = tau.max(initial=0.0)
-    # |R| cannot fall below the strongest weight less all others.
-    if longest == 0.0 or 2.0 * weight.max() - 1.0 > level:
+    # |R| cannot fall below the strongest weight less all others; of delays nearer than that even the squares are zero.
+    if longest < 1e-150 or 2.0 * weight.max() - 1.0 > level:
         return float("inf")
 
     def over(shift: ArrayLike) -> np.ndarray:
         waves = np.exp(-2j * np.pi * np.mod(np.multiply.outer(shift, tau), 1.0))
         return np.abs(waves @ weight) - level
 
-    step = 1.0 / (longest * _STEPS)
-    for begin in range(0, _MOST_PERIODS * _STEPS, 256):
+    steps = 16  # trials of the correlation over the shortest period that it can have
+    step = 1.0 / (longest * steps)
+    most_periods = 4096  # searched for the first crossing
+    for begin in range(0, most_periods * steps, 256):
         shifts = step * np.arange(begin, begin + 257)
         below = np.flatnonzero(over(shifts) <= 0)
         if len(below):

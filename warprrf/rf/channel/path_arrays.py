@@ -13,7 +13,7 @@ traced in a scene with materials, or taken from a solver, have it; spectra and f
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -24,11 +24,14 @@ from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 from warprrf.rf.spectra.spectrum import angles_from_directions, directions_from_angles
 
+MIRROR, SCATTER, SLAB, EDGE = 1, 2, 4, 8
+"""Codes of interactions, those of ``sionna.rt.InteractionType``; 0 for none."""
+_LAST = {"diffuse": SCATTER, "slab": SLAB, "edge": EDGE}
 MOST_PATHS = 10_000_000
 """Longest list that is asked for: 2 GB of a receiver."""
-_PADDING: dict[str, Any] = {
+PADDING: dict[str, Any] = {
     "gain": 0.0, "tau": np.nan, "theta_r": np.nan, "phi_r": np.nan, "theta_t": np.nan, "phi_t": np.nan,
-    "vertices": np.nan, "kind": "", "valid": False, "jones": 0.0,
+    "vertices": np.nan, "kind": "", "valid": False, "jones": 0.0, "interactions": 0,
 }  # fmt: skip
 """Arrays with an entry for each path, and what they hold where there is none."""
 
@@ -47,7 +50,8 @@ class PathArrays:
         theta_t: Zenith of departure [rad].
         phi_t: Azimuth of departure [rad].
         vertices: Interaction points from the transmitter on [m], shape ``(..., depth, 3)``; NaN past the last.
-        kind: "los", "mirror" (of Sionna RT's also paths through walls and round edges) or "diffuse"; "" where padded.
+        kind: "los", "mirror", "slab" (through walls, and mirrors perhaps), "edge" (over an edge, too) or "diffuse"; "" where
+            padded.
         valid: Whether there is a path.
         jones: Polarised complex gain, shape ``(..., 2, 2)``: received over transmitted, both along zenith and azimuth
             unit vectors; NaN for paths without, None if no path has it. 0 where padded.
@@ -55,6 +59,8 @@ class PathArrays:
         transmitter: Position [m], shape ``(3,)``, or of each receiver ``(R, 3)``; None if not known.
         receiver: Position ``(3,)`` or positions ``(R, 3)`` [m]; None if not known.
         air: The air whose absorption (ITU-R P.676) is in ``gain`` and ``jones``; None for none.
+        interactions: What happens at each of ``vertices``, shape ``(..., depth)``, int8: 1 mirror, 2 scatter, 4 transmission, 8
+            diffraction, 0 past the last. Where not given, ``kind`` is what happens last, after mirrors.
     """
 
     __repr__ = one_line
@@ -73,6 +79,23 @@ class PathArrays:
     transmitter: np.ndarray | None = None
     receiver: np.ndarray | None = None
     air: Air | None = None
+    interactions: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))
+
+    def __post_init__(self) -> None:
+        if self.interactions.size == 0:
+            there = np.isfinite(self.vertices[..., 0])
+            codes, last = (
+                np.where(there, MIRROR, 0),
+                np.cumsum(there, axis=-1) == there.sum(-1, keepdims=True),
+            )
+            for kind, code in _LAST.items():
+                codes[there & last & (self.kind == kind)[..., None]] = code
+            object.__setattr__(self, "interactions", codes.astype(np.int8))
+        elif self.interactions.shape != self.vertices.shape[:-1]:
+            raise ValueError(
+                f"interactions: got shape {self.interactions.shape}, expected {self.vertices.shape[:-1]}, one for each of "
+                "vertices"
+            )
 
     @property
     def power(self) -> np.ndarray:
@@ -127,7 +150,7 @@ class PathArrays:
 
     def _taken(self, index: int | slice | np.ndarray) -> Self:
         """Every array at ``index``."""
-        arrays: dict[str, Any] = {name: getattr(self, name) for name in _PADDING}
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in PADDING}
         taken: dict[str, Any] = {name: None if v is None else v[index] for name, v in arrays.items()}
         return replace(self, **taken)
 
@@ -238,14 +261,18 @@ class PathArrays:
         kind: NDArray[np.str_],
         frequency_hz: float,
         jones: np.ndarray | None = None,
+        excess_m: np.ndarray | float = 0.0,
+        interactions: np.ndarray | None = None,
     ) -> Self:
-        """:meth:`from_points` of arrays that fit each other; ``jones`` (L, 2, 2) is complex, before exp(-j 2 pi f tau) too."""
+        """:meth:`from_points` of arrays that fit each other; ``jones`` (L, 2, 2) is complex, before exp(-j 2 pi f tau) too;
+        slabs make paths longer than they are by ``excess_m`` (L,)."""
         count, depth = vertices.shape[:2]
         bounces = np.isfinite(vertices[..., 0]).sum(axis=1)
         points = points_along(transmitter, vertices, receiver)
         each = np.arange(count)
         steps = np.linalg.norm(np.diff(points, axis=1), axis=2)
-        tau = np.where(np.arange(depth + 1) <= bounces[:, None], steps, 0.0).sum(axis=1) / SPEED_OF_LIGHT
+        length = np.where(np.arange(depth + 1) <= bounces[:, None], steps, 0.0).sum(axis=1)
+        tau = (length + excess_m) / SPEED_OF_LIGHT
         theta_r, phi_r = angles_from_directions(points[each, bounces] - receiver)
         theta_t, phi_t = angles_from_directions(points[:, 1] - transmitter)
         turned = carrier_phase(frequency_hz, tau)
@@ -263,6 +290,7 @@ class PathArrays:
             frequency_hz=float(frequency_hz),
             transmitter=np.array(transmitter, dtype=np.float64),
             receiver=np.array(receiver, dtype=np.float64),
+            interactions=np.zeros(0, np.int8) if interactions is None else interactions,
         )
 
     @classmethod
@@ -282,7 +310,7 @@ class PathArrays:
         _check_parts(parts)
         length = max(check_count("length", length, 0, MOST_PATHS), *(len(p.gain) for p in parts))
         stacked: dict[str, Any] = {
-            name: np.stack([_padded(a, 0, length, _PADDING[name]) for a in arrays])
+            name: np.stack([_padded(a, 0, length, PADDING[name]) for a in arrays])
             for name, arrays in _columns(parts).items()
         }
         receiver = None
@@ -316,9 +344,10 @@ def _check_parts(parts: Sequence[PathArrays]) -> None:
 
 def _columns(parts: Sequence[PathArrays]) -> dict[str, list[np.ndarray]]:
     """The arrays of all parts by name, equally deep; without ``jones`` if no part has it, NaN for those that lack it."""
-    columns = {name: [getattr(p, name) for p in parts] for name in _PADDING}
+    columns = {name: [getattr(p, name) for p in parts] for name in PADDING}
     depth = max((v.shape[1] for v in columns["vertices"]), default=1)
-    columns["vertices"] = [_padded(v, 1, depth, np.nan) for v in columns["vertices"]]
+    for name in ("vertices", "interactions"):
+        columns[name] = [_padded(v, 1, depth, PADDING[name]) for v in columns[name]]
     known = columns.pop("jones")
     if any(jones is not None for jones in known):
         columns["jones"] = [

@@ -28,15 +28,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import eigh
 
-from warprrf.checks import check_array, check_positive, checked
+from warprrf.checks import check_array, check_choice, check_positive, checked
 from warprrf.rf.channel.beams import Ends, Source, chunks, codebook_of, rays_of, squared
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.spectra.spectrum import Spectrum
 
 METHODS = ("mr", "zf", "slnr")
-LEAST_APART = 1e-9
-"""Least singular value of unit channels, relative to the largest, for users that zero forcing can still part."""
-ROUNDING = 1e-13
 
 
 @checked
@@ -95,8 +92,7 @@ def precoders(channels: ArrayLike, method: str = "slnr", *, noise: float) -> np.
         ValueError: naming the argument; for a user without power, and for "zf" with more users than elements or users
             whose channels are linearly dependent.
     """
-    if method not in METHODS:
-        raise ValueError(f"method: got {method!r}, expected one of {', '.join(METHODS)}")
+    check_choice("method", method, METHODS)
     check_positive("noise", noise, "share of the transmitted power")
     h = _checked(channels)
     if h.ndim == 2:
@@ -128,9 +124,7 @@ def precoded_sinr(channels: ArrayLike, weights: ArrayLike, *, noise: float) -> n
     h = _checked(channels, allow_dark=True)
     w = np.asarray(weights, dtype=complex)
     if w.shape != h.shape[:2] or not (np.isfinite(w).all() and w.any(axis=1).all()):
-        raise ValueError(
-            f"weights: got shape {w.shape}, expected finite ones of shape {h.shape[:2]}, none zero"
-        )
+        raise ValueError(f"weights: got shape {w.shape}, expected finite ones {h.shape[:2]}, none zero")
     w = _unit(w)
     if h.ndim == 2:
         heard = squared(h @ w.T)
@@ -145,7 +139,7 @@ def _leakage(covariances: np.ndarray, floor: float) -> np.ndarray:
     count, size = covariances.shape[:2]
     everything = covariances.sum(axis=0)
     # Below rounding of what leaks the matrix of leakage is singular; noise so far down changes nothing.
-    floor = max(floor, ROUNDING * float(np.abs(everything).max()))
+    floor = max(floor, 1e-13 * float(np.abs(everything).max()))
     found = np.empty((count, size), dtype=complex)
     for u, own in enumerate(covariances):
         leaked = everything - own + floor * np.eye(size)
@@ -157,8 +151,9 @@ def _apart(best: np.ndarray) -> np.ndarray:
     """The unit vectors nearest to ``best`` (U, N), each orthogonal to all the others."""
     users, size = best.shape
     left, singular, right = np.linalg.svd(best.conj(), full_matrices=False)
-    if users > size or singular[-1] < LEAST_APART * singular[0]:
-        rank = int((singular >= LEAST_APART * singular[0]).sum())
+    least_apart = 1e-9  # least singular value, over the largest, of users that can still be parted
+    if users > size or singular[-1] < least_apart * singular[0]:
+        rank = int((singular >= least_apart * singular[0]).sum())
         raise ValueError(
             f"method: 'zf' cannot part {users} users by {size} elements, whose channels have rank {rank}; expected "
             "linearly independent ones, or method 'slnr'"
@@ -180,7 +175,5 @@ def _checked(channels: ArrayLike, allow_dark: bool = False) -> np.ndarray:
             raise ValueError("channels: got covariances that are not Hermitian")
     dark = np.flatnonzero(~h.reshape(len(h), -1).any(axis=1))
     if len(dark) and not allow_dark:
-        raise ValueError(
-            f"channels: users {dark.tolist()} get no power; expected some for all, leave them out"
-        )
+        raise ValueError(f"channels: users {dark.tolist()} get no power; leave them out")
     return h

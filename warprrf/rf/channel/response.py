@@ -34,7 +34,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count, check_positive, check_seed
+from warprrf.checks import check_array, check_choice, check_count, check_positive, check_seed
 from warprrf.rf.channel.arrays import ISOTROPIC, SLANTS_RAD, PlanarArray
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.channel.sums import (
@@ -50,12 +50,6 @@ from warprrf.rf.channel.sums import (
 )
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
-
-DENSE_TERMS = 1e6
-"""``method="auto"`` sums more terms than that (pairs x paths x frequencies) on a grid."""
-
-_EVEN = 1e-9  # frequencies are equally spaced if they are so to this share of their step
-_SERIES = 1e-8  # where the series of the air's frequency dependence is cut
 
 
 class LinkOptions(TypedDict, total=False):
@@ -93,7 +87,7 @@ def frequency_response(
     Args:
         amplitude: "carrier", or "friis" for the factor carrier / f.
         method: "dense", exact to rounding; "grid" for equally spaced frequencies, errs by about 1e-7 of the root of the
-            paths' power; "auto" takes the grid where the dense sum has more than :data:`DENSE_TERMS` terms.
+            paths' power; "auto" takes the grid where the dense sum has more than a million terms (pairs x paths x frequencies).
         **link: See :class:`LinkOptions`.
 
     Returns:
@@ -105,11 +99,9 @@ def frequency_response(
     """
     f = check_array("frequencies_hz", frequencies_hz, (None,))
     if not (len(f) and (f > 0).all()):
-        raise ValueError(
-            "frequencies_hz: expected at least one, all positive (absolute, not about the carrier)"
-        )
-    _choice("amplitude", amplitude, ("carrier", "friis"))
-    _choice("method", method, ("auto", "dense", "grid"))
+        raise ValueError("frequencies_hz: expected some, all positive (absolute, not about the carrier)")
+    check_choice("amplitude", amplitude, ("carrier", "friis"))
+    check_choice("method", method, ("auto", "dense", "grid"))
     even = len(f) >= LEAST_FREQUENCIES and _evenly_spaced(f)
     if method == "grid" and not even:
         raise ValueError(
@@ -117,7 +109,7 @@ def frequency_response(
         )
     found = []
     for one in _links(paths, **link):
-        many = one.ports[0] * one.ports[1] * len(one.tau) * len(f) > DENSE_TERMS
+        many = one.ports[0] * one.ports[1] * len(one.tau) * len(f) > 1e6
         gridded = method == "grid" or (method == "auto" and even and many)
         h = np.zeros((*one.ports, len(f)), dtype=complex)
         for index, ports, job in one.jobs():
@@ -297,9 +289,9 @@ def _links(
     normalize_delays: bool = False,
 ) -> Iterator[_Link]:
     """The link of each receiver; :class:`LinkOptions` says what the options mean."""
-    _choice("wave", wave, ("plane", "spherical"))
+    check_choice("wave", wave, ("plane", "spherical"))
     if diffuse is not None:
-        _choice("diffuse", diffuse, ("random_phase", "power", "given"))
+        check_choice("diffuse", diffuse, ("random_phase", "power", "given"))
     elif (paths.valid & (paths.kind == "diffuse")).any():
         raise ValueError(
             "diffuse: got None with diffuse paths, which have no phase; expected 'random_phase' (with a seed), 'power' "
@@ -361,13 +353,13 @@ def _response(
 
 
 def _gridded_with_air(job: Sum, f: np.ndarray, loss: np.ndarray, length_m: np.ndarray) -> np.ndarray:
-    """exp(-loss L) as a series in L about its middle: one gridded sum a term."""
+    """exp(-loss L) as a series in L about its middle, cut at 1e-8: one gridded sum a term."""
     middle = 0.5 * (length_m.min() + length_m.max())
     reach = max(0.5 * float(np.ptp(length_m)), 1e-12)
     size = reach * np.abs(loss).max()
     about = (length_m - middle) / reach
     total, k = np.zeros((*job.shape, len(f)), dtype=complex), 0
-    while size**k / factorial(k) > _SERIES:
+    while size**k / factorial(k) > 1e-8:
         part = gridded_sum(replace(job, amplitude=job.amplitude * about**k), f)
         total += part * ((-loss * reach) ** k / factorial(k))
         k += 1
@@ -392,14 +384,8 @@ def _amplitudes(paths: PathArrays, tx: PlanarArray, rx: PlanarArray) -> np.ndarr
     return np.einsum("apx,pxy,bpy->abp", received, paths.jones, transmitted)
 
 
-def _choice(name: str, value: object, allowed: tuple[str, ...]) -> None:
-    if value not in allowed:
-        raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(allowed)}")
-
-
 def _evenly_spaced(f: np.ndarray) -> bool:
     step = np.diff(f)
     mean = (f[-1] - f[0]) / (len(f) - 1)
-    return mean != 0 and bool(
-        np.abs(step - mean).max() <= max(_EVEN * abs(mean), 4e-16 * np.abs(f).max() * 4)
-    )
+    even = 1e-9  # frequencies are equally spaced if they are so to this share of their step
+    return mean != 0 and bool(np.abs(step - mean).max() <= max(even * abs(mean), 4e-16 * np.abs(f).max() * 4))

@@ -33,11 +33,9 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 
 TAPS = 8
 """Cells that a path is spread to."""
-OVERSAMPLING = 2
 LEAST_FREQUENCIES = 2 * TAPS
 """Fewer frequencies are summed densely: the window would wrap round the grid."""
 
-_BETA = 2.3 * TAPS  # width of the window for this oversampling: Barnett et al., eq. (1.8)
 _BLOCK = 4_000_000  # numbers that an intermediate array may hold, about
 
 
@@ -66,11 +64,6 @@ class PairLengths:
         """Whether a length is that of a receiving element plus that of a transmitting one."""
         return len(self.target) == 1
 
-    @property
-    def alone(self) -> bool:
-        """Whether there is one element at either end, at the centre."""
-        return len(self.place) == 1 and len(self.extra) == 1
-
     def received(self) -> tuple[np.ndarray, np.ndarray]:
         """Of separable ones: length [m] that receiving elements add, ``(M, P)``, and factor of amplitudes."""
         if not self.spherical:
@@ -79,10 +72,7 @@ class PairLengths:
         return reach - far, far / reach
 
     def longer(self) -> tuple[np.ndarray, np.ndarray]:
-        """Added length [m] and factor of amplitudes, each ``(M, N, P)``."""
-        if self.separable:
-            added, ratio = self.received()
-            return added[:, None] + self.extra, ratio[:, None] * self.scale
+        """Of others: added length [m] and factor of amplitudes, each ``(M, N, P)``."""
         reach, far = self._reach(self.target, self.place[:, None, None])
         return self.extra + (reach - far), self.scale * (far / reach)
 
@@ -123,7 +113,7 @@ class Sum:
     @property
     def own_delays(self) -> bool:
         """Whether pairs of elements have delays of their own."""
-        return self.squint and not self.lengths.alone
+        return self.squint and self.shape != (1, 1)
 
     def blocks(self, per_pair: int) -> Iterator[tuple[slice, slice, Sum]]:
         """The sum in pieces of elements whose ``per_pair`` numbers a pair are held at once."""
@@ -200,16 +190,16 @@ def gridded_sum(job: Sum, frequencies_hz: np.ndarray) -> np.ndarray:
     harmonic = np.arange(count) - count // 2
     middle_hz = frequencies_hz[count // 2]
     step_hz = (frequencies_hz[-1] - frequencies_hz[0]) / (count - 1)
-    cells = scipy.fft.next_fast_len(OVERSAMPLING * count)
+    oversampling = 2
+    cells = scipy.fft.next_fast_len(oversampling * count)
     amplitude = job.amplitude * carrier_phase(middle_hz - job.carrier_hz, job.tau)
     correction = 1.0 / _window_transform(harmonic / cells)
     out = np.empty((*job.shape, count), dtype=complex)
     for m, n, block in job.blocks(max(cells, paths * (TAPS if job.own_delays else 1))):
         factor, longer = block.pairs(middle_hz if job.squint else job.carrier_hz)
         delay = job.tau + longer / SPEED_OF_LIGHT if job.own_delays else job.tau
-        grid = _spread(
-            step_hz * cells * delay.reshape(-1, paths), (amplitude * factor).reshape(-1, paths), cells
-        )
+        place = step_hz * cells * delay.reshape(-1, paths)
+        grid = _spread(place, (amplitude * factor).reshape(-1, paths), cells)
         waves = scipy.fft.fft(grid, axis=1, workers=threads(), overwrite_x=True)
         out[m, n] = (waves[:, harmonic] * correction).reshape(*factor.shape[:2], count)
     return out
@@ -237,7 +227,8 @@ def _spread(place: np.ndarray, values: np.ndarray, cells: int) -> np.ndarray:
 def _window(x: np.ndarray) -> np.ndarray:
     """The window at ``x`` cells from its middle; nothing outside."""
     z = 1.0 - (2.0 / TAPS * x) ** 2
-    return np.where(z > 0.0, np.exp(_BETA * (np.sqrt(np.maximum(z, 0.0)) - 1.0)), 0.0)
+    beta = 2.3 * TAPS  # width of the window for this oversampling: Barnett et al., eq. (1.8)
+    return np.where(z > 0.0, np.exp(beta * (np.sqrt(np.maximum(z, 0.0)) - 1.0)), 0.0)
 
 
 def _window_transform(cycles_per_cell: np.ndarray) -> np.ndarray:
@@ -306,9 +297,7 @@ def _ends(paths: PathArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         raise ValueError("paths: got ones without transmitter and receiver, which spherical waves need")
     bounces = np.isfinite(paths.vertices[..., 0]).sum(axis=1)
     if (bounces[paths.kind != "los"] == 0).any():
-        raise ValueError(
-            "paths: got mirror or diffuse paths without interaction points, which spherical waves need"
-        )
+        raise ValueError("paths: got some without the interaction points that spherical waves need")
     return paths.transmitter, paths.receiver, bounces
 
 

@@ -93,6 +93,19 @@ def slab_transmission(
     return _shared((1.0 - te**2) * once, te, echo, once), _shared((1.0 - tm**2) * once, tm, echo, once)
 
 
+def slab_passage(
+    cos_incidence: ArrayLike, permittivity: ArrayLike, thickness_m: ArrayLike, wavelength_m: ArrayLike
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What passing a slab does to a path that goes straight on: factors of the field (TE, TM), and by how much the slab makes the
+    path longer than in air [m]. The factors are those of :func:`slab_transmission` without the phase of the way through."""
+    te, tm = slab_transmission(cos_incidence, permittivity, thickness_m, wavelength_m)
+    cos, thickness = np.asarray(cos_incidence, float), np.asarray(thickness_m, float)
+    root = np.sqrt(np.asarray(permittivity, complex) - (1.0 - cos**2)).real
+    way = np.where(np.isinf(thickness), 0.0, thickness)
+    turned = np.exp(2j * np.pi / np.asarray(wavelength_m) * way * root)
+    return te * turned, tm * turned, way * (root - cos)
+
+
 def _shared(wave: np.ndarray, face: np.ndarray, echo: np.ndarray, none: np.ndarray | float) -> np.ndarray:
     """``wave`` over 1 - face^2 echo; ``none`` where that is 0, as at grazing of a slab without thickness."""
     below = 1.0 - face**2 * echo
@@ -117,7 +130,7 @@ def _slab(
     ):
         if not fits.all():
             raise ValueError(
-                f"{name}: got {values[~fits].flat[0]!r}, expected a passive slab and a wave that meets it"
+                f"{name}: got {values[~fits].flat[0]!r}, expected a wave that meets a passive slab"
             )
     root = np.sqrt(eta - (1.0 - cos**2))
     root = np.where(root.imag > 0, -root, root)  # beyond total reflection the wave decays
@@ -175,9 +188,8 @@ def reciprocal_factor(alpha_r: int, cosine: ArrayLike) -> np.ndarray:
     """
     cos = np.clip(np.asarray(cosine, dtype=np.float64), 0.0, 1.0)
     node, weighed = _reciprocal_nodes(int(alpha_r))
-    return np.asarray(
-        1.0 / (_around_the_normal(int(alpha_r), cos.ravel(), node) @ weighed).reshape(cos.shape)
-    )
+    held = _around_the_normal(int(alpha_r), cos.ravel(), node) @ weighed
+    return np.asarray(1.0 / held.reshape(cos.shape))
 
 
 @lru_cache(maxsize=64)

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.checks import check_count, check_number, check_positive, check_type, checked
+from warprrf.checks import check_choice, check_count, check_number, check_positive, check_type, checked
 from warprrf.files import read_json
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 
@@ -114,7 +114,7 @@ class Material:
         name: the material's name.
         bands: permittivity rows; the first whose band holds the frequency counts. Without any it is a name alone, as a
             mesh file gives: it tells a radio field which surfaces are alike, and every question about it is an error.
-        thickness_m: slab thickness [m]; ``inf`` for a half-space.
+        thickness_m: slab thickness [m], by default Sionna RT's; ``inf`` for a half-space.
         roughness_m: rms height of the surface sigma_h [m]; gives the scattering coefficient.
         scattering: scattering coefficient S in [0, 1] at every frequency, instead of one from ``roughness_m``.
         pattern: ``"lambertian"`` or ``"directive"``.
@@ -151,8 +151,7 @@ class Material:
         check_number("roughness_m" + of, self.roughness_m, 0.0, ROUGHEST_M)
         if self.scattering is not None:
             check_number("scattering" + of, self.scattering, 0.0, 1.0)
-        if self.pattern not in PATTERNS:
-            raise ValueError(f"pattern{of}: got {self.pattern!r}, expected one of {', '.join(PATTERNS)}")
+        check_choice("pattern" + of, self.pattern, PATTERNS)
         check_count("alpha_r" + of, self.alpha_r, 1, NARROWEST_LOBE)
         check_number("xpd" + of, self.xpd, 0.0, 1.0)
 
@@ -322,15 +321,20 @@ def _number(entry: object, key: str, where: str) -> float:
     return check_number(f"{where}: {key!r}", _mapping(entry, where).get(key))
 
 
+def _band(row: Any, where: str) -> Band:
+    law: dict[str, Any] = {key: _number(row, key, where) for key in "abcd"}
+    law |= {f"{end}_hz": 1e9 * _number(row, f"{end}_ghz", where) for end in ("low", "high")}
+    return Band(**law, source=str(row.get("source", "assumed")))
+
+
 def _material(entry: object, where: str) -> Material:
     entry = _mapping(entry, where)
     name = entry.get("name")
     if not isinstance(name, str):
         raise ValueError(f"{where} has no 'name'")
     where = f"{where}, material {name!r}"
-    for key in ("permittivity", "thickness_m", "pattern"):
-        if key not in entry:
-            raise ValueError(f"{where} has no {key!r}")
+    if lacking := [key for key in ("permittivity", "thickness_m", "pattern") if key not in entry]:
+        raise ValueError(f"{where} has no {lacking[0]!r}")
     if "roughness_m" not in entry and "scattering" not in entry:
         raise ValueError(f"{where} has neither 'roughness_m' nor 'scattering', expected one of them")
     if not isinstance(entry["permittivity"], list) or not entry["permittivity"]:
@@ -341,30 +345,16 @@ def _material(entry: object, where: str) -> Material:
     if not isinstance(reciprocal, bool):
         raise ValueError(f"{where}: 'reciprocal' is {reciprocal!r}, expected true or false")
     try:
-        bands = tuple(
-            Band(
-                low_hz=_number(row, "low_ghz", where) * 1e9,
-                high_hz=_number(row, "high_ghz", where) * 1e9,
-                a=_number(row, "a", where),
-                b=_number(row, "b", where),
-                c=_number(row, "c", where),
-                d=_number(row, "d", where),
-                source=str(row.get("source", "assumed")),
-            )
-            for row in entry["permittivity"]
-        )
+        numbers: Any = {key: _number(part, "value", where) for key, part in parts.items() if key != "pattern"}
         return Material(
             name=name,
-            bands=bands,
-            thickness_m=_number(parts["thickness_m"], "value", where),
-            roughness_m=_number(parts["roughness_m"], "value", where) if "roughness_m" in parts else 0.0,
-            scattering=_number(parts["scattering"], "value", where) if "scattering" in parts else None,
+            bands=tuple(_band(row, where) for row in entry["permittivity"]),
             pattern=str(parts["pattern"].get("value")),
             alpha_r=alpha_r,
             itu=entry.get("itu"),
             sources={key: str(part.get("source", "assumed")) for key, part in parts.items()},
             reciprocal=reciprocal,
-            xpd=_number(parts["xpd"], "value", where) if "xpd" in parts else 0.0,
+            **numbers,
         )
     except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: {error}") from error
@@ -415,14 +405,9 @@ def load_materials(path: str | os.PathLike[str]) -> dict[str, Material]:
     for k, entry in enumerate(table):
         material = _material(entry, f"path: {path}, entry {k}")
         if material.name in found:
-            raise ValueError(
-                f"path: {path} has two materials named {material.name!r}, expected one of each name"
-            )
+            raise ValueError(f"path: {path} has two materials named {material.name!r}, expected one")
         found[material.name] = material
     return found
-
-
-DEFAULT_THICKNESS_M = 0.1  # of a surface whose scene says nothing of it, as in Sionna RT
 
 
 def _rows(edition: int, *rows: tuple[float, float, float, float, float, float]) -> tuple[Band, ...]:
@@ -486,7 +471,7 @@ def itu_material(
     itu: str,
     *,
     name: str | None = None,
-    thickness_m: float = DEFAULT_THICKNESS_M,
+    thickness_m: float = Material.thickness_m,
     scattering: float = 0.0,
     pattern: str = "lambertian",
     alpha_r: int = 4,
@@ -504,9 +489,7 @@ def itu_material(
     """
     known = itu_name(itu) if isinstance(itu, str) else None
     if known is None:
-        raise ValueError(
-            f"itu: got {itu!r}, expected a material of ITU-R P.2040: {', '.join(sorted(ITU_BANDS))}"
-        )
+        raise ValueError(f"itu: got {itu!r}, expected one of ITU-R P.2040: {', '.join(sorted(ITU_BANDS))}")
     return Material(
         name=known if name is None else name,
         bands=ITU_BANDS[known],

@@ -22,9 +22,7 @@ def check_frequency(frequency_hz: ArrayLike | None, name: str = "frequency_hz") 
     """
     value, (low, high) = float(check_array(name, frequency_hz, ())), CARRIERS_HZ
     if not low <= value <= high:
-        raise ValueError(
-            f"{name}: got {value!r}, expected a carrier in hertz, {low:g} to {high:g} (28 GHz is 28e9)"
-        )
+        raise ValueError(f"{name}: got {value!r}, expected hertz, {low:g} to {high:g} (28 GHz is 28e9)")
     return value
 
 

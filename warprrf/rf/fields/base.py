@@ -37,7 +37,7 @@ from warprrf.rf.channel.response import LinkOptions as LinkEnds
 from warprrf.rf.channel.response import frequency_response
 from warprrf.rf.em.absorption import Air, Gas
 from warprrf.rf.em.waves import CARRIERS_HZ, SPEED_OF_LIGHT
-from warprrf.rf.fields.batches import Batch, Delivery
+from warprrf.rf.fields.batches import Batch
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
 from warprrf.rf.paths.path_set import PATH_VARIABLES, Paths, arrays_of, ends_and_attributes
@@ -45,7 +45,14 @@ from warprrf.rf.positions import Ends, check_positions
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.readings import Readings
-from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectra, Spectrum, check_beam, check_shape
+from warprrf.rf.spectra.spectrum import (
+    BEAM_SIGMA_RAD,
+    Spectra,
+    Spectrum,
+    check_beam,
+    check_range_db,
+    check_shape,
+)
 from warprrf.steps import digest
 
 _PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
@@ -127,9 +134,7 @@ class RadioField(ABC):
             ValueError: if it is corrupt, or no radio field (of this model).
         """
         tensors, header = tensor_files.read(path)
-        found = cls.models[
-            "bistatic" if header.get("model") == "bistatic" else "rf3dgs+"
-        ]  # which reads rf3dgs too
+        found = cls.models.get(str(header.get("model")), cls.models["rf3dgs+"])
         if not issubclass(found, cls):
             raise ValueError(f"{os.fspath(path)}: holds a {found.__name__}, expected a {cls.__name__}")
         with tensor_files.named(path, "corrupt, or no radio field of this version"):
@@ -268,10 +273,10 @@ class RadioField(ABC):
             many = field.spectra(receivers, store="spectra.nc", client=distributed.Client("lab:8786"))
             many.path_gain[17]
         """
-        field, batch = self.on_grid(shape), Batch("spectra", self.check_positions(receivers, transmitter))
+        field = self.on_grid(shape)
+        batch = Batch("spectra", self.check_positions(receivers, transmitter), store, client, progress)
         variables = {"path_gain": Variable(("receiver", "zenith", "azimuth"), "1")}
-        delivery, key = Delivery(store, client, progress), field._known_by(store, batch)
-        found = batch.gather(partial(_spectra, field), variables, {}, key, delivery)
+        found = batch.gather(partial(_spectra, field), variables, {}, field._known_by(batch))
         to, source, gain = map(batch.ends.shaped, (*batch.ends[:2], found["path_gain"]))
         return Spectra(to, source, self.frequency_hz, gain)
 
@@ -310,22 +315,21 @@ class RadioField(ABC):
         """
         if max_paths is not None:
             check_count("max_paths", max_paths)
-        batch = Batch("paths", self.check_positions(receivers, transmitter))
-        ends = batch.ends
+        ends = self.check_positions(receivers, transmitter)
         if ends.single and store is None and client is None:  # in a hurry
             return self._trace_paths(ends.receivers[0], ends.transmitters[0], max_paths)
-        work, delivery = partial(_paths, self, max_paths), Delivery(store, client, progress)
+        batch, work = Batch("paths", ends, store, client, progress), partial(_paths, self, max_paths)
         if store is None:
             found: dict[int, Paths] = {}
-            for rows, several in batch.each(work, delivery):
+            for rows, several in batch.each(work):
                 found |= zip(rows.tolist(), several, strict=True)
             return found[0] if ends.single else Paths.stack([found[k] for k in sorted(found)])
         if max_paths is None:
             raise ValueError("max_paths: got None with a store, expected how many paths it has room for")
         source = ends.transmitters if len(ends.groups()) > 1 else ends.transmitters[0]
         known, attributes = ends_and_attributes(ends.receivers, source, self.frequency_hz, self.air)
-        attributes |= {"single_receiver": int(ends.single)} | self._known_by(store, batch, max_paths)
-        batch.gather(partial(_path_arrays, work, max_paths), PATH_VARIABLES, known, attributes, delivery)
+        attributes |= {"single_receiver": int(ends.single)} | self._known_by(batch, max_paths)
+        batch.gather(partial(_path_arrays, work, max_paths), PATH_VARIABLES, known, attributes)
         return Paths.load(store)
 
     def cfr(
@@ -361,18 +365,18 @@ class RadioField(ABC):
             raise TypeError(f"cfr: got {', '.join(sorted(unknown))}, expected options of Paths.cfr")
         ports = [a.ports for a in (response.get("tx_array"), response.get("rx_array")) if a is not None]
         ends = self.check_positions(receivers, transmitter)
-        batch = Batch("cfr", ends, 8 * len(f) * int(np.prod(ports)))
+        batch = Batch("cfr", ends, store, client, progress, 8 * len(f) * int(np.prod(ports)))
         variables = {
             "cfr": Variable(("receiver", "receiving_port", "transmitting_port", "frequency"), "1"),
             "frequency": Variable(("frequency",), "Hz"),
         }
-        key = self._known_by(store, batch, f, max_paths, {n: _sampled(o) for n, o in response.items()})
-        work, delivery = partial(_cfr, self, f, max_paths, response), Delivery(store, client, progress)
-        return ends.shaped(batch.gather(work, variables, {"frequency": f}, key, delivery)["cfr"])
+        key = self._known_by(batch, f, max_paths, {n: _sampled(o) for n, o in response.items()})
+        work = partial(_cfr, self, f, max_paths, response)
+        return ends.shaped(batch.gather(work, variables, {"frequency": f}, key)["cfr"])
 
-    def _known_by(self, store: str | os.PathLike[str] | None, batch: Batch, *options: Any) -> dict[str, str]:
+    def _known_by(self, batch: Batch, *options: Any) -> dict[str, str]:
         """What tells a store of these answers from others."""
-        if store is None:
+        if batch.store is None:
             return {}
         tensors, header = self._whole()
         del header["report"]
@@ -421,11 +425,7 @@ class RadioField(ABC):
         ends = self.check_positions(receivers, transmitter)
         rows, found = np.zeros(0, int), []
         for source, own in ends.groups():
-            tell = (
-                None
-                if progress is None
-                else partial(_progress_after, progress, len(rows), len(ends.receivers))
-            )
+            tell = progress and partial(_progress_after, progress, len(rows), len(ends.receivers))
             options = LinkOptions(beam_sigma_rad, shape, mirror_order, client, tell)
             found.append(self.trace_links(ends.receivers[own], source, options))
             rows = np.concatenate([rows, own])
@@ -465,9 +465,7 @@ class RadioField(ABC):
             field = wr.RadioField.fit(room, wr.SpectrumDataset.empty(transmitter=source, frequency_hz=300e9))
             first = candidates[field.suggest(candidates, 3)]
         """
-        raise ValueError(
-            f"field: got one of model {self.model!r}, expected 'bistatic', which can suggest places"
-        )
+        raise ValueError(f"field: got one of model {self.model!r}, expected 'bistatic' to suggest places")
 
     def check_positions(
         self, receivers: ArrayLike, transmitter: ArrayLike | None = None, *, name: str = "receivers"
@@ -527,9 +525,7 @@ class RadioField(ABC):
         check_number("frequency_hz", self.frequency_hz, *CARRIERS_HZ)
         check_shape(self.shape)
         check_positive("floor", self.floor, "linear noise floor")
-        low, high = (check_number("range_db", value, -1e4, 1e4) for value in self.range_db)
-        if not low <= high:
-            raise ValueError(f"range_db: got {self.range_db}, expected the lower end first")
+        check_range_db(self.range_db)
         check_beam(self.beam_sigma_rad)
         known = check_array("fitted_on", self.fitted_on, (None, 3))
         if self.fitted_under is not None:

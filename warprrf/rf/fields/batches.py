@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -15,19 +15,10 @@ from warprrf.netcdf_files import Store, Variable
 from warprrf.rf.positions import Ends
 
 AT_ONCE = 24  # receivers of a part: some tenths of a second of work, to which sending it adds little
-PART_BYTES = 64_000_000  # of its answers at most
 
 _ENDS = {name: Variable(("receiver", "xyz"), "m") for name in ("receiver_position", "transmitter_positions")}
 Work = Callable[[tuple[np.ndarray, np.ndarray]], Any]
 """From receivers ``(K, 3)`` and their transmitter ``(3,)`` to answers."""
-
-
-class Delivery(NamedTuple):
-    """Where answers are computed and gathered; see :meth:`RadioField.spectra`."""
-
-    store: str | os.PathLike[str] | None = None
-    client: Any = None
-    progress: Progress | None = None
 
 
 @dataclass(frozen=True)
@@ -37,28 +28,31 @@ class Batch:
     Attributes:
         stage: name of the answers, for the progress.
         ends: places that were checked.
+        store, client, progress: where they are gathered and computed, and who is told; see :meth:`RadioField.spectra`.
         row_bytes: of one receiver's answer.
     """
 
     stage: str
     ends: Ends
+    store: str | os.PathLike[str] | None
+    client: Any
+    progress: Progress | None
     row_bytes: int = 0
 
     def parts(self) -> list[np.ndarray]:
         """Receivers that are asked together, under one transmitter: always the same, so that so are the answers."""
-        most = max(1, min(AT_ONCE, PART_BYTES // max(1, self.row_bytes)))
+        part_bytes = 64_000_000  # of its answers at most
+        most = max(1, min(AT_ONCE, part_bytes // max(1, self.row_bytes)))
         return [own[k : k + most] for _, own in self.ends.groups() for k in range(0, len(own), most)]
 
-    def each(
-        self, work: Work, delivery: Delivery, missing: np.ndarray | None = None
-    ) -> Iterator[tuple[np.ndarray, Any]]:
+    def each(self, work: Work, missing: np.ndarray | None = None) -> Iterator[tuple[np.ndarray, Any]]:
         """Rows and answers of the parts of which some are ``missing`` (R,), all by default, as they are ready."""
         parts = [own for own in self.parts() if missing is None or missing[own].any()]
         ends, count = self.ends, len(self.ends.receivers)
-        done, tell = count - sum(map(len, parts)), delivery.progress or (lambda *_: None)
+        done, tell = count - sum(map(len, parts)), self.progress or (lambda *_: None)
         tell(self.stage, done, count)
         jobs = [(ends.receivers[own], ends.transmitters[own[0]]) for own in parts]
-        for k, found in each(work, jobs, delivery.client):
+        for k, found in each(work, jobs, self.client):
             yield parts[k], found
             done += len(parts[k])
             tell(self.stage, done, count)
@@ -69,13 +63,12 @@ class Batch:
         variables: Mapping[str, Variable],
         known: Mapping[str, np.ndarray],
         attributes: Mapping[str, Any],
-        delivery: Delivery,
     ) -> dict[str, np.ndarray]:
         """Arrays ``(R, ...)`` of the answers, which are arrays ``(K, ...)`` by the names of ``variables``; ``known`` and
         ``attributes`` go into the file besides."""
-        path, held, count = delivery.store, dict[str, np.ndarray](), len(self.ends.receivers)
+        path, held, count = self.store, dict[str, np.ndarray](), len(self.ends.receivers)
         if path is None:
-            for rows, found in self.each(work, delivery):
+            for rows, found in self.each(work):
                 for name, array in found.items():
                     if name not in held:
                         held[name] = np.empty((count, *array.shape[1:]), array.dtype)
@@ -83,6 +76,6 @@ class Batch:
             return held
         ends = {"receiver_position": self.ends.receivers, "transmitter_positions": self.ends.transmitters}
         with Store(path, ends | dict(known), _ENDS | dict(variables), attributes, count) as store:
-            for rows, found in self.each(work, delivery, store.missing):
+            for rows, found in self.each(work, store.missing):
                 store.put(rows, found)
         return store.arrays()

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import os
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,6 @@ from warprrf.checks import check_count, checked
 from warprrf.files import write_arrays, write_text
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.scene import Scene
-
-REFLECTION, SCATTERING = 1, 3
-"""DeepMIMO's codes of interactions; a path's code is the string of its digits, 0 for line of sight."""
 
 _VERSION = "4.0.5"  # of the format
 _FORBIDDEN = set('/\\:*?"<>|\n') | {"'"}
@@ -70,7 +68,7 @@ def write_deepmimo(
         )
     carrier = paths.carrier_hz
     coefficient, _ = paths.cir(diffuse=diffuse if scattered else None, seed=seed)
-    several = paths if paths.batched else Paths.stack([paths])
+    several = paths.as_several()
     coefficient = coefficient.reshape(several.gain.shape)
     matrices = _matrices(several, coefficient, max_paths)
     for key, values in matrices.items():
@@ -82,21 +80,16 @@ def write_deepmimo(
         "version": _VERSION,
         "rt_params": {
             "raytracer_name": "warprrf",
-            "raytracer_version": _warprrf_version(),
+            "raytracer_version": version("warprrf"),
             "frequency": carrier,
             "max_path_depth": int(bounces.max(initial=0)),
             "max_reflections": int(mirrors),
-            "max_diffractions": 0,
             "max_scattering": int(scattered),
-            "max_transmissions": 0,
-            "diffuse_reflections": 0,
-            "diffuse_diffractions": 0,
-            "diffuse_transmissions": 0,
+            **{f"max_{kind}": 0 for kind in ("diffractions", "transmissions")},
+            **{f"diffuse_{kind}": 0 for kind in ("reflections", "diffractions", "transmissions")},
             "diffuse_final_interaction_only": True,
             "diffuse_random_phases": diffuse == "random_phase",
-            "terrain_reflection": False,
-            "terrain_diffraction": False,
-            "terrain_scattering": False,
+            **{f"terrain_{kind}": False for kind in ("reflection", "diffraction", "scattering")},
             "num_rays": 0,
             "ray_casting_method": "image method",
             "synthetic_array": True,
@@ -112,9 +105,8 @@ def write_deepmimo(
         "materials": described.pop("materials"),
         "scene": described,
     }
-    write_text(
-        folder / "params.json", json.dumps(parameters, indent=2)
-    )  # last: a folder without it does not load
+    # last: a folder without it does not load
+    write_text(folder / "params.json", json.dumps(parameters, indent=2))
     return folder
 
 
@@ -141,9 +133,11 @@ def _matrices(paths: Paths, coefficient: np.ndarray, max_paths: int | None) -> d
 
     deep = max(1, int(bounces.max(initial=0)))
     index = order[:, :, None, None]
-    # Codes read from the transmitter: a diffuse path scatters last.
+    # A path's code is the string of its interactions' digits, 0 for line of sight, read from the transmitter: a diffuse
+    # path scatters last.
+    reflection, scattering = 1, 3
     ones = (10.0**bounces - 1.0) / 9.0
-    codes = ones + np.where((paths.kind == "diffuse") & (bounces > 0), SCATTERING - REFLECTION, 0)
+    codes = ones + np.where((paths.kind == "diffuse") & (bounces > 0), scattering - reflection, 0)
     return {
         "rx_pos": np.asarray(paths.receiver, dtype=np.float32).reshape(-1, 3),
         "tx_pos": np.asarray(paths.transmitter, dtype=np.float32).reshape(1, 3),
@@ -222,9 +216,3 @@ def _material(k: int, material: Any, carrier: float) -> dict[str, Any]:
         "roughness": float(material.roughness_m),
         "thickness": float(material.thickness_m),
     }
-
-
-def _warprrf_version() -> str:
-    from warprrf import __version__
-
-    return __version__

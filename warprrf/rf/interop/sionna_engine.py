@@ -17,16 +17,14 @@ from numpy.typing import ArrayLike
 from warprrf import device as _device
 from warprrf.checks import check_array, check_count, checked
 from warprrf.device import DeviceLike
+from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.absorption import Gas, air_of
-from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
+from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.exact import ReceivedPaths
-from warprrf.rf.paths.sionna import DIFFUSE, repeated
+from warprrf.rf.paths.sionna import by_delay
 from warprrf.rf.scene import Scene
 from warprrf.rf.scene_sionna import select_variant, sionna_rt
-from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape, directions_from_angles, spread_paths
-
-# Dr.Jit keeps freed memory and compiled kernels; emptied every so many receivers.
-_RECEIVERS_PER_FLUSH = 20
+from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape, spread_paths
 
 
 @checked
@@ -120,11 +118,10 @@ class SionnaEngine:
         self._solver = self._rt.PathSolver(deterministic=True)
         self._solved = 0
 
-    def solve(self, receiver: ArrayLike, *, specular: bool = True) -> dict[str, np.ndarray]:
-        """Paths of one receiver (3,): ``power``, ``jones`` (L,2,2) without the delay's phase, along zenith and azimuth unit
-        vectors, ``tau``, ``arrival`` (L,3), ``aod`` (L,2), ``diffuse``, ``bounces``.
+    def solve(self, receiver: ArrayLike, *, specular: bool = True) -> PathArrays:
+        """Paths of one receiver (3,), by rising delay.
 
-        They come by rising delay: one seed gives the same paths to the bit, in the same order, in every run.
+        One seed gives the same paths to the bit, in the same order, in every run.
         Without ``specular`` reflections every ray scatters, and at depth 1 Sionna's result hardly depends on chance.
         """
         point = check_array("receiver", receiver, (3,))
@@ -147,7 +144,7 @@ class SionnaEngine:
         finally:
             self._scene.remove("rx")
         self._solved += 1
-        if self._solved % _RECEIVERS_PER_FLUSH == 0:
+        if self._solved % 20 == 0:  # Dr.Jit keeps freed memory and compiled kernels
             drjit = _device.require("drjit", extra="sionna")
             drjit.flush_malloc_cache()
             drjit.flush_kernel_cache()
@@ -158,51 +155,21 @@ class SionnaEngine:
         """Sionna's default of 1e6 paths truncates silently; each sample can give one path a bounce."""
         return self.sampling.samples * max(self.sampling.depth, 1) + 100_000
 
-    def _read(self, paths: Any) -> dict[str, np.ndarray]:
-        """Sionna's arrays of one receiver and transmitter; both antennas are two polarisations at one place."""
-        real, imag = (np.asarray(part.numpy(), dtype=np.float64) for part in paths.a)
-        per_path = (real**2 + imag**2).reshape(4, real.shape[-1])  # 2 receive x 2 transmit polarisations
-        valid = paths.valid.numpy().reshape(-1).astype(bool)  # no paths come as an array of numbers
-        if len(valid) >= self._path_cap:
+    def _read(self, paths: Any) -> PathArrays:
+        """Sionna's paths of one receiver and transmitter."""
+        if paths.valid.numpy().size >= self._path_cap:
             raise RuntimeError(f"Sionna filled its cap of {self._path_cap} paths: power would be missing")
-        kinds = paths.interactions.numpy().reshape(-1, len(valid)) if len(valid) else np.zeros((1, 0), int)
-
-        def field(values: Any) -> np.ndarray:
-            return np.asarray(values.numpy(), dtype=np.float64).reshape(-1)[valid]
-
-        found = {
-            "power": per_path.sum(axis=0)[valid] / 2.0,
-            "jones": (real + 1j * imag).reshape(2, 2, -1).transpose(2, 0, 1)[valid],
-            "tau": field(paths.tau),
-            "arrival": directions_from_angles(field(paths.theta_r), field(paths.phi_r)),
-            "aod": np.column_stack([field(paths.theta_t), field(paths.phi_t)]),
-            "diffuse": (kinds == DIFFUSE).any(axis=0)[valid],
-            "bounces": (kinds != 0).sum(axis=0)[valid],
-        }
-        # Sionna stores paths as its threads end; few have equal delays, and sorting by all keys takes long
-        order = np.argsort(found["tau"], kind="stable")
-        same = np.diff(found["tau"][order], prepend=-1.0, append=-1.0) == 0
-        tied = np.flatnonzero(same[1:] | same[:-1])
-        keys = [found[name][order[tied]].T for name in ("aod", "arrival", "power", "tau")]
-        order[tied] = order[tied][np.lexsort(np.vstack(keys))]
-        sharp = np.flatnonzero(~found["diffuse"][order])
-        keys = [found[name][order[sharp]] for name in ("tau", "arrival", "aod", "bounces")]
-        order = np.delete(order, sharp[repeated(*keys)])
-        found = {name: values[order] for name, values in found.items()}
-        if self.air is not None:
-            through = self.air.transmittance(self.frequency_hz, SPEED_OF_LIGHT * found["tau"])
-            found["power"] *= through
-            found["jones"] *= np.sqrt(through)[:, None, None]
-        return found
+        (found,) = by_delay(paths, self.frequency_hz, 0, True)
+        return found.with_gas(self.air)
 
     def receive(self, receiver: ArrayLike) -> ReceivedPaths:
         """The spectrum of one receiver (3,)."""
         found = self.solve(receiver)
         beam = self.shape, self.beam_sigma_rad
-        spread = spread_paths(found["arrival"], found["power"], *beam, device=self.device)
+        spread = spread_paths(found.arrival, found.power, *beam, device=self.device)
         return ReceivedPaths(
             path_gain=spread.path_gain,
-            delay_s=spread.of_strongest(found["tau"]),
-            aod=spread.of_strongest(found["aod"]),
-            line_of_sight=bool((found["bounces"] == 0).any()),
+            delay_s=spread.of_strongest(found.tau),
+            aod=spread.of_strongest(np.column_stack([found.theta_t, found.phi_t])),
+            line_of_sight=bool((found.kind == "los").any()),
         )

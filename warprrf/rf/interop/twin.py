@@ -43,17 +43,10 @@ from warprrf.rf.fields.bistatic.field import BistaticField
 ABOUT = "Digital twin written by warprrf."
 """First line of a twin's ``materials.json``: a folder that says so may be replaced."""
 LOSS_TANGENT = 0.02  # least that single precision, which Sionna computes in, surely turns into a decay
-THICKNESS_WAVELENGTHS = (
-    200.0  # then what the far side sends back has lost 25 nepers: the slab is a half-space
-)
-BAND_SHARE = 0.1  # a material holds this far from the carrier: it was fitted at one frequency
-NARROWEST_LOBE = 60  # largest exponent that is tried
-MIRROR_SHARE = (
-    0.01  # weight of mirrored power: about the share of a spectrum's pixels that a mirror's beam fills
-)
+# What the far side sends back has then lost 25 nepers: the slab is a half-space.
+THICKNESS_WAVELENGTHS = 200.0
 LOST_IN_NOISE = 1e-2 / np.pi  # [1/sr], 20 dB below a white Lambertian lobe: darker directions hardly count
 _EXCESS = np.geomspace(1e-2, 1e6, 1601)  # of epsilon_r - 1; the last reflects like metal
-CERTAIN = 40.0  # logit of an S^2 of one
 _MATERIAL = "fitted_"  # Sionna keeps names of materials and objects apart, and reserves those of the ITU
 _FILES = {"scene.xml", "materials.json", "meshes"}
 
@@ -76,8 +69,8 @@ class Reflection:
 
 
 @dataclass(frozen=True)
-class TwinGroup:
-    """One material of a twin.
+class TwinGroup(Reflection):
+    """One material of a twin; its relative permittivity and errors are those of :class:`Reflection`.
 
     Attributes:
         name: its largest group's name in the field.
@@ -85,10 +78,7 @@ class TwinGroup:
         material: what it became.
         permittivity: complex relative permittivity at the carrier.
         thickness_m: of the slab [m]; inf where it stands for a half-space.
-        scattering: scattering coefficient S.
         alpha_r: exponent of its lobe, 0 for Lambertian.
-        scattering_error_db: error of the power that it scatters, rms over incidence [dB].
-        mirror_error_db: error of the power that it mirrors, rms over incidence [dB].
         lobe_error_db: what one lobe misses of the fitted mix, rms over both directions [dB].
     """
 
@@ -97,10 +87,7 @@ class TwinGroup:
     material: Material = dataclasses.field(repr=False)
     permittivity: complex
     thickness_m: float
-    scattering: float
     alpha_r: int
-    scattering_error_db: float
-    mirror_error_db: float
     lobe_error_db: float
 
 
@@ -204,22 +191,17 @@ def write_twin(
         "materials": [table_entry(group.material) for group in groups],
     }
     part = partial_path(folder)
-    earlier = part.with_name(
-        f"{part.name}.earlier.kept"
-    )  # no partial file: the only one, if this is killed just then
+    # no partial file: the only one, if this is killed just then
+    earlier = part.with_name(f"{part.name}.earlier.kept")
     try:
         part.mkdir()
         for m in used:
             kept, faces = np.unique(surface.mesh.faces[face_material == m], return_inverse=True)
-            write_mesh(
-                part / "meshes" / f"{names[largest[m]]}.ply",
-                surface.mesh.vertices[kept],
-                faces.reshape(-1, 3),
-            )
+            file = part / "meshes" / f"{names[largest[m]]}.ply"
+            write_mesh(file, surface.mesh.vertices[kept], faces.reshape(-1, 3))
         write_json(part / "materials.json", table, seal=True)
-        (part / "scene.xml").write_text(
-            _scene_xml([group.material for group in groups], field.frequency_hz), encoding="utf-8"
-        )
+        xml = _scene_xml([group.material for group in groups], field.frequency_hz)
+        (part / "scene.xml").write_text(xml, encoding="utf-8")
         if folder.exists():
             folder.rename(earlier)  # a folder cannot be renamed over one that holds something
         part.rename(folder)
@@ -250,7 +232,8 @@ def project_reflection(
     shape = weight @ (gap - level) ** 2
     excess = np.log(_EXCESS)
     wanted = NEPER * np.log(np.maximum([scattered, mirrored], 1e-30))
-    share = np.where([scattered > 0, mirrored > 0], [1.0 - MIRROR_SHARE, MIRROR_SHARE], 0.0)
+    mirror_share = 0.01  # weight of mirrored power: of a spectrum's pixels a mirror's beam fills so many
+    share = np.where([scattered > 0, mirrored > 0], [1.0 - mirror_share, mirror_share], 0.0)
 
     def errors(x: np.ndarray, odds: np.ndarray) -> np.ndarray:
         """Mean square errors [dB^2] of scattered and mirrored power, ``(2, ...)``; ``odds`` is the logit of S^2."""
@@ -258,8 +241,8 @@ def project_reflection(
         gaps = [a - b + np.interp(x, excess, level) for a, b in zip(split, wanted, strict=True)]
         return np.stack([gap**2 + np.interp(x, excess, shape) for gap in gaps])
 
-    # Where one of the powers is none, S^2 is one or zero for certain.
-    certain = CERTAIN if mirrored <= 0 else -CERTAIN if scattered <= 0 else None
+    # Where one of the powers is none, S^2 is one or zero for certain: its logit is 40.
+    certain = 40.0 if mirrored <= 0 else -40.0 if scattered <= 0 else None
     trials = np.linspace(-14.0, 14.0, 113) if certain is None else np.array([certain])
     coarse = np.tensordot(share, errors(excess[:, None], trials), axes=1)
     row, column = np.unravel_index(coarse.argmin(), coarse.shape)
@@ -299,7 +282,8 @@ def project_lobes(
         The exponent, and the rms difference of the lobes [dB] over cosines of incidence (evenly) and the projected
         hemisphere of scattering, both raised by :data:`LOST_IN_NOISE`.
     """
-    most = max(NARROWEST_LOBE, *exponents)
+    narrowest_lobe = 60  # largest exponent that is tried
+    most = max(narrowest_lobe, *exponents)
     lobes, solid_angle = _lobe_table(most, False)
     mixed = _lobe_table(most, True)[0] if reciprocal else lobes
     mix = np.asarray(weight, float) @ mixed[list(exponents)] / np.sum(weight)
@@ -336,7 +320,8 @@ def _project(field: BistaticField, g: int, name: str, area: float, thickness_m: 
     if scattered > 0:
         alpha_r, lobe_error = project_lobes(p.lobes, p.weight[g], reciprocal=p.reciprocal)
     conductivity = LOSS_TANGENT * permittivity * 2.0 * np.pi * frequency * VACUUM_PERMITTIVITY
-    low, high = (1.0 - BAND_SHARE) * frequency, (1.0 + BAND_SHARE) * frequency
+    band_share = 0.1  # a material holds this far from the carrier: it was fitted at one frequency
+    low, high = (1.0 - band_share) * frequency, (1.0 + band_share) * frequency
     fitted = f"fitted at {frequency / 1e9:g} GHz"
     row = Band(low, high, permittivity, 0.0, conductivity, 0.0, fitted)
     material = Material(
@@ -354,15 +339,13 @@ def _project(field: BistaticField, g: int, name: str, area: float, thickness_m: 
         },
     )
     return TwinGroup(
+        **vars(reflection),
         name=field.surface.group_names[g],
         area_m2=area,
         material=material,
         permittivity=material.permittivity(frequency),
         thickness_m=thickness_m if known else np.inf,
-        scattering=material.scattering_coefficient(frequency),
         alpha_r=alpha_r,
-        scattering_error_db=reflection.scattering_error_db,
-        mirror_error_db=reflection.mirror_error_db,
         lobe_error_db=lobe_error,
     )
 

@@ -24,7 +24,6 @@ from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
     check_beam,
     check_shape,
-    directions_from_angles,
     pixel_of,
     pixel_solid_angles,
 )
@@ -84,9 +83,7 @@ class LinkOptions:
             object.__setattr__(self, "shape", check_shape(self.shape))
         check_beam(self.beam_sigma_rad)
         if self.mirror_order not in (None, 0, 1, 2, 3):
-            raise ValueError(
-                f"mirror_order: got {self.mirror_order!r}, expected 0 to 3, or None for the field's own"
-            )
+            raise ValueError(f"mirror_order: got {self.mirror_order!r}, expected 0 to 3, or None")
 
     def in_batches(self, receivers: np.ndarray, batch: int, trace: Callable[[np.ndarray], Links]) -> Links:
         """Links of ``receivers`` (R, 3), at most ``batch`` of them at a time."""
@@ -150,7 +147,7 @@ def links_of(paths: Sequence[Paths], search: BeamSearch) -> Links:
     found = []
     for p in paths:
         own = p.valid
-        power, toward = np.abs(p.gain[own]) ** 2, directions_from_angles(p.theta_r[own], p.phi_r[own])
+        power, toward = p.power[own], p.arrival[own]
         rough = p.kind[own] == "diffuse"
         image = np.zeros(search.shape)
         np.add.at(image, pixel_of(toward[rough], search.shape), power[rough])

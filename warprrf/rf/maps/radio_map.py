@@ -9,28 +9,21 @@ from __future__ import annotations
 import io
 import os
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from warprrf import device as _device
 from warprrf import netcdf_files
-from warprrf.checks import check_array, check_number, check_positive, checked
+from warprrf.checks import check_array, check_choice, check_number, check_positive, checked
 from warprrf.files import write_bytes
 from warprrf.geometry.mesh import Mesh
 from warprrf.netcdf_files import Variable
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.maps.links import LinkOptions, Links
-from warprrf.rf.positions import (
-    NEAR_FIELD,
-    check_positions,
-    ground_height,
-    is_free,
-)
-
-BOLTZMANN = 1.380649e-23  # SI [J/K]
-ROOM_TEMPERATURE_K = 290.0  # at which noise figures are stated (ITU-R P.372)
-MOST_CELLS = 2_000_000
+from warprrf.rf.maps.links import LinkOptions
+from warprrf.rf.positions import NEAR_FIELD, check_positions, ground_height, is_free
+from warprrf.rf.spectra.spectrum import to_db
+from warprrf.tensor_files import named
 
 _FORMAT = "warprrf radio map 1"
 _LAYERS = {
@@ -90,28 +83,22 @@ class RadioMap:
 
     def __post_init__(self) -> None:
         """Check shapes and values; ValueError or TypeError names the field."""
-        x, y = (check_array(name, getattr(self, name), (None,)) for name in ("x", "y"))
-        fields: dict[str, Any] = {
-            "x": x,
-            "y": y,
-            "transmitter": check_array("transmitter", self.transmitter, (3,)),
-            "outline": check_array("outline", self.outline, (None, 2, 2)),
-        }
-        for name in _PLAIN:
-            fields[name] = check_number(name, getattr(self, name))
+        fields: dict[str, Any] = {name: check_number(name, getattr(self, name)) for name in _PLAIN}
+        shapes = {"x": (None,), "y": (None,), "transmitter": (3,), "outline": (None, 2, 2)}
+        for name, shape in shapes.items():
+            fields[name] = check_array(name, getattr(self, name), shape)
+        cells = len(fields["y"]), len(fields["x"])
         for name in ("cell_m", "frequency_hz", "beam_sigma_rad"):
             check_positive(name, fields[name])
         for name in ("x", "y"):
             if not (np.abs(np.diff(fields[name]) - self.cell_m) < 1e-3 * self.cell_m).all():
                 raise ValueError(f"{name}: got {fields[name]}, expected steps of cell_m, {self.cell_m:g} m")
         for name in _LAYERS:
-            fields[name] = check_array(name, getattr(self, name), (len(y), len(x)), finite=False)
+            fields[name] = check_array(name, getattr(self, name), cells, finite=False)
             if not (np.isnan(fields[name]) | (fields[name] >= 0) & np.isfinite(fields[name])).all():
-                raise ValueError(
-                    f"{name}: got negative or infinite values, expected none, or NaN outside the air"
-                )
+                raise ValueError(f"{name}: got negative or infinite values, expected NaN outside the air")
         if self.ground_m is not None:
-            fields["ground_m"] = check_array("ground_m", self.ground_m, (len(y), len(x)), finite=False)
+            fields["ground_m"] = check_array("ground_m", self.ground_m, cells, finite=False)
         for name, value in fields.items():
             object.__setattr__(self, name, value)
 
@@ -130,9 +117,7 @@ class RadioMap:
     @property
     def best_beam_snr_db(self) -> np.ndarray:
         """Signal-to-noise ratio of the best beam [dB], shape ``(Y, X)``; another budget shifts it by a constant."""
-        with np.errstate(divide="ignore"):
-            gain = 10.0 * np.log10(self.best_beam_gain)
-        return self.transmit_power_dbm + gain - self.noise_power_dbm
+        return self.transmit_power_dbm + to_db(self.best_beam_gain) - self.noise_power_dbm
 
     def plot_values(self, quantity: str) -> np.ndarray:
         """``quantity`` as it is drawn: gains in dB, delay spread in ns, shape ``(Y, X)``.
@@ -140,15 +125,11 @@ class RadioMap:
         Raises:
             ValueError: for a quantity that is not one of :data:`QUANTITIES`.
         """
-        if quantity not in QUANTITIES:
-            raise ValueError(f"quantity: got {quantity!r}, expected one of {', '.join(QUANTITIES)}")
+        check_choice("quantity", quantity, QUANTITIES)
         value = np.asarray(getattr(self, quantity))
         if quantity == "delay_spread_s":
             return value * 1e9
-        if quantity.endswith("_db"):
-            return value
-        with np.errstate(divide="ignore"):
-            return np.asarray(10.0 * np.log10(value))
+        return value if quantity.endswith("_db") else to_db(value)
 
     def plot(self, quantity: str = "total_path_gain", ax: Any = None, **options: Any) -> Any:
         """Draw one quantity over the floor plan into ``ax`` (a new one by default); returns the axes.
@@ -216,7 +197,7 @@ class RadioMap:
             ValueError: naming it, if it is damaged, or holds something else.
         """
         arrays, attributes = netcdf_files.read(path, _VARIABLES, {})
-        try:
+        with named(path, "damaged, or no radio map"):
             if attributes.get("format") != _FORMAT:
                 raise ValueError(f"it holds {attributes.get('format')!r}, expected {_FORMAT!r}")
             for axis, name in enumerate(("y", "x")):
@@ -225,8 +206,6 @@ class RadioMap:
                     arrays[held] = arrays[held].take(order, axis=min(axis, arrays[held].ndim - 1))
             fields: dict[str, Any] = {**arrays, **{name: attributes[name] for name in _PLAIN}}
             return cls(**fields)
-        except (KeyError, IndexError, TypeError, ValueError) as error:
-            raise ValueError(f"{os.fspath(path)}: damaged, or no radio map: {error}") from error
 
 
 _PLAIN = ("height_m", "cell_m", "frequency_hz", "beam_sigma_rad", "transmit_power_dbm", "noise_power_dbm")
@@ -267,27 +246,14 @@ class MapOptions(LinkOptions):
     @property
     def noise_power_dbm(self) -> float:
         """Of the receiver, k T B F [dBm]."""
-        noise_w = BOLTZMANN * ROOM_TEMPERATURE_K * self.bandwidth_hz
+        boltzmann = 1.380649e-23  # SI [J/K]
+        room_temperature_k = 290.0  # at which noise figures are stated (ITU-R P.372)
+        noise_w = boltzmann * room_temperature_k * self.bandwidth_hz
         return float(10.0 * np.log10(noise_w) + 30.0 + self.noise_figure_db)
 
 
-class LinkField(Protocol):
-    """What maps are made of: see :class:`warprrf.RadioField`."""
-
-    transmitter: np.ndarray
-    frequency_hz: float
-    device: Any
-
-    @property
-    def mesh(self) -> Mesh | None:
-        """What blocks."""
-
-    def trace_links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
-        """Links at ``receivers`` (R, 3) [m], off the mesh."""
-
-
 def radio_map(
-    field: LinkField,
+    field: Any,
     height: float,
     cell: float = 0.25,
     transmitter: Any = None,
@@ -298,7 +264,7 @@ def radio_map(
     Cells are left out that the field's mesh takes for solid; see :func:`warprrf.rf.positions.is_free`.
 
     Args:
-        field: a fitted field with a mesh.
+        field: a :class:`warprrf.RadioField` with a mesh.
         height: of the receivers [m]: z, or over the ground if ``options`` say so.
         cell: width of a cell [m].
         transmitter: position (3,) [m] if another than the fitted one.
@@ -321,9 +287,7 @@ def radio_map(
     check_positive("cell", cell)
     low, high = mesh.bounds
     if not (0.0 if o.above_ground else low[2]) < height < high[2]:
-        raise ValueError(
-            f"height: got {height!r} m, expected one inside the scene, {low[2]:.3g} to {high[2]:.3g} m"
-        )
+        raise ValueError(f"height: got {height!r} m, expected {low[2]:.3g} to {high[2]:.3g} m")
     x, y = _centres(mesh, cell, o.bounds)
     across, along = np.meshgrid(x, y)
     ground = ground_height(mesh, across, along, device=field.device) if o.above_ground else None
@@ -364,9 +328,10 @@ def _centres(mesh: Mesh, cell: float, bounds: Any) -> tuple[np.ndarray, np.ndarr
     if not (low < high).all():
         raise ValueError(f"bounds: got {bounds!r}, expected lowest x and y, then higher x and y")
     counts = np.maximum(np.ceil((high - low) / cell - 1e-6), 1.0)
-    if counts.prod() > MOST_CELLS:
+    most_cells = 2_000_000
+    if counts.prod() > most_cells:
         raise ValueError(
-            f"cell: got {cell!r} m, which makes {counts.prod():.0f} cells; expected at most {MOST_CELLS}: give wider "
+            f"cell: got {cell!r} m, which makes {counts.prod():.0f} cells; expected at most {most_cells}: give wider "
             "cells, or bounds of a part"
         )
     x, y = (start + cell * (np.arange(int(n)) + 0.5) for start, n in zip(low, counts, strict=True))

@@ -8,10 +8,11 @@ try all pairs. Nothing that could be a path is left out, to rounding. Source: J.
 
 from __future__ import annotations
 
+import copy
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,12 @@ from numpy.typing import ArrayLike
 from warprrf import device as _device
 from warprrf.checks import check_positive, users_level
 from warprrf.device import DeviceLike, Progress
+from warprrf.geometry.edges import Edges
 from warprrf.geometry.planar_patches import PlanarPatches
+from warprrf.kernels.radio import edges as edge_kernels
 from warprrf.kernels.radio import mirrors as kernels
+from warprrf.kernels.radio.edges import find_over_edges
+from warprrf.kernels.radio.mirrors import IN_PLANE
 
 ALL_SPACE = 2.0  # a sine that stands for no cone
 MOST_KEPT = 4_000_000  # pairs of a chain and a patch to try up to which all chains are found once and kept
@@ -33,6 +38,8 @@ MOST_CHAINS = 20_000_000
 CURVED_M2, CURVED_SHARE = 0.5, 0.01
 """Area of smooth surfaces that facets stand for, and its share of all patches, above which a warning says so."""
 
+_PIECE_M = 20.0  # longer edges are cut, so that balls around neighbours stay small
+_WORDS = 16_000_000  # chains times leaves that are tried at once
 _SAMPLE = 1000  # chains from which the number of longer ones is estimated
 _FIRST, _LAUNCH_S = 4096, 0.1  # chains in the first launch; later ones take about so long
 _PARTS = 1000  # of a search, in which its progress is reported
@@ -157,6 +164,42 @@ class MirrorImages:
         row, patch, found = (np.concatenate(p) for p in zip(*parts, strict=True))
         by_row = np.argsort(row, kind="stable")
         return row[by_row], patch[by_row], found[by_row]
+
+    def seen_from(self, point: np.ndarray) -> MirrorImages:
+        """Images of another transmitter in the same patches."""
+        other = copy.copy(self)
+        other.transmitter, other._kept = point, [replace(self._kept[0], image=point[None])]
+        return other
+
+    def over_edges(self, leaves: EdgeLeaves, point: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
+        """Over which edges chains of ``order`` reflections, known from the transmitter on, reach ``point`` (3,), if nothing
+        stands between: index of the edge ``(L,)`` and patches ``(L, order)``, whose boxes hold the mirror points."""
+        parts = [(np.zeros(0, int), np.zeros((0, order), np.int32))]
+        step = max(1, _WORDS // max(len(leaves.radius), 1))
+        kept = self._keep(order)
+        known = min(order, len(kept) - 1)
+        for chains, _ in self._descendants(kept[known], order - known, point, -1.0):
+            for first in range(0, len(chains) if len(leaves.radius) else 0, step):
+                some = chains.take(slice(first, first + step))
+                patch = wp.array(some.patch, dtype=wp.int32, device=self.device)
+                words = wp.zeros((len(some), len(leaves.radius)), dtype=wp.uint32, device=self.device)
+                inputs = [
+                    self._on_device,
+                    patch,
+                    _cones(some, self.device),
+                    leaves.on_device,
+                    wp.vec3d(*point),
+                ]
+                inputs += [wp.float64(IN_PLANE), words]
+                _device.launch(find_over_edges, words.size, inputs, device=self.device)
+                chain, leaf, bit = _set_bits(words.numpy())
+                edge = leaves.edge[32 * leaf + bit]
+                chain, edge = np.unique(
+                    np.column_stack([chain, edge]), axis=0
+                ).T  # pieces of an edge share their ends
+                parts.append((edge, some.patch[chain]))
+        edge, patches = (np.concatenate(p) for p in zip(*parts, strict=True))
+        return edge, patches
 
     def _keep(self, order: int) -> list[Chains]:
         """All chains of 0, 1 ... reflections, up to ``order`` or as far as they are few; found once."""
@@ -293,11 +336,8 @@ class MirrorImages:
         words = wp.zeros((len(chains), len(ends.leaf_radius)), dtype=wp.uint32, device=where)
         inputs = [self._on_device, patch, cones, ends.points, ends.leaf_middle, ends.leaf_radius, words]
         _device.launch(kernels.find_chains, words.size, inputs, device=where)
-        words_ = words.numpy()
-        chain, leaf = np.nonzero(words_)
-        octets = words_[chain, leaf].astype("<u4", copy=False).view(np.uint8).reshape(-1, 4)
-        some, bit = np.nonzero(np.unpackbits(octets, axis=1, bitorder="little"))
-        chain, row = chain[some], ends.order[32 * leaf[some] + bit]
+        chain, leaf, bit = _set_bits(words.numpy())
+        row = ends.order[32 * leaf + bit]
         patches = chains.patch[chain]
         point = wp.zeros(patches.shape, dtype=wp.vec3d, device=where)
         inputs = [
@@ -325,6 +365,45 @@ class _Ends:
         )
         low, high = low.min(axis=0), high.max(axis=0)
         self.middle, self.radius = 0.5 * (low + high), 1e-6 + 0.5 * float(np.linalg.norm(high - low))
+
+
+class EdgeLeaves:
+    """Edges in pieces, in leaves of 32 neighbours with a ball around each.
+
+    Args:
+        edges: Which edges.
+        where: Where ways over them are sought.
+    """
+
+    def __init__(self, edges: Edges, where: wp.Device) -> None:
+        count = np.maximum(1, np.ceil(edges.length / _PIECE_M)).astype(int)
+        edge = np.repeat(np.arange(len(edges)), count)
+        piece = edges.length[edge] / count[edge]
+        start = (np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)) * piece
+        start = edges.start[edge] + start[:, None] * edges.along[edge]
+        middle = start + 0.5 * piece[:, None] * edges.along[edge]
+        order = _along_curve(middle)
+        self.edge, start, piece, middle = edge[order], start[order], piece[order], middle[order]
+        own, first = edges.take(self.edge), np.arange(0, len(order), 32)
+        half = 0.5 * piece[:, None] * np.abs(own.along)
+        low, high = np.minimum.reduceat(middle - half, first), np.maximum.reduceat(middle + half, first)
+        self.radius = 1e-6 + 0.5 * np.linalg.norm(high - low, axis=1)
+        below = np.cross(own.along, own.inward), own.n[:, None] * np.pi
+        far = np.sin(below[1]) * own.inward - np.cos(below[1]) * below[0]
+        self.on_device = edge_kernels.EdgePieces()
+        for name, vectors in (("start", start), ("along", own.along), ("first", below[0]), ("last", far)):
+            setattr(self.on_device, name, wp.array(vectors, dtype=wp.vec3d, device=where))
+        self.on_device.leaf_middle = wp.array(0.5 * (low + high), dtype=wp.vec3d, device=where)
+        for name, lengths in (("length", piece), ("leaf_radius", self.radius)):
+            setattr(self.on_device, name, wp.array(lengths, dtype=wp.float64, device=where))
+
+
+def _set_bits(words: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Row, column and number of each bit that is set in ``words`` (C, K), lowest first."""
+    row, column = np.nonzero(words)
+    octets = words[row, column].astype("<u4", copy=False).view(np.uint8).reshape(-1, 4)
+    some, bit = np.nonzero(np.unpackbits(octets, axis=1, bitorder="little"))
+    return row[some], column[some], bit
 
 
 def _joined(parts: list[Chains], order: int) -> Chains:

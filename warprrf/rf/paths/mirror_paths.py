@@ -5,10 +5,14 @@ between. Soft blocking is for a surface fused from photos, which is right to cen
 single ray is a poor judge of what it lets through. Each path is tried along several rays that fill its first Fresnel
 zone, widened by the mesh's position error; the share that arrives is taken as the share of the field (Kirchhoff's
 approximation of a partly covered zone), so that power falls with its square.
+
+Where :class:`~warprrf.rf.paths.slabs.Walls` are given, a path may also pass them. Its mirror points are the same, because a
+slab does not bend its way.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from itertools import chain
 
@@ -19,6 +23,7 @@ from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.rf.paths.images import MirrorImages
 from warprrf.rf.paths.polarisation import turns
+from warprrf.rf.paths.slabs import Slabs, Walls
 
 ZONE_RINGS = ((0.0, 1), (0.5, 6), (0.9, 8))
 """Radii (share of a Fresnel zone's) and numbers of the rays that fill it: about equal areas each."""
@@ -27,35 +32,60 @@ LEAST_SHARE = 0.05  # paths that keep less of their field are dropped: -26 dB
 
 @dataclass(frozen=True)
 class MirrorPaths:
-    """Line of sight and mirror paths of several receivers, L rows, of up to K reflections.
+    """Line of sight and mirror paths of several receivers, L rows, over up to K mirrors and slabs.
 
     Attributes:
         receiver: Index of the receiver, shape ``(L,)``.
-        patch: Patches met, from the transmitter on, -1 past the last, shape ``(L, K)``.
-        point: Mirror points [m], shape ``(L, K, 3)``; NaN past the last.
+        patch: Patches that mirror, from the transmitter on, -1 for a slab and past the last, shape ``(L, K)``.
+        slab: Faces by which slabs are entered, -1 for a mirror and past the last, shape ``(L, K)``.
+        point: Points where either is met [m], shape ``(L, K, 3)``; NaN past the last.
         share: Part of the field that is not blocked, shape ``(L,)``, in (0, 1].
         length_m: Unfolded length, shape ``(L,)``.
         arrival: Unit direction from the receiver to what it sees last, shape ``(L, 3)``.
-        cosine: Cosine of incidence at each mirror, 0 past the last, shape ``(L, K)``.
+        normal: Unit normal of each, either way, shape ``(L, K, 3)``; NaN past the last.
+        cosine: Cosine of incidence at each, 0 past the last, shape ``(L, K)``.
         turn: Angle of its plane of incidence to the one before [rad], shape ``(L, K)``; see :mod:`.polarisation`.
+        thickness_m: Of a slab that is a solid, else NaN, shape ``(L, K)``.
+        over_edge: Whether the path goes over an edge, and over no mirror but those that ``share`` counts, shape ``(L,)``.
     """
 
     receiver: np.ndarray
     patch: np.ndarray
+    slab: np.ndarray
     point: np.ndarray
     share: np.ndarray
     length_m: np.ndarray
     arrival: np.ndarray
+    normal: np.ndarray
     cosine: np.ndarray
     turn: np.ndarray
+    thickness_m: np.ndarray
+    over_edge: np.ndarray
 
     def __len__(self) -> int:
         return len(self.receiver)
 
     @property
     def order(self) -> np.ndarray:
-        """Number of reflections, shape ``(L,)``: 0 is line of sight."""
+        """Number of reflections, shape ``(L,)``: 0 is line of sight, or a path over an edge."""
         return (self.patch >= 0).sum(axis=1)
+
+    @property
+    def in_sight(self) -> np.ndarray:
+        """Which are line of sight, shape ``(L,)``."""
+        return (self.order == 0) & (self.slabs == 0) & ~self.over_edge
+
+    @property
+    def slabs(self) -> np.ndarray:
+        """Number of slabs that are passed, shape ``(L,)``."""
+        return (self.slab >= 0).sum(axis=1)
+
+    @property
+    def by_interactions(self) -> Iterator[tuple[int, np.ndarray]]:
+        """Numbers of mirrors and slabs, and the paths over so many."""
+        count = self.order + self.slabs
+        for k in np.unique(count):
+            yield int(k), np.flatnonzero(count == k)
 
     def subset(self, chosen: np.ndarray) -> MirrorPaths:
         """The rows ``chosen``."""
@@ -68,9 +98,14 @@ class MirrorPaths:
 
 
 def exact_paths(
-    images: MirrorImages, receivers: np.ndarray, order: int, progress: Progress | None = None
+    images: MirrorImages,
+    receivers: np.ndarray,
+    order: int,
+    progress: Progress | None = None,
+    walls: Walls | None = None,
 ) -> MirrorPaths:
-    """All unobstructed paths to ``receivers`` (R, 3) with at most ``order`` reflections, by receiver, then by order.
+    """All unobstructed paths to ``receivers`` (R, 3) with at most ``order`` reflections, and those that ``walls`` let
+    through, by receiver, then by order.
 
     A mirror point lies in its patch's faces. Paths through one place on two patches (faces that overlap, or the seam
     between them) count once.
@@ -85,16 +120,22 @@ def exact_paths(
         for j in range(k):
             own = patches.contains(patch[:, j], point[:, j])
             row, patch, point = row[own], patch[own], point[own]
-        free = unobstructed(patches, source, receivers[row], patch, point, images.device)
-        row, patch, point = row[free], patch[free], point[free]
         # Sheets closer than the tolerance don't hide each other: seen at a slant, their mirror points lie further apart.
-        once = _distinct(row, point, 3.0 * patches.tolerance_m)
-        parts.append(
-            _described(
-                patches, source, receivers, (row[once], patch[once], point[once], np.ones(len(once))), order
-            )
-        )
-    paths = _joined(parts)
+        free = unobstructed(patches, source, receivers[row], patch, point, images.device)
+        clear = np.flatnonzero(free)
+        clear = clear[distinct(row[clear], point[clear], 3.0 * patches.tolerance_m)]
+        found = row[clear], patch[clear], point[clear], np.ones(len(clear))
+        parts.append(_described(patches, source, receivers, found, order, walls))
+        if walls is not None:
+            dark = np.flatnonzero(~free)
+            legs = _legs(patches, source, receivers[row[dark]], patch[dark], point[dark], patches.tolerance_m)
+            through, slabs = _passed(walls, *legs)
+            through = dark[through]
+            own = distinct(row[through], point[through], 3.0 * patches.tolerance_m)
+            own, slabs = through[own], [s.take(own) for s in slabs]
+            found = row[own], patch[own], point[own], np.ones(len(own))
+            parts.append(_described(patches, source, receivers, found, order, walls, slabs))
+    paths = joined(parts)
     return paths.subset(np.argsort(paths.receiver, kind="stable"))
 
 
@@ -105,11 +146,14 @@ def zone_paths(
     wavelength_m: float,
     position_error_m: float,
     progress: Progress | None = None,
+    walls: Walls | None = None,
 ) -> MirrorPaths:
     """Paths to ``receivers`` (R, 3) with at most ``order`` reflections, and what share of their Fresnel zones is free.
 
     A mirror point needs a surface of the patch at that place, not a face of exact outline. Of several reflections the
-    middle ray must be free; line of sight and single mirrors may be partly covered anywhere.
+    middle ray must be free; line of sight and single mirrors may be partly covered anywhere. Where ``walls`` may be
+    passed, a path whose middle ray meets some goes through what that one passes, with the share of its zone that arrives
+    freely or through.
 
     Args:
         images: Its boxes say how far beside its faces a patch may still mirror.
@@ -118,6 +162,7 @@ def zone_paths(
         wavelength_m: Wavelength [m].
         position_error_m: Position error of the surface: zones are wider, and rays end that much before it [m].
         progress: Called with the stage ``"mirrors"``.
+        walls: What may be passed.
 
     Returns:
         Rows by order. Those with less than :data:`LEAST_SHARE` of their field are left out.
@@ -125,17 +170,36 @@ def zone_paths(
     Raises:
         ValueError: before anything is traced, if more chains would be tried than ``images`` allow.
     """
-    zone = ZoneRays(images.patches, images.transmitter, wavelength_m, position_error_m, images.device)
-    parts = [_described(images.patches, images.transmitter, receivers, zone.line_of_sight(receivers), order)]
-    for row, patch, point in images.search(receivers, order, progress):
-        if patch.shape[1] > 1:
+    patches, source = images.patches, images.transmitter
+    zone = ZoneRays(patches, source, wavelength_m, position_error_m, images.device)
+    through = ZoneRays(patches, source, wavelength_m, position_error_m, images.device, walls)
+    none, parts = np.zeros((len(receivers), 0)), list[MirrorPaths]()
+    direct = np.arange(len(receivers)), none.astype(np.int32), none[..., None].repeat(3, axis=2)
+    for k, (row, patch, point) in enumerate(chain([direct], images.search(receivers, order, progress))):
+        kept = np.ones(len(row), bool)
+        if k > 1 or walls is not None:
             free = zone.reached(receivers[row], patch, point)
-            row, patch, point = row[free], patch[free], point[free]
-        share = zone.mirror_share(receivers[row], patch, point)
-        parts.append(
-            _described(images.patches, images.transmitter, receivers, (row, patch, point, share), order)
-        )
-    return _joined(parts)
+            kept = free if k > 1 else kept
+        if walls is not None:
+            dark = np.flatnonzero(~free)
+            dark = dark[through.reached(receivers[row[dark]], patch[dark], point[dark])]
+            passed, slabs = _passed(
+                walls,
+                *_legs(patches, source, receivers[row[dark]], patch[dark], point[dark], position_error_m),
+            )
+            dark = dark[passed]
+            kept[dark] = False
+            found = (
+                row[dark],
+                patch[dark],
+                point[dark],
+                through.share(receivers[row[dark]], patch[dark], point[dark]),
+            )
+            parts.append(_described(patches, source, receivers, found, order, walls, slabs))
+        row, patch, point = row[kept], patch[kept], point[kept]
+        found = row, patch, point, zone.share(receivers[row], patch, point)
+        parts.append(_described(patches, source, receivers, found, order, walls))
+    return joined(parts)
 
 
 class ZoneRays:
@@ -148,8 +212,9 @@ class ZoneRays:
         wavelength_m: float,
         position_error_m: float,
         device: DeviceLike,
+        walls: Walls | None = None,
     ) -> None:
-        self.patches, self.source, self.wavelength_m = patches, source, wavelength_m
+        self.patches, self.source, self.wavelength_m, self.walls = patches, source, wavelength_m, walls
         self.position_error_m, self.device = position_error_m, device
         self.samples = np.array(
             [
@@ -165,8 +230,12 @@ class ZoneRays:
             self.wavelength_m * near * far / np.maximum(near + far, 1e-9) + self.position_error_m**2
         )
 
-    def line_of_sight(self, receivers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Receiver, no patches, no points, and share, by rays over the zone's widest place."""
+    def share(self, ends: np.ndarray, patch: np.ndarray, point: np.ndarray) -> np.ndarray:
+        """Share of each path's rays that arrive, shape ``(L,)``."""
+        return self._mirror_share(ends, patch, point) if patch.shape[1] else self._direct_share(ends)
+
+    def _direct_share(self, receivers: np.ndarray) -> np.ndarray:
+        """That of line of sight, by rays over the zone's widest place."""
         count = len(receivers)
         way = self.source - receivers
         length = np.linalg.norm(way, axis=1)
@@ -178,12 +247,10 @@ class ZoneRays:
         free = self.clear(start, middle.reshape(-1, 3))
         left = np.flatnonzero(free)
         free[left] = self.clear(middle.reshape(-1, 3)[left], np.broadcast_to(self.source, (len(left), 3)))
-        share = free.reshape(count, len(self.samples)).mean(axis=1)
-        none = np.zeros((count, 0))
-        return np.arange(count), none.astype(np.int32), np.zeros((count, 0, 3)), share
+        return np.asarray(free.reshape(count, len(self.samples)).mean(axis=1))
 
-    def mirror_share(self, ends: np.ndarray, patch: np.ndarray, point: np.ndarray) -> np.ndarray:
-        """Share of each path's rays that arrive; a zone cuts a patch's plane in an ellipse, longer by 1 / cos."""
+    def _mirror_share(self, ends: np.ndarray, patch: np.ndarray, point: np.ndarray) -> np.ndarray:
+        """That of mirror paths; a zone cuts a patch's plane in an ellipse, longer by 1 / cos."""
         count, order = patch.shape
         legs = np.diff(stops_of(self.source, point, ends), axis=1)
         lengths = np.linalg.norm(legs, axis=2)
@@ -207,7 +274,7 @@ class ZoneRays:
     def reached(
         self, ends: np.ndarray, patch: np.ndarray, point: np.ndarray, lift: np.ndarray | None = None
     ) -> np.ndarray:
-        """Whether each leg reaches its patch and nothing stands between, shape ``(L,)``.
+        """Whether each leg reaches its patch and nothing stands between, or nothing but walls, shape ``(L,)``.
 
         ``lift`` is added to ``ends`` where rays start, for ends on a surface.
         """
@@ -219,21 +286,31 @@ class ZoneRays:
             normal, offset = self.patches.normal[patch[:, k]], self.patches.offset[patch[:, k]]
             side = np.sign((here * normal).sum(axis=1) - offset)
             here = point[:, k] + (self.position_error_m * side)[:, None] * normal
-        own = np.flatnonzero(free)
-        free[own] = self.clear(point[own, 0], np.broadcast_to(self.source, (len(own), 3)))
+        own, last = np.flatnonzero(free), point[:, 0] if patch.shape[1] else here
+        free[own] = self.clear(last[own], np.broadcast_to(self.source, (len(own), 3)))
         return free
 
     def clear(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Whether nothing lies between a and b (N, 3), but within the position error of either end."""
+        """Whether nothing lies between a and b (N, 3), or nothing but walls, but within the position error of either end."""
         way = b - a
         length = np.linalg.norm(way, axis=1)
         toward = way / np.maximum(length, 1e-12)[:, None]
-        hit = self.patches.mesh.cast(a + self.position_error_m * toward, toward, device=self.device)
-        return (length <= 2 * self.position_error_m) | (hit.t >= length - 2 * self.position_error_m)
+        start = a + self.position_error_m * toward
+        hit = self.patches.mesh.cast(start, toward, device=self.device)
+        free = (length <= 2 * self.position_error_m) | (hit.t >= length - 2 * self.position_error_m)
+        if self.walls is not None:
+            dark = np.flatnonzero(~free)
+            free[dark[self.walls.between(start[dark], b[dark])[0]]] = True
+        return np.asarray(free)
 
     def _meets(self, start: np.ndarray, target: np.ndarray, patch: np.ndarray) -> np.ndarray:
-        """Whether the ray from ``start`` first meets a surface at ``target``, on the plane of ``patch``."""
-        p = self.patches
+        """Whether the ray from ``start`` first meets a surface, behind walls perhaps, at ``target``, on the plane of ``patch``."""
+        p, reached = self.patches, np.ones(len(start), bool)
+        if self.walls is not None:
+            back = (start - target) / np.maximum(np.linalg.norm(start - target, axis=1, keepdims=True), 1e-12)
+            before = target + 3.0 * self.position_error_m * back
+            reached[:] = np.isin(np.arange(len(start)), self.walls.between(start, before)[0])
+            start = before
         way = target - start
         length = np.linalg.norm(way, axis=1)
         hit = p.mesh.cast(start, way / np.maximum(length, 1e-12)[:, None], device=self.device)
@@ -241,7 +318,9 @@ class ZoneRays:
         met = p.face_patch[np.maximum(hit.face, 0)]
         # A torn seam of the patch passes for it, another patch does not.
         off = np.abs((np.nan_to_num(hit.point) * p.normal[patch]).sum(axis=1) - p.offset[patch])
-        return (hit.face >= 0) & ((met == patch) | (near & (off <= self.position_error_m) & (met < 0)))
+        return (
+            reached & (hit.face >= 0) & ((met == patch) | (near & (off <= self.position_error_m) & (met < 0)))
+        )
 
 
 def unobstructed(
@@ -254,34 +333,51 @@ def unobstructed(
 ) -> np.ndarray:
     """Whether every leg of each path is free, shape ``(L,)``.
 
-    A leg begins off its mirror by the patches' tolerance, so that the mirror's own faces are not met; it is drawn out by
-    the clearance that :meth:`Mesh.visible` leaves at ends, so that whatever lies further off than the tolerance is.
+    See :func:`_legs`; a leg is also drawn out by the clearance that :meth:`Mesh.visible` leaves at ends, so that whatever
+    lies further off than the tolerance is met.
     """
-    stops = stops_of(source, point, ends)
+    begin, end = _legs(patches, source, ends, patch, point, patches.tolerance_m)
+    toward = (end - begin) / np.maximum(np.linalg.norm(end - begin, axis=2, keepdims=True), 1e-12)
+    begin[:, 1:] -= ENDPOINT_CLEARANCE * toward[:, 1:]
+    end[:, :-1] += ENDPOINT_CLEARANCE * toward[:, :-1]
     free = np.ones(len(patch), bool)
     for k in range(patch.shape[1] + 1):
         own = np.flatnonzero(free)
-        a, b = stops[own, k], stops[own, k + 1]
-        toward = (b - a) / np.maximum(np.linalg.norm(b - a, axis=1, keepdims=True), 1e-12)
-        begin = _off_mirror(patches, patch[own], a, b, k - 1) - (k > 0) * ENDPOINT_CLEARANCE * toward
-        end = _off_mirror(patches, patch[own], b, a, k) + (k < patch.shape[1]) * ENDPOINT_CLEARANCE * toward
-        free[own] = patches.mesh.visible(begin, end, device=device) if len(own) else False
+        free[own] = patches.mesh.visible(begin[own, k], end[own, k], device=device) if len(own) else False
     return free
 
 
-def _off_mirror(
-    patches: PlanarPatches, patch: np.ndarray, point: np.ndarray, other: np.ndarray, k: int
-) -> np.ndarray:
-    """``point`` (L, 3) on mirror k of each path, off it by the mirrors' tolerance on the side of ``other``; as it is for
-    the ends of the path."""
-    if not 0 <= k < patch.shape[1]:
-        return point
-    normal, offset = patches.normal[patch[:, k]], patches.offset[patch[:, k]]
-    side = np.sign((other * normal).sum(axis=1) - offset)
-    return point + (patches.tolerance_m * side)[:, None] * normal
+def _legs(
+    patches: PlanarPatches,
+    source: np.ndarray,
+    ends: np.ndarray,
+    patch: np.ndarray,
+    point: np.ndarray,
+    lift_m: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Starts and ends of the legs of each path, shape ``(L, k + 1, 3)``: off their mirrors by ``lift_m``, so that the mirrors'
+    own faces are not met."""
+    stops = stops_of(source, point, ends)
+    begin, end = stops[:, :-1].copy(), stops[:, 1:].copy()
+    for k in range(patch.shape[1]):
+        normal, offset = patches.normal[patch[:, k]], patches.offset[patch[:, k]]
+        for place, leg, other in ((end, k, k), (begin, k + 1, k + 2)):
+            side = np.sign((stops[:, other] * normal).sum(axis=1) - offset)
+            place[:, leg] += (lift_m * side)[:, None] * normal
+    return begin, end
 
 
-def _distinct(row: np.ndarray, point: np.ndarray, distance_m: float) -> np.ndarray:
+def _passed(walls: Walls, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, list[Slabs]]:
+    """Which paths arrive through at most as many slabs as ``walls`` allow, and what each leg passes on those."""
+    rows, slabs = np.arange(len(begin)), list[Slabs]()
+    for k in range(begin.shape[1]):
+        arrived, found = walls.between(begin[rows, k], end[rows, k])
+        rows, slabs = rows[arrived], [*(s.take(arrived) for s in slabs), found]
+    few = np.flatnonzero(sum((s.count for s in slabs), np.zeros(len(rows), int)) <= walls.most)
+    return rows[few], [s.take(few) for s in slabs]
+
+
+def distinct(row: np.ndarray, point: np.ndarray, distance_m: float) -> np.ndarray:
     """Indices of paths that no earlier one of the same receiver repeats, all points within ``distance_m``, sorted."""
     if point.shape[1] == 0 or len(row) < 2:
         return np.arange(len(row))
@@ -303,27 +399,65 @@ def _described(
     source: np.ndarray,
     receivers: np.ndarray,
     found: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-    columns: int,
+    order: int,
+    walls: Walls | None = None,
+    slabs: list[Slabs] | None = None,
 ) -> MirrorPaths:
-    """Rows of paths of one order (receiver, patch, point, share), what they lack of ``columns`` filled up."""
-    row, patch, point, share = (a[found[3] >= LEAST_SHARE] for a in found)
-    stops = stops_of(source, point, receivers[row])
-    legs = np.diff(stops, axis=1)
-    lengths = np.linalg.norm(legs, axis=2)
-    along = legs / np.maximum(lengths, 1e-12)[..., None]
-    normal = patches.normal[patch]
-    empty = max(columns, 1) - patch.shape[1]
-    rest = ((0, 0), (0, empty))
+    """Rows of paths of one order (receiver, patch, point, share) over what ``slabs`` each leg passes, what they lack of all
+    columns filled up."""
+    kept = np.flatnonzero(found[3] >= LEAST_SHARE)
+    row, patch, point, share = (a[kept] for a in found)
+    most = max(order, 1) + (walls.most if walls else 0)
+    normal, slab = patches.normal[patch], np.full(patch.shape, -1, np.int32)
+    thickness = np.full(patch.shape, np.nan)
+    if walls is not None and slabs is not None:
+        mesh, stops, columns = (
+            patches.mesh,
+            stops_of(source, point, receivers[row]),
+            list[tuple[np.ndarray, ...]](),
+        )
+        for k, s in enumerate(s.take(kept) for s in slabs):
+            leg = stops[:, k + 1] - stops[:, k]
+            for j in range(walls.most):
+                met = s.face[:, j] >= 0
+                turned = np.where(met[:, None], mesh.face_normals[s.face[:, j]], np.nan)
+                corner = mesh.triangles[s.face[:, j], 0]
+                with np.errstate(invalid="ignore", divide="ignore"):  # where none is met
+                    part = ((corner - stops[:, k]) * turned).sum(axis=1) / (leg * turned).sum(axis=1)
+                at = stops[:, k] + part[:, None] * leg
+                columns.append(
+                    (np.full(len(row), -1, np.int32), s.face[:, j], at, turned, s.thickness_m[:, j])
+                )
+            if k < patch.shape[1]:
+                columns.append((patch[:, k], slab[:, k], point[:, k], normal[:, k], thickness[:, k]))
+        patch, slab, point, normal, thickness = (np.stack(c, axis=1) for c in zip(*columns, strict=True))
+        first = np.argsort((patch < 0) & (slab < 0), axis=1, kind="stable")
+        patch, slab, thickness = (np.take_along_axis(a, first, axis=1) for a in (patch, slab, thickness))
+        point, normal = (np.take_along_axis(a, first[..., None], axis=1) for a in (point, normal))
+    count, columns_now = ((patch >= 0) | (slab >= 0)).sum(axis=1), patch.shape[1]
+    length, arrival = np.zeros(len(row)), np.zeros((len(row), 3))
+    cosine, turn = np.zeros((2, len(row), columns_now))
+    for k in np.unique(count):
+        own = np.flatnonzero(count == k)
+        stops = stops_of(source, point[own, :k], receivers[row[own]])
+        legs = np.diff(stops, axis=1)
+        lengths = np.linalg.norm(legs, axis=2)
+        along = legs / np.maximum(lengths, 1e-12)[..., None]
+        length[own], arrival[own] = lengths.sum(axis=1), -along[:, -1]
+        cosine[own, :k] = np.abs((along[:, :-1] * normal[own, :k]).sum(axis=2))
+        turn[own, :k] = turns(stops, normal[own, :k])
+
+    def filled(a: np.ndarray, value: float) -> np.ndarray:
+        shape = len(row), most, *a.shape[2:]
+        out = np.full(shape, value, a.dtype)
+        out[:, : min(most, columns_now)] = a[:, :most]
+        return out
+
     return MirrorPaths(
-        receiver=row,
-        patch=np.pad(patch, rest, constant_values=-1),
-        point=np.pad(point, (*rest, (0, 0)), constant_values=np.nan),
-        share=share,
-        length_m=lengths.sum(axis=1),
-        arrival=-along[:, -1],
-        cosine=np.pad(np.abs((along[:, :-1] * normal).sum(axis=2)), rest),
-        turn=np.pad(turns(stops, normal), rest),
-    )
+        receiver=row, patch=filled(patch, -1), slab=filled(slab, -1), point=filled(point, np.nan), share=share,
+        length_m=length, arrival=arrival, normal=filled(normal, np.nan), cosine=filled(cosine, 0.0), turn=filled(turn, 0.0),
+        thickness_m=filled(thickness, np.nan), over_edge=np.zeros(len(row), bool),
+    )  # fmt: skip
 
 
 def stops_of(source: np.ndarray, point: np.ndarray, ends: np.ndarray) -> np.ndarray:
@@ -331,7 +465,8 @@ def stops_of(source: np.ndarray, point: np.ndarray, ends: np.ndarray) -> np.ndar
     return np.concatenate([np.broadcast_to(source, (len(ends), 1, 3)), point, ends[:, None]], axis=1)
 
 
-def _joined(parts: list[MirrorPaths]) -> MirrorPaths:
+def joined(parts: list[MirrorPaths]) -> MirrorPaths:
+    """All paths of ``parts``, one after another."""
     return MirrorPaths(
         **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(MirrorPaths)}
     )

@@ -17,12 +17,20 @@ from typing import Any
 import numpy as np
 
 from warprrf import netcdf_files
-from warprrf.checks import Expected, check_arrays, check_positive, checked, lengths, one_line
+from warprrf.checks import (
+    Expected,
+    check_arrays,
+    check_known_whole,
+    check_positive,
+    checked,
+    lengths,
+    one_line,
+)
 from warprrf.netcdf_files import Variable
 from warprrf.rf.channel import dispersion as dispersions
 from warprrf.rf.channel import response
 from warprrf.rf.channel.arrays import PlanarArray
-from warprrf.rf.channel.path_arrays import PathArrays
+from warprrf.rf.channel.path_arrays import PADDING, PathArrays
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.paths import sionna
 from warprrf.tensor_files import named
@@ -64,8 +72,7 @@ class Paths(PathArrays):
         """Paths that Sionna RT solved, with their Jones matrices, arrays ``(R, L)``, strongest path first.
 
         Sionna's arrays must be one isotropic element of polarisation "VH" at either end, unrotated: their four
-        coefficients are the Jones matrix. The phase of ``gain`` is that of the delay alone. Paths through walls and round
-        edges are "mirror" paths here: sharp, and not in line of sight.
+        coefficients are the Jones matrix. The phase of ``gain`` is that of the delay alone.
 
         Args:
             paths: What a ``PathSolver`` returned, with ``synthetic_array=True`` as by default.
@@ -97,7 +104,7 @@ class Paths(PathArrays):
         return several[0] if one_receiver else several
 
 
-KINDS = ("", "los", "mirror", "diffuse")
+KINDS = ("", "los", "mirror", "diffuse", "slab", "edge")
 """What the values 0, 1, ... of the variable ``kind`` mean."""
 
 _FORMAT = "warprrf paths 1"
@@ -111,14 +118,19 @@ _UNITS = {
     "phi_t": ("rad", "azimuth of departure"),
 }
 _FLAGS = {
-    "flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": "none los mirror diffuse",
+    "flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": " ".join(("none", *KINDS[1:])),
 }  # fmt: skip
+_CODES = {
+    "flag_values": np.array([0, 1, 2, 4, 8], np.int8),
+    "flag_meanings": "none mirror scatter transmission diffraction",
+}
 PATH_VARIABLES = {
     "vertices": Variable(
         (*_SEVERAL, "vertex", "xyz"), "m", {"long_name": "interaction points from the transmitter on"}
     ),
     "kind": Variable(_SEVERAL, about=_FLAGS),
     "valid": Variable(_SEVERAL),
+    "interactions": Variable((*_SEVERAL, "vertex"), about=_CODES, optional=True),
     **{name: Variable(_SEVERAL, unit, {"long_name": text}) for name, (unit, text) in _UNITS.items()},
     "gain_real": Variable(_SEVERAL, "1"),
     "gain_imag": Variable(_SEVERAL, "1"),
@@ -136,6 +148,7 @@ _ARRAYS = {
     "vertices": Expected("R L D 3", nan=True),
     "kind": Expected("R L", 0, len(KINDS) - 1, kind="iu"),
     "valid": Expected("R L", 0, 1, kind="iu"),
+    "interactions": Expected("R L D", 0, 8, kind="iu"),
     "tau": Expected("R L", 0.0, 1.0, nan=True),
     **{name: Expected("R L", -7.0, 7.0, nan=True) for name in list(_UNITS)[1:]},
     "receiver_position": lengths("R 3"),
@@ -152,6 +165,7 @@ def arrays_of(paths: PathArrays) -> dict[str, np.ndarray]:
         "vertices": paths.vertices,
         "kind": np.asarray(codes, dtype=np.int8),
         "valid": paths.valid.astype(np.int8),
+        "interactions": paths.interactions,
         **{name: getattr(paths, name) for name in _UNITS},
     }
     for name, values in (("gain", paths.gain), ("jones", paths.jones)):
@@ -198,16 +212,25 @@ def read_paths(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bool]:
             raise ValueError(f"it holds {attributes.get('format')!r}, expected {_FORMAT!r}")
         check_arrays(held, {name: wanted for name, wanted in _ARRAYS.items() if name in held})
         carrier = attributes.get("frequency_hz")
+        there = {"jones_real", "jones_imag"} & held.keys()
         fields: dict[str, Any] = {
             "gain": held["gain_real"] + 1j * held["gain_imag"],
             "vertices": held["vertices"],
             "kind": np.array(KINDS, dtype="<U7")[held["kind"].astype(int)],
             "valid": held["valid"].astype(bool),
-            "jones": held["jones_real"] + 1j * held["jones_imag"] if "jones_real" in held else None,
+            "jones": held["jones_real"] + 1j * held["jones_imag"] if there else None,
             "frequency_hz": None if carrier is None else check_positive("frequency_hz", carrier),
             "transmitter": held.get("transmitter_position", held.get("transmitter_positions")),
             "receiver": held.get("receiver_position"),
             "air": Air.from_attributes(attributes),
-            **{name: held[name] for name in _UNITS},
+            **{name: held[name] for name in (*_UNITS, "interactions") if name in held},
         }
+        for name, empty in PADDING.items():
+            if fields.get(name) is not None:
+                fields[name][~fields["valid"]] = empty
+        check_known_whole("vertices", fields["vertices"])
+        for way, angles in (("arrival", ("theta_r", "phi_r")), ("departure", ("theta_t", "phi_t"))):
+            check_known_whole(way, np.stack([fields[name] for name in angles], axis=-1))
+        if there:
+            check_known_whole("jones", fields["jones"], axes=2)
         return fields, bool(attributes["single_receiver"])

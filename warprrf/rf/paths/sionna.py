@@ -8,8 +8,9 @@ there: polarisation by polarisation, then element by element. There is one trans
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,18 +18,11 @@ from numpy.typing import ArrayLike
 from warprrf import device as _device
 from warprrf.checks import check_array, check_count, checked, one_line
 from warprrf.rf.channel.arrays import PlanarArray
-from warprrf.rf.channel.path_arrays import PathArrays
+from warprrf.rf.channel.path_arrays import EDGE, SCATTER, SLAB, PathArrays
 from warprrf.rf.channel.response import channel_taps, frequency_response, impulse_response
-from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase, check_frequency
-from warprrf.rf.spectra.spectrum import directions_from_angles
+from warprrf.rf.em.waves import carrier_phase, check_frequency
 
-SPECULAR, DIFFUSE = 1, 2
-"""``sionna.rt.InteractionType``."""
-SAME_LENGTH_M = (
-    5e-3  # paths nearer than this in length and direction are one: Sionna takes planes 1 cm apart for one
-)
 MOST_TIME_STEPS = 1_000_000
-SAME_DIRECTION_RAD = 1e-3
 
 
 @checked
@@ -41,9 +35,10 @@ class SionnaPaths:
         tau: Delays [s], shape ``(R, 1, L)``; -1 where there is no path.
         theta_t, phi_t, theta_r, phi_r: Angles of departure and arrival [rad], shape ``(R, 1, L)``; 0 where none.
         valid: Shape ``(R, 1, L)``, bool.
-        interactions: ``sionna.rt.InteractionType`` (1 specular, 2 diffuse, 0 none), shape ``(depth, R, 1, L)``.
+        interactions: ``sionna.rt.InteractionType`` (1 specular, 2 diffuse, 4 refraction, 8 diffraction, 0 none), shape
+            ``(depth, R, 1, L)``.
         vertices: Interaction points [m], shape ``(depth, R, 1, L, 3)``; 0 where none.
-        synthetic_array: True.
+        synthetic_array: always True.
     """
 
     __repr__ = one_line
@@ -57,7 +52,7 @@ class SionnaPaths:
     valid: np.ndarray
     interactions: np.ndarray
     vertices: np.ndarray
-    synthetic_array: bool
+    synthetic_array: ClassVar[bool] = True
     _paths: PathArrays
     _options: dict[str, Any]
 
@@ -149,9 +144,6 @@ def to_sionna(
         valid &= several.kind != "diffuse"
     passband = coefficient * carrier_phase(-several.carrier_hz, np.where(valid, tau, 0.0))[:, None, None]
     there = np.isfinite(several.vertices[..., 0]) & valid[..., None]
-    depth = np.arange(several.vertices.shape[-2])
-    last = depth == there.sum(axis=-1, keepdims=True) - 1
-    kinds = np.where(last & (several.kind == "diffuse")[..., None], DIFFUSE, SPECULAR)
 
     def angle(values: np.ndarray) -> np.ndarray:
         return np.where(valid, values, 0.0)[:, None]
@@ -164,9 +156,8 @@ def to_sionna(
         theta_r=angle(several.theta_r),
         phi_r=angle(several.phi_r),
         valid=valid[:, None],
-        interactions=np.moveaxis(np.where(there, kinds, 0), -1, 0)[:, :, None],
+        interactions=np.moveaxis(np.where(there, several.interactions, 0).astype(int), -1, 0)[:, :, None],
         vertices=np.moveaxis(np.where(there[..., None], several.vertices, 0.0), -2, 0)[:, :, None],
-        synthetic_array=True,
         _paths=several,
         _options=options,
     )
@@ -176,7 +167,12 @@ def from_sionna(
     paths: Any, frequency_hz: float, transmitter: int, drop_repeated: bool
 ) -> list[dict[str, Any]]:
     """Arrays of the paths of ``sionna.rt.Paths`` from one transmitter, of each receiver; see ``Paths.from_sionna``."""
-    carrier = check_frequency(frequency_hz)
+    each = by_delay(paths, check_frequency(frequency_hz), transmitter, drop_repeated)
+    return [vars(p.select(np.argsort(-np.abs(p.gain), kind="stable"))) for p in each]
+
+
+def by_delay(paths: Any, carrier: float, transmitter: int, drop_repeated: bool) -> Iterator[PathArrays]:
+    """The paths of each receiver by rising delay: in the same order, whatever Sionna's threads did."""
     if not hasattr(paths, "synthetic_array"):
         raise TypeError(f"paths: got {type(paths).__name__}, expected what Sionna RT's PathSolver returned")
     real, imag = (np.asarray(part.numpy(), dtype=np.float64) for part in paths.a)
@@ -191,72 +187,55 @@ def from_sionna(
     def field(values: Any) -> np.ndarray:
         return np.asarray(values.numpy(), dtype=np.float64)[:, transmitter]
 
-    valid = np.asarray(paths.valid.numpy())[:, transmitter]
+    valid = np.asarray(paths.valid.numpy(), dtype=bool)[:, transmitter]
     kinds = np.asarray(paths.interactions.numpy())[:, :, transmitter]
     points = np.moveaxis(np.asarray(paths.vertices.numpy(), dtype=np.float64)[:, :, transmitter], 0, -2)
     sources, targets = (np.asarray(p.numpy(), dtype=np.float64).T for p in (paths.sources, paths.targets))
-    tau, angles = (
-        field(paths.tau),
-        [field(v) for v in (paths.theta_r, paths.phi_r, paths.theta_t, paths.phi_t)],
-    )
-    found = []
+    names = ("tau", "theta_r", "phi_r", "theta_t", "phi_t")
+    own = {name: field(getattr(paths, name)) for name in names}
     for r in range(len(a)):
         here = np.flatnonzero(valid[r])
+        here = here[np.argsort(own["tau"][r, here], kind="stable")]
+        # few have equal delays, and sorting by all keys takes long
+        same = np.diff(own["tau"][r, here], prepend=-1.0, append=-1.0) == 0
+        tied = np.flatnonzero(same[1:] | same[:-1])
+        keys = [own[name][r, here[tied]] for name in names[::-1]]
+        here[tied] = here[tied][np.lexsort(keys)]
         bounce = np.moveaxis(kinds[:, r, here], 0, -1)  # (L, depth)
-        diffuse = (bounce == DIFFUSE).any(axis=1)
         count = (bounce != 0).sum(axis=1)
-        if drop_repeated:
-            sharp = np.flatnonzero(~diffuse)
-            copy = repeated(
-                tau[r, here[sharp]],
-                directions_from_angles(angles[0][r, here[sharp]], angles[1][r, here[sharp]]),
-                np.column_stack([angles[2][r, here[sharp]], angles[3][r, here[sharp]]]),
-                count[sharp],
-            )
-            kept = np.setdiff1d(np.arange(len(here)), sharp[copy])
-            here, bounce, diffuse, count = here[kept], bounce[kept], diffuse[kept], count[kept]
-        turned = carrier_phase(carrier, tau[r, here])
+        has = [(bounce == code).any(axis=1) for code in (SCATTER, EDGE, SLAB)]
+        kind = np.select([count == 0, *has], ["los", "diffuse", "edge", "slab"], "mirror")
+        turned = carrier_phase(carrier, own["tau"][r, here])
         jones = np.moveaxis(a[r][:, :, here], -1, 0) * turned[:, None, None]
-        gain = np.sqrt(0.5 * (np.abs(jones) ** 2).sum(axis=(1, 2))) * turned
-        order = np.argsort(-np.abs(gain), kind="stable")
-        arrays = {
-            "gain": gain,
-            "tau": tau[r, here],
-            "theta_r": angles[0][r, here],
-            "phi_r": angles[1][r, here],
-            "theta_t": angles[2][r, here],
-            "phi_t": angles[3][r, here],
-            "vertices": np.where((bounce != 0)[..., None], points[r, here], np.nan),
-            "kind": np.where(count == 0, "los", np.where(diffuse, "diffuse", "mirror")).astype("<U7"),
-            "valid": np.ones(len(here), dtype=bool),
-            "jones": jones,
-        }
-        found.append(
-            {name: values[order] for name, values in arrays.items()}
-            | {"frequency_hz": carrier, "transmitter": sources[transmitter], "receiver": targets[r]}
+        found = PathArrays(
+            gain=np.sqrt(0.5 * (np.abs(jones) ** 2).sum(axis=(1, 2))) * turned,
+            vertices=np.where((bounce != 0)[..., None], points[r, here], np.nan),
+            interactions=bounce.astype(np.int8),
+            kind=kind.astype("<U7"),
+            valid=np.ones(len(here), dtype=bool),
+            jones=jones,
+            frequency_hz=carrier,
+            transmitter=sources[transmitter],
+            receiver=targets[r],
+            **{name: values[r, here] for name, values in own.items()},
         )
-    return found
+        if drop_repeated:
+            sharp = np.flatnonzero(found.kind != "diffuse")
+            found = found.select(np.delete(np.arange(len(here)), sharp[repeated(found.select(sharp))]))
+        yield found
 
 
-def repeated(tau: np.ndarray, arrival: np.ndarray, aod: np.ndarray, bounces: np.ndarray) -> np.ndarray:
-    """Which specular paths repeat an earlier one, shape ``(L,)`` bool.
+def repeated(paths: PathArrays) -> np.ndarray:
+    """Which of one receiver's specular paths repeat an earlier one, shape ``(L,)`` bool.
 
     Sionna tells mirrors apart by the rounded plane of the triangle met. Small triangles of one surface have planes that
     differ by rounding, and each is then taken for a mirror of its own: one reflection is counted several times.
-
-    Args:
-        tau: delays [s], shape ``(L,)``.
-        arrival: unit directions of arrival, shape ``(L, 3)``.
-        aod: zenith and azimuth of departure [rad], shape ``(L, 2)``.
-        bounces: interactions, shape ``(L,)``.
     """
-    departure = directions_from_angles(aod[:, 0], aod[:, 1])
-    same = (
-        (np.abs(tau[:, None] - tau) * SPEED_OF_LIGHT < SAME_LENGTH_M)
-        & (np.linalg.norm(arrival[:, None] - arrival, axis=-1) < SAME_DIRECTION_RAD)
-        & (np.linalg.norm(departure[:, None] - departure, axis=-1) < SAME_DIRECTION_RAD)
-        & (bounces[:, None] == bounces)
-    )
+    bounces = np.isfinite(paths.vertices[..., 0]).sum(axis=1)
+    # Sionna takes planes 1 cm apart for one
+    same = (bounces[:, None] == bounces) & (np.abs(paths.length_m[:, None] - paths.length_m) < 5e-3)
+    for direction in (paths.arrival, paths.departure):
+        same &= np.linalg.norm(direction[:, None] - direction, axis=-1) < 1e-3
     return np.asarray(np.tril(same, -1).any(axis=1))
 
 

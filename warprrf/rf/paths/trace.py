@@ -1,4 +1,4 @@
-"""The exact paths among all: line of sight and mirror reflections.
+"""The exact paths among all: line of sight and mirror reflections, through slabs where asked for.
 
 Mirror reflections follow the image method on the planar patches of a mesh, in float64: lengths are exact to rounding.
 Angles: arrival points from the receiver to the last interaction, departure from the transmitter to the first.
@@ -6,20 +6,25 @@ Angles: arrival points from the receiver to the last interaction, departure from
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_count, checked
 from warprrf.device import DeviceLike, Progress
-from warprrf.geometry.mesh import GeometryLike, as_mesh
+from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, GeometryLike, as_mesh
 from warprrf.geometry.planar_patches import planar_patches
+from warprrf.rf.channel.path_arrays import MIRROR, SLAB
 from warprrf.rf.em.absorption import Gas
-from warprrf.rf.em.fresnel import SurfaceTable, slab_reflection, surface_table
+from warprrf.rf.em.fresnel import SurfaceTable, slab_passage, slab_reflection, surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
+from warprrf.rf.paths.edge_paths import EdgeFinder, EdgePaths
 from warprrf.rf.paths.images import MOST_CHAINS, MirrorImages
 from warprrf.rf.paths.mirror_paths import MirrorPaths, exact_paths, stops_of
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.polarisation import jones_matrices
+from warprrf.rf.paths.slabs import Walls
 from warprrf.rf.positions import Ends, check_positions, question_unit, warn_of_unmodelled
 
 
@@ -31,6 +36,8 @@ def trace_paths(
     receivers: ArrayLike,
     frequency_hz: float,
     mirror_order: int = 1,
+    transmissions: int = 0,
+    diffractions: int = 0,
     gas: Gas = False,
     progress: Progress | None = None,
     device: DeviceLike = None,
@@ -43,17 +50,30 @@ def trace_paths(
     the TE coefficient of each reflection (-1 for a conductor), because one number cannot carry both polarisations;
     ``jones`` carries them. A bare mesh says nothing of polarisation: its paths have no ``jones``.
 
+    A slab lets waves straight through (ITU-R P.2040-4, eq. (43b)), later by what it is slower than air; such paths, with
+    mirrors or without, are of kind ``"slab"``. A wall may be a sheet, as thick as its material says, or a closed solid of
+    two faces at most :data:`~warprrf.rf.paths.slabs.THICKEST_M` apart, as thick as it is. Sionna RT takes each face for
+    a slab of its own.
+
+    Over the edge of a wedge or a sheet, paths of kind ``"edge"`` go round: one edge, and one mirror before or behind it if
+    mirrors are asked for (:mod:`~warprrf.rf.em.diffraction`, :mod:`~warprrf.rf.paths.edge_paths`). Fields add up: with them the sum
+    of ``jones``, or of a bare mesh's ``gain``, is continuous where line of sight and mirror paths end. A bare mesh's edges
+    are conductors' of hard polarisation, which has no sign change. The phase of ``gain`` is that of the field along the edge.
+
     Args:
         mesh_or_scene: A :class:`Mesh` or anything with a ``mesh``; a scene has ``face_material`` and ``materials`` too.
         transmitter, receivers: Positions [m], shapes ``(3,)`` or ``(R, 3)``, row by row.
         frequency_hz: Carrier frequency [Hz].
         mirror_order: Most reflections on one path: 0 and up.
+        transmissions: Most slabs that one path passes, 0 to 3. Of a bare mesh nothing is known to let through.
+        diffractions: Most edges on one path, 0 or 1.
         gas: Absorption of the air in every gain: see :meth:`Paths.with_gas`.
         progress: Called with the stages ``"patches"``, in which the mesh's planes are found, and ``"mirrors"``.
         device: Where chains are tried and rays cast.
 
     Returns:
-        Arrays ``(L,)`` for one receiver and transmitter, else ``(R, L)``; line of sight first, then by order, then by delay.
+        Arrays ``(L,)`` for one receiver and transmitter, else ``(R, L)``; line of sight first, then by order, then by delay;
+        then paths over edges.
 
     Raises:
         ValueError: on a position that is NaN, outside a closed room, inside a solid, or within the reactive near
@@ -62,7 +82,7 @@ def trace_paths(
             (:class:`MirrorTracer` takes another limit).
 
     Warns:
-        UserWarning: below 100 GHz and outdoors, that diffraction and transmission are not modelled.
+        UserWarning: below 100 GHz and outdoors, of diffraction and transmission if not asked for.
     """
     ends, frequency = Ends.of(receivers, transmitter), check_frequency(frequency_hz)
     mesh, wavelength_m = as_mesh(mesh_or_scene), SPEED_OF_LIGHT / frequency
@@ -70,13 +90,20 @@ def trace_paths(
     for source, own in ends.groups():
         points = ends.shaped(ends.receivers[own])
         check_positions(mesh, source, points, wavelength_m, on_surfaces=True, device=device)
-        warn_of_unmodelled(mesh, source, points, frequency_hz=frequency, device=device)
+        modelled = {"transmission": transmissions > 0, "diffraction": diffractions > 0}
+        warn_of_unmodelled(mesh, source, points, frequency_hz=frequency, device=device, **modelled)
     order = check_count("mirror_order", mirror_order, 0)
+    most = {
+        "transmissions": check_count("transmissions", transmissions, 0, 3),
+        "diffractions": check_count("diffractions", diffractions, 0, 1),
+    }
     tell: Progress = progress or (lambda stage, done, total: None)
     found: dict[int, Paths] = {}
     for source, own in ends.groups():
         tell("patches", 0, 1)
-        tracer = MirrorTracer(mesh_or_scene, transmitter=source, frequency_hz=frequency, device=device)
+        tracer = MirrorTracer(
+            mesh_or_scene, transmitter=source, frequency_hz=frequency, device=device, **most
+        )
         tell("patches", 1, 1)
         found |= zip(own.tolist(), tracer.trace_each(ends.receivers[own], order, progress), strict=True)
     several = [found[k] for k in sorted(found)]
@@ -95,6 +122,8 @@ class MirrorTracer:
         patches: What mirrors.
         images: Images of the transmitter in them.
         table: Radio properties of the scene's materials; None for a bare mesh.
+        walls: What may be passed, if anything.
+        edges: Paths over edges, if asked for.
     """
 
     def __init__(
@@ -103,6 +132,8 @@ class MirrorTracer:
         *,
         transmitter: ArrayLike,
         frequency_hz: float,
+        transmissions: int = 0,
+        diffractions: int = 0,
         max_chains: float = MOST_CHAINS,
         device: DeviceLike = None,
     ) -> None:
@@ -110,13 +141,30 @@ class MirrorTracer:
         self.transmitter = check_array("transmitter", transmitter, (3,))
         self.frequency_hz = check_frequency(frequency_hz)
         self.table: SurfaceTable | None = None
+        self.walls: Walls | None = None
+        self._face_material = np.zeros(0, np.int32)
         groups = None
         materials = getattr(mesh_or_scene, "materials", None)
         if materials is not None:
             self.table = surface_table(materials, frequency_hz)
             groups = getattr(mesh_or_scene, "face_material", None)
         self.patches = planar_patches(self.mesh, groups)
+        if transmissions and self.table is not None and groups is not None:
+            self._face_material = np.asarray(groups, np.int32)
+            eta, thickness = (
+                a[self._face_material] for a in (self.table.permittivity, self.table.thickness_m)
+            )
+            clearance = max(ENDPOINT_CLEARANCE, self.patches.tolerance_m)
+            self.walls = Walls.of_slabs(
+                self.mesh, eta, thickness, self.wavelength_m, transmissions, clearance, device
+            )
         self.images = MirrorImages(self.patches, self.transmitter, max_chains=max_chains, device=device)
+        self.edges: EdgeFinder | None = None
+        if diffractions:
+            through = None
+            if self.walls is not None and self.table is not None:
+                through = partial(self._through_sheets, self.table)
+            self.edges = EdgeFinder(self.images, self.wavelength_m, self.table, through=through)
 
     @property
     def wavelength_m(self) -> float:
@@ -133,20 +181,43 @@ class MirrorTracer:
         """Paths of each of ``receivers`` (R, 3), one after the other."""
         found = self.find(receivers, mirror_order, progress)
         points = np.asarray(receivers, float)
-        jones, amplitude = self._reflected(found, points)
+        jones, amplitude, excess_m = self._passed_on(found, points)
+        codes = np.where(found.slab >= 0, SLAB, np.where(found.patch >= 0, MIRROR, 0)).astype(np.int8)
+        over = None if self.edges is None else self.edges.find(points, min(mirror_order, 1), progress)
         ends = np.searchsorted(found.receiver, np.arange(len(points) + 1))
         result = []
         for k, point in enumerate(points):
             own = np.arange(ends[k], ends[k + 1])
-            own = own[np.lexsort((found.length_m[own], found.order[own]))]
-            kind = np.where(found.order[own] == 0, "los", "mirror").astype("<U7")
+            own = own[np.lexsort((found.length_m[own], found.order[own], found.slabs[own] > 0))]
+            kind = np.where(found.slabs[own] > 0, "slab", np.where(found.order[own] == 0, "los", "mirror"))
             result.append(
                 Paths._from_points(
-                    self.transmitter, point, found.point[own], amplitude[own], kind, self.frequency_hz,
-                    None if jones is None else jones[own],
+                    self.transmitter, point, found.point[own], amplitude[own], kind.astype("<U7"), self.frequency_hz,
+                    None if jones is None else jones[own], excess_m[own], interactions=codes[own],
                 )
             )  # fmt: skip
+            if over is not None:
+                result[-1] = Paths.concatenate([result[-1], self._over(over, k, point)])
         return result
+
+    def _over(self, found: EdgePaths, k: int, point: np.ndarray) -> Paths:
+        """The paths over edges of receiver ``k``, at ``point``."""
+        own = found.take(np.flatnonzero(found.receiver == k))
+        jones = (self.wavelength_m / (4.0 * np.pi * own.length_m))[:, None, None] * own.matrix
+        kind = np.full(len(own), "edge", "<U7")
+        return Paths._from_points(
+            self.transmitter, point, own.point, own.amplitude, kind, self.frequency_hz,
+            None if self.table is None else jones, interactions=own.code,
+        )  # fmt: skip
+
+    def _through_sheets(
+        self, table: SurfaceTable, material: np.ndarray, cosine: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What a sheet makes of a field that passes it, over that of the way in air."""
+        eta, thickness = table.permittivity[material], table.thickness_m[material]
+        te, tm, longer = slab_passage(cosine, eta, thickness, self.wavelength_m)
+        late = np.exp(-2j * np.pi / self.wavelength_m * longer)
+        return te * late, tm * late
 
     def find(
         self, receivers: ArrayLike, mirror_order: int = 1, progress: Progress | None = None
@@ -161,27 +232,34 @@ class MirrorTracer:
         points = check_array("receivers", receivers, (None, 3))
         if (points == self.transmitter).all(axis=1).any():
             raise ValueError("receivers: got a receiver at the transmitter's place, expected them apart")
-        return exact_paths(self.images, points, order, progress)
+        return exact_paths(self.images, points, order, progress, self.walls)
 
-    def _reflected(self, found: MirrorPaths, receivers: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
-        """Jones matrices ``(L, 2, 2)``, None for a bare mesh, and amplitudes ``(L,)``, both without the delay's phase."""
-        friis = self.wavelength_m / (4.0 * np.pi * found.length_m)
+    def _passed_on(
+        self, found: MirrorPaths, receivers: np.ndarray
+    ) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
+        """Jones matrices ``(L, 2, 2)``, None for a bare mesh, and amplitudes ``(L,)``, both without the delay's phase; and by how
+        much slabs make paths longer than they are [m], ``(L,)``."""
+        friis, excess_m = self.wavelength_m / (4.0 * np.pi * found.length_m), np.zeros(len(found))
         if self.table is None:
-            return None, friis.astype(complex)
+            return None, friis.astype(complex), excess_m
         jones, phase = np.zeros((len(found), 2, 2), complex), np.ones(len(found), complex)
         size = np.ones(len(found))
-        for order in np.unique(found.order):
-            own = np.flatnonzero(found.order == order)
-            patch, cos = found.patch[own, :order], found.cosine[own, :order]
+        for count, own in found.by_interactions:
+            patch, slab, cos = (a[own, :count] for a in (found.patch, found.slab, found.cosine))
+            through = slab >= 0
             material = self.patches.group[patch]
-            te, tm = slab_reflection(
-                cos, self.table.permittivity[material], self.table.thickness_m[material], self.wavelength_m
-            )
-            smooth = np.sqrt(1.0 - self.table.scattering[material] ** 2)
-            stops = stops_of(self.transmitter, found.point[own, :order], receivers[found.receiver[own]])
-            normal, turn = self.patches.normal[patch], found.turn[own, :order]
-            jones[own] = jones_matrices(stops, normal, turn, smooth * te, smooth * tm)
+            material[through] = self._face_material[slab[through]]
+            eta, thickness = self.table.permittivity[material], self.table.thickness_m[material]
+            fields = slab_reflection(cos, eta, thickness, self.wavelength_m)
+            te, tm = (np.sqrt(1.0 - self.table.scattering[material] ** 2) * r for r in fields)
+            if through.any():
+                solid = found.thickness_m[own, :count]
+                passed = cos[through], eta[through], np.where(np.isnan(solid), thickness, solid)[through]
+                te[through], tm[through], longer = slab_passage(*passed, self.wavelength_m)
+                excess_m[own] = np.bincount(np.nonzero(through)[0], longer, minlength=len(own))
+            stops = stops_of(self.transmitter, found.point[own, :count], receivers[found.receiver[own]])
+            jones[own] = jones_matrices(stops, found.normal[own, :count], found.turn[own, :count], te, tm)
             phase[own] = np.where(te == 0, 1.0, te / np.where(te == 0, 1.0, np.abs(te))).prod(axis=1)
-            if order:
+            if count:
                 size[own] = np.sqrt(0.5 * (np.abs(jones[own]) ** 2).sum(axis=(1, 2)))
-        return friis[:, None, None] * jones, friis * size * phase
+        return friis[:, None, None] * jones, friis * size * phase, excess_m

@@ -1,6 +1,6 @@
 """The full model of a scene at a few receivers, with any of its effects left out.
 
-All that a bistatic field can model is switched on; air, edges and walls are added as estimates. A reduced model is the
+All that a bistatic field can model is switched on; air is added. A reduced model is the
 same field with fewer effects; path gains add up by sequence of interactions, so what has been computed is kept.
 """
 
@@ -19,9 +19,8 @@ from warprrf.rf.em.fresnel import fresnel_curves, lobe, slab_reflection, surface
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.observations import Frame
-from warprrf.rf.paths.blockage import Walls, past_obstacles
 from warprrf.rf.spectra.beam import beam_operator
-from warprrf.rf.spectra.spectrum import default_floor, pixel_solid_angles, spread, to_db
+from warprrf.rf.spectra.spectrum import default_floor, pixel_solid_angles, to_db
 from warprrf.rf.tracing.model import Effects, Parameters
 from warprrf.rf.tracing.render import images
 from warprrf.rf.tracing.surface import Surface
@@ -70,23 +69,24 @@ def full_field(
     shape: tuple[int, int],
     beam_sigma_rad: float,
     device: Any = None,
-) -> tuple[BistaticField, Walls, str]:
-    """A field with every effect on for a Scene, Reconstruction, Mesh or bistatic field; its walls; and where its
-    materials come from: ``"scene"``, ``"fit"`` or ``"assumed"``."""
+) -> tuple[BistaticField, str]:
+    """A field with every effect on for a Scene, Reconstruction, Mesh or bistatic field, and where its materials come from:
+    ``"scene"``, ``"fit"`` or ``"assumed"``."""
     if isinstance(geometry, BistaticField):
         effects = replace(EVERYTHING, residual=geometry.effects.residual)
         whole = replace(
             geometry, effects=effects, transmitter=transmitter, air=None
         )  # air is judged by itself
-        return whole, Walls.of(geometry.surface.mesh), "fit"
+        return whole, "fit"
     surface = Surface.of(geometry)
     frame = Frame(transmitter, frequency_hz, shape, 1.0, (0.0, 1.0), beam_sigma_rad, None)
     field = BistaticField.prior(surface, frame, effects=replace(EVERYTHING, residual=False), device=device)
     if not hasattr(geometry, "materials"):
-        return field, Walls.of(surface.mesh), "assumed"
-    table, face = surface_table(list(geometry.materials), frequency_hz), np.asarray(geometry.face_material)
-    walls = Walls(geometry.mesh, table.permittivity[face], table.thickness_m[face])
-    return replace(field, parameters=material_parameters(geometry.materials, frequency_hz)), walls, "scene"
+        return field, "assumed"
+    parameters = replace(
+        material_parameters(geometry.materials, frequency_hz), log_through=surface.slabs(frequency_hz)[2]
+    )
+    return replace(field, parameters=parameters), "scene"
 
 
 def with_lobes(p: Parameters, kept: tuple[int, ...]) -> Parameters:
@@ -124,7 +124,6 @@ class FullModel:
 
     Args:
         field: with every effect on.
-        walls: what transmission goes through.
         receivers: positions [m], shape ``(R, 3)``.
         floor: N0; None for the default of the full model's spectra.
         gas_db_per_m: attenuation of air; None for that of standard air.
@@ -141,14 +140,13 @@ class FullModel:
     def __init__(
         self,
         field: BistaticField,
-        walls: Walls,
         receivers: np.ndarray,
         *,
         floor: float | None,
         gas_db_per_m: float | None,
         progress: Progress,
     ) -> None:
-        self.field, self.walls, self.receivers = field, walls, receivers
+        self.field, self.receivers = field, receivers
         self.gas_db_per_m = (
             gas_attenuation_db_per_m(field.frequency_hz) if gas_db_per_m is None else gas_db_per_m
         )
@@ -160,15 +158,9 @@ class FullModel:
             self.views.append(field.view(receiver))
             field.path_gains(self.views[-1])
             progress("relevance", r + 1, len(receivers) + 1)
-        self.blocked = np.array([not (v.paths.order == 0).any() for v in self.views])
-        which = np.flatnonzero(self.blocked)
-        past = past_obstacles(
-            walls, field.transmitter, receivers[which], field.wavelength_m,
-            position_error_m=field.surface.position_error_m, device=field.device
-        )  # fmt: skip
-        self.side = {name: replace(found, receiver=which[found.receiver]) for name, found in past.items()}
+        self.blocked = np.array([not v.paths.in_sight.any() for v in self.views])
         residual = ("residual",) if field.effects.residual else ()
-        self.effects = (*NAMES, *residual, *map(lobe_name, field.parameters.lobes), "gas", *self.side)
+        self.effects = (*NAMES, *residual, *map(lobe_name, field.parameters.lobes), "gas")
         self.all = frozenset(self.effects)
         solid_angle = pixel_solid_angles(field.shape)
         self._weight = solid_angle[:, None] / solid_angle.sum() / field.shape[1]
@@ -195,16 +187,7 @@ class FullModel:
         key = field.effects, field.parameters.lobes, gas
         if key not in self._parts:
             self._parts[key] = np.stack([self._image(field, view, gas) for view in self.views])
-        total = self._parts[key].copy()
-        for name, found in self.side.items():
-            if name not in kept:
-                continue
-            power = found.power * self._air(found.length_m, gas)
-            for r in np.unique(found.receiver):
-                own = found.receiver == r
-                given = found.arrival[own], power[own], field.shape, field.beam_sigma_rad
-                total[r] += spread(*given, device=field.device)
-        return total
+        return self._parts[key]
 
     def _image(self, field: BistaticField, view: View, gas: bool) -> np.ndarray:
         """One spectrum; light over several surfaces is as long as what the same ray sees of single ones."""
@@ -247,6 +230,7 @@ class FullModel:
 
 NAMES = (
     "line_of_sight", "mirrors_1", "mirrors_2", "scatterings_1", "mirror_scatter", "scatter_mirror", "scatterings_2",
+    "transmission", "diffraction",
 )  # fmt: skip
 """Effects of every model, in the order of the table."""
 
@@ -260,6 +244,8 @@ def effects_of(kept: frozenset[str]) -> Effects:
         scatterings=scattering * (3 if "scatterings_2" in kept else 1),
         mirror_scatter=scattering and "mirror_scatter" in kept,
         scatter_mirror=scattering and "scatter_mirror" in kept,
+        transmissions=3 if "transmission" in kept else 0,
+        diffractions=int("diffraction" in kept),
         residual="residual" in kept,
     )
 

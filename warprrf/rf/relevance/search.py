@@ -25,6 +25,7 @@ from warprrf.geometry.mesh import as_mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.needs import RARE
 from warprrf.rf.positions import check_positions, check_receivers, question_unit
 from warprrf.rf.relevance.model import FullModel, effects_of, full_field, lobe_name
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape
@@ -42,11 +43,9 @@ TITLES = {
     "residual": "residual of elements",
     "lobes": "scattering lobes",
     "gas": "gas absorption (ITU-R P.676)",
-    "diffraction": "diffraction (knife edge, ITU-R P.526)",
+    "diffraction": "diffraction (one edge, Kouyoumjian and Pathak)",
     "transmission": "transmission through walls (ITU-R P.2040)",
 }
-OUTSIDE = ("diffraction", "transmission")
-"""Effects that a bistatic field does not model."""
 ALIKE_DB = 0.01  # losses that round to the same hundredth of a dB are alike: then cost decides
 NEEDS = {
     "mirrors_1": ("mirrors_2",), "scatterings_1": ("mirror_scatter", "scatter_mirror", "scatterings_2", "residual"),
@@ -134,11 +133,6 @@ class Relevance:
         """Names of the effects in the smallest model."""
         return tuple(e.name for e in self.effects if e.kept)
 
-    @property
-    def missing(self) -> tuple[str, ...]:
-        """Effects that the scene needs and a bistatic field does not model."""
-        return tuple(name for name in self.kept if name in OUTSIDE)
-
     def needs(self, frequency_hz: float) -> tuple[Effects, tuple[int, ...] | None]:
         """What a fit to spectra at ``frequency_hz`` may need, and its lobes; None for those of a fit.
 
@@ -173,8 +167,6 @@ class Relevance:
         ]
         for e in self.effects:
             chosen = "left to the fit" if e.kept is None else "yes" if e.kept else "no"
-            if e.name in self.missing:
-                chosen = "needed, not modelled"
             numbers = [cell(v) for v in (e.image_db, e.total_db, e.image_blocked_db, e.total_blocked_db)]
             lines.append(f"| {title(e.name)} | {' | '.join(numbers)} | {chosen} | {e.reason} |")
         lines += [
@@ -182,15 +174,13 @@ class Relevance:
             f"All that is left out, together: {self.image_db:.3f} dB of the image, {self.total_db:.3f} dB of the "
             "total.",
         ]
-        if self.missing:
-            lines.append(f"Needed, but not modelled: {', '.join(map(title, self.missing))}.")
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
         """All of it, in terms of JSON."""
         values = {name: getattr(self, name) for name in self.__dataclass_fields__}
         values["effects"] = [{**asdict(e), "worth_db": e.worth_db} for e in self.effects]
-        return {**values, "model": asdict(self.model), "missing": list(self.missing)}
+        return {**values, "model": asdict(self.model)}
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write it as JSON, in one go."""
@@ -206,7 +196,6 @@ class Relevance:
         """
         values = read_json(path)
         try:
-            values.pop("missing")
             rows = [{k: v for k, v in row.items() if k != "worth_db"} for row in values.pop("effects")]
             model, lobes = Effects(**values.pop("model")), tuple(values.pop("lobes"))
             return cls(effects=tuple(Effect(**row) for row in rows), model=model, lobes=lobes, **values)
@@ -318,7 +307,7 @@ def relevances(
     asked = Setting(**setting).of(geometry)
     frequency_hz = check_frequency(asked.frequency_hz)
     question_unit(as_mesh(geometry, "geometry"), SPEED_OF_LIGHT / frequency_hz)
-    full, walls, source = full_field(
+    full, source = full_field(
         geometry,
         transmitter=check_array("transmitter", asked.transmitter, (3,)),
         frequency_hz=frequency_hz,
@@ -330,7 +319,7 @@ def relevances(
     known = geometry.transmitter if isinstance(geometry, BistaticField) else None
     check_positions(full.mesh, full.transmitter, places, full.wavelength_m, known=known, device=device)
     tick: Progress = progress or (lambda stage, done, total: None)
-    model = FullModel(full, walls, places, floor=asked.floor, gas_db_per_m=asked.gas_db_per_m, progress=tick)
+    model = FullModel(full, places, floor=asked.floor, gas_db_per_m=asked.gas_db_per_m, progress=tick)
     found = [_choose(model, source, float(tolerance)) for tolerance in tolerances_db]
     tick("relevance", len(places) + 1, len(places) + 1)
     return found
@@ -415,8 +404,8 @@ def open_row(name: str, reason: str) -> Effect:
 def _reason(model: FullModel, name: str, lost: frozenset[str]) -> str:
     if name == "gas":
         return _gas(model)
-    if name in model.side:
-        return _beside(model, name)
+    if name in RARE:
+        return _rare(model, name)
     if name.startswith("lobe_"):
         return _lobe(model, int(name.removeprefix("lobe_")))
     share = f"{_percent(model.power(lost))} of the received power"
@@ -434,27 +423,15 @@ def _gas(model: FullModel) -> str:
     return f"{1e3 * rate:.2g} dB/km, longest path {longest:.1f} m: at most {rate * longest:.2g} dB"
 
 
-def _beside(model: FullModel, name: str) -> str:
-    found, blocked = model.side[name], model.blocked
+def _rare(model: FullModel, name: str) -> str:
+    blocked = model.blocked
     if not blocked.any():
         return "no receiver is blocked"
-    power = np.bincount(found.receiver, found.power, minlength=len(blocked))[blocked]
-    rest = model.image(model.all - set(model.side)).sum(axis=(1, 2))[blocked]
-    reached = power > 0
-    assumed = (
-        "; walls of 12.5 mm and permittivity 4 assumed"
-        if name == "transmission" and model.walls.assumed
-        else ""
+    with_it, without = (
+        model.image(kept).sum(axis=(1, 2))[blocked] for kept in (model.all, model.all - {name})
     )
-    if not reached.any():
-        over = "over one edge (ways over two are not sought) " if name == "diffraction" else ""
-        return f"no such path {over}to any blocked receiver{assumed}"
-    dark = int((rest[reached] == 0).sum())
-    if dark:
-        return f"nothing else reaches {dark} of {len(rest)} blocked receivers{assumed}"
-    nearest = float(np.min(10.0 * np.log10(rest[reached] / power[reached])))
-    where = f"{nearest:.0f} dB below" if nearest >= 0 else f"{-nearest:.0f} dB above"
-    return f"at its strongest {where} the rest of a blocked receiver's power{assumed}"
+    share = float(np.mean(1.0 - without / np.maximum(with_it, 1e-300)))
+    return f"{_percent(share)} of the power of a blocked receiver, in the mean"
 
 
 def _lobe(model: FullModel, n: int) -> str:

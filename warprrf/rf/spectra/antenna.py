@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias, TypedDict, Unpack
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,34 +28,12 @@ from warprrf.rf.spectra.spectrum import (
     spread_paths,
 )
 
-STALL = 0.01
-"""Steps stop when the misfit fell by less than this share over the last :data:`STALL_STEPS`."""
-
-STALL_STEPS = 50
-
-DYNAMIC_RANGE_DB = 60.0
-"""What an estimate holds that far below its strongest direction is dropped [dB]."""
-
 SCANNED = "scanned antenna: Richardson-Lucy on the sphere, then spread by the stated beam"
 FIXED = "fixed antenna: divided by its gain in each direction"
-
-LARGEST_GAIN_DBI = 100.0  # an aperture of ten thousand wavelengths
-_TOGETHER = 32  # receivers whose estimates are refined at once
-_FLAT_DB = 0.1  # a pattern that varies less cannot tell directions apart
 
 
 Pattern: TypeAlias = Callable[[np.ndarray], ArrayLike] | Sequence[float] | np.ndarray
 """Power gain [linear]: a function of the angle off boresight [rad], or samples of it from 0 to pi."""
-
-
-class DeembedOptions(TypedDict, total=False):
-    """Options by the kind of antenna: ``limit_db`` for a fixed one, the others (:class:`Scan`) for a scanned one."""
-
-    snapshots: int
-    iterations: int
-    tolerance: float
-    device: DeviceLike
-    limit_db: float
 
 
 @dataclass(frozen=True)
@@ -68,8 +46,8 @@ class Scan:
             root of it.
         iterations: Most Richardson-Lucy steps for one receiver.
         tolerance: Steps stop when the misfit is this small against the measurement, both weighted by solid angle,
-            after the first :data:`STALL_STEPS` when it is as small as the noise's scatter, or when it no longer falls
-            (:data:`STALL`); paths between pixel centres leave a few percent, so that stalling ends most.
+            after the first 50 when it is as small as the noise's scatter, or when it fell by less than 1 % over the
+            last 50; paths between pixel centres leave a few percent, so that stalling ends most.
         device: Where estimates are spread by the beam.
     """
 
@@ -115,11 +93,12 @@ def deembed(
     boresight_gain_dbi: float | None = None,
     noise: float = 0.0,
     progress: _device.Progress | None = None,
-    **options: Unpack[DeembedOptions],
+    **options: Any,
 ) -> Deembedded:
     """``path_gain`` (R, H, W) without the antenna; see :meth:`warprrf.SpectrumDataset.deembed`.
 
-    A pattern ``(H, W)`` is a fixed antenna's, any other a scanned one's.
+    A pattern ``(H, W)`` is a fixed antenna's, which takes the option ``limit_db``; any other a scanned one's, with those
+    of :class:`Scan`.
 
     Raises:
         TypeError: for an option of the other kind of antenna.
@@ -132,11 +111,11 @@ def deembed(
         pattern = check_array("pattern", pattern, finite=False)
     if callable(pattern) or pattern.ndim != 2:
         kernel = scanned_kernel(pattern, check_shape(power.shape[1:]), boresight_gain_dbi)
-        return _deembed_scanned(power, kernel, beam_sigma_rad, Scan(noise=noise, **options), progress)  # type: ignore[misc]
+        return _deembed_scanned(power, kernel, beam_sigma_rad, Scan(noise=noise, **options), progress)
     if noise != 0.0:
         raise ValueError("noise: a fixed antenna's spectra are divided as they are; take the noise off first")
     gain = _gains(check_array("pattern", pattern, power.shape[1:]), boresight_gain_dbi)
-    return _deembed_fixed(power, gain, **options)  # type: ignore[misc]
+    return _deembed_fixed(power, gain, **options)
 
 
 def scanned_kernel(
@@ -155,7 +134,8 @@ def scanned_kernel(
         ValueError: if gains are negative, NaN, infinite, all zero or the same in all directions.
     """
     gain = _gains(sample_pattern(pattern, _angles_between(shape)), boresight_gain_dbi)
-    if gain.min() > gain.max() * 10.0 ** (-_FLAT_DB / 10.0):
+    flat_db = 0.1  # a pattern that varies less cannot tell directions apart
+    if gain.min() > gain.max() * 10.0 ** (-flat_db / 10.0):
         raise ValueError(
             "pattern: got the same gain in all directions; scanning it tells nothing of directions, expected a "
             "directive antenna (a fixed isotropic one is an array of ones over the pixels)"
@@ -201,11 +181,13 @@ def _deembed_scanned(
     directions = pixel_directions(shape).reshape(-1, 3)
     path_gain, source = np.zeros(power.shape), np.full(power.shape, -1)
     steps, misfit = np.zeros(count, dtype=int), np.zeros(count)
-    for first in range(0, count, _TOGETHER):
-        part = slice(first, min(first + _TOGETHER, count))
+    dynamic_range_db = 60.0  # what an estimate holds that far below its strongest direction is dropped [dB]
+    together = 32  # receivers whose estimates are refined at once
+    for first in range(0, count, together):
+        part = slice(first, min(first + together, count))
         estimate, steps[part], misfit[part] = _richardson_lucy(power[part], kernel, scan)
         for k, one in enumerate(estimate, start=first):
-            kept = np.where(one > one.max() * 10.0 ** (-DYNAMIC_RANGE_DB / 10.0), one, 0.0)
+            kept = np.where(one > one.max() * 10.0 ** (-dynamic_range_db / 10.0), one, 0.0)
             if kept.any():
                 kept *= one.sum() / kept.sum()
                 path_gain[k], source[k] = spread_paths(
@@ -232,13 +214,14 @@ def _richardson_lucy(
     steps, misfit = np.zeros(len(measured), dtype=int), np.where(size > 0, 1.0, 0.0)
     before = np.full(len(measured), np.inf)
     going = np.flatnonzero(signed > 0)
+    together = 50  # steps
     for step in range(scan.iterations):
         expected = np.maximum(respond(estimate[going], kernel), 0.0) + scan.noise
         error = np.sqrt((weight * (measured[going] - expected) ** 2).sum(axis=(1, 2)))
         misfit[going] = error / size[going]
-        left = error > (goal if step < STALL_STEPS else noisy_goal)[going]
-        if step % STALL_STEPS == 0:
-            left &= error < (1.0 - STALL) * before[going]
+        left = error > (goal if step < together else noisy_goal)[going]
+        if step % together == 0:
+            left &= error < 0.99 * before[going]
             before[going] = error
         going, expected = going[left], expected[left]
         if len(going) == 0:
@@ -273,9 +256,7 @@ def sample_pattern(pattern: Pattern, angle: np.ndarray) -> np.ndarray:
     if callable(pattern):
         gain = check_array("pattern", pattern(angle), finite=False)
         if gain.shape not in ((), angle.shape):
-            raise ValueError(
-                f"pattern: got shape {gain.shape} for angles {angle.shape}, expected one gain for each angle"
-            )
+            raise ValueError(f"pattern: got shape {gain.shape} for angles {angle.shape}, expected the same")
         return np.broadcast_to(gain, angle.shape)
     samples = check_array("pattern", pattern, finite=False)
     if samples.ndim != 1 or len(samples) < 2:
@@ -293,5 +274,6 @@ def _gains(gain: np.ndarray, boresight_gain_dbi: float | None) -> np.ndarray:
         raise ValueError("pattern: got a gain of zero in all directions, expected linear power gains")
     if boresight_gain_dbi is None:
         return gain
-    peak_db = check_number("boresight_gain_dbi", boresight_gain_dbi, -LARGEST_GAIN_DBI, LARGEST_GAIN_DBI)
+    largest_gain_dbi = 100.0  # an aperture of ten thousand wavelengths
+    peak_db = check_number("boresight_gain_dbi", boresight_gain_dbi, -largest_gain_dbi, largest_gain_dbi)
     return gain / gain.max() * 10.0 ** (peak_db / 10.0)

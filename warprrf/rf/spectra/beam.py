@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-from numpy.typing import DTypeLike
 from scipy.fft import irfft, rfft
 from scipy.sparse import csr_matrix
 
 from warprrf.cache import Cache, cached_property
 from warprrf.device import DeviceLike
 from warprrf.rf.spectra.spectrum import spread, sub_pixel_directions
-
-EVEN_SUB_PIXELS = 4  # square root of the directions that stand for a whole pixel's even power
 
 
 class BeamOperator:
@@ -23,14 +22,18 @@ class BeamOperator:
 
     def __init__(self, shape: tuple[int, int], sigma: float, *, device: DeviceLike = None) -> None:
         rows, columns = self.shape = shape
-        directions = sub_pixel_directions(shape, EVEN_SUB_PIXELS)[0].reshape(rows, columns, -1, 3)[:, 0]
+        even_sub_pixels = 4  # square root of the directions that stand for a whole pixel's even power
+        directions = sub_pixel_directions(shape, even_sub_pixels)[0].reshape(rows, columns, -1, 3)[:, 0]
         even = np.full(directions.shape[1], 1.0 / directions.shape[1])
         # what row i of column 0 gives to each pixel, shape (row, column, i)
         self._kernel = np.stack([spread(d, even, shape, sigma, device=device) for d in directions], axis=-1)
         transform = np.moveaxis(rfft(self._kernel, axis=1), 1, 0)
-        self._forward = np.concatenate([transform.real, transform.imag], axis=1)
         back = np.swapaxes(transform, 1, 2).conj()
-        self._backward = np.concatenate([back.real, back.imag], axis=1)
+        self._matrices = {
+            (name, real): np.concatenate([one.real, one.imag], axis=1, dtype=real)
+            for name, one in (("forward", transform), ("backward", back))
+            for real in (np.float32, np.float64)
+        }
 
     @cached_property
     def _matrix(self) -> csr_matrix:
@@ -52,18 +55,18 @@ class BeamOperator:
         Double precision is used whatever comes, because the errors of a transform are shared by pixels 100 dB apart;
         ``quick`` does without (errors of 1e-6 of the largest, half the time).
         """
-        return self._apply(self._forward, images, np.float32 if quick else np.float64)
+        return self._apply("forward", images, np.float32 if quick else np.float64)
 
     def adjoint(self, images: np.ndarray, *, quick: bool = False) -> np.ndarray:
         """The transposed map of ``images`` (H, W, ...)."""
-        return self._apply(self._backward, images, np.float32 if quick else np.float64)
+        return self._apply("backward", images, np.float32 if quick else np.float64)
 
-    def _apply(self, matrices: np.ndarray, images: np.ndarray, real: DTypeLike) -> np.ndarray:
+    def _apply(self, name: str, images: np.ndarray, real: type[np.floating[Any]]) -> np.ndarray:
         rows, columns = self.shape
         flat: np.ndarray = np.asarray(images, real).reshape(rows, columns, -1)
         count = flat.shape[2]
         x = np.moveaxis(rfft(flat, axis=1), 1, 0)
-        product = matrices.astype(real, copy=False) @ np.concatenate([x.real, x.imag], axis=2)
+        product = self._matrices[name, real] @ np.concatenate([x.real, x.imag], axis=2)
         y = np.empty((len(x), rows, count), x.dtype)
         y.real = product[:, :rows, :count] - product[:, rows:, count:]
         y.imag = product[:, :rows, count:] + product[:, rows:, :count]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, Unpack, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +17,7 @@ from warprrf.device import DeviceLike
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra import dataset_files
-from warprrf.rf.spectra.antenna import DeembedOptions, Pattern, deembed
+from warprrf.rf.spectra.antenna import Pattern, deembed
 from warprrf.rf.spectra.levels import free_space_gain, question_levels
 from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
@@ -36,9 +36,7 @@ from warprrf.rf.spectra.spectrum import (
 POLARISATION = "mean over vertical and horizontal transmit, sum over both receive polarisations"
 
 _ROLES = ("train", "test")
-USUAL_M = 10.0  # between a transmitter and a receiver in a room
 SAME_PLACE_M = 1e-3  # a spectrum measured this near is the same one
-_MOST_ATTRIBUTE_BYTES = 60_000  # HDF5 takes 64 kB
 
 
 @runtime_checkable
@@ -106,9 +104,7 @@ class SpectrumDataset:
         count = len(receivers)
         gain = check_array("path_gain", self.path_gain, (count, None, None), dtype=np.float32, finite=False)
         if np.isinf(gain).any():
-            raise ValueError(
-                "path_gain: got infinite values, expected linear path gain, or NaN where not measured"
-            )
+            raise ValueError("path_gain: got infinite values, expected linear gains, NaN where not measured")
         shape = check_shape(gain.shape[1:])
         fields: dict[str, Any] = {
             "receivers": receivers,
@@ -243,9 +239,7 @@ class SpectrumDataset:
                 "(dataclasses.replace(paths, receiver=...) adds one)"
             )
         if np.ndim(paths.transmitter) != 1:
-            raise ValueError(
-                "paths: got ones of several transmitters, expected those of one; a set holds one"
-            )
+            raise ValueError("paths: got ones of several transmitters, expected those of one")
         several = list(paths.each())
         grid = check_shape(shape)
         spread = [spread_paths(p.arrival, p.power, grid, beam_sigma_rad, device=device) for p in several]
@@ -283,13 +277,13 @@ class SpectrumDataset:
             frequency_hz: carrier [Hz].
             shape: rows and columns of spectra.
             beam_sigma_rad: width of the receiver's beam.
-            floor: N0; if None, 60 dB below free space's path gain over :data:`USUAL_M`.
+            floor: N0; if None, 60 dB below free space's path gain over 10 m, usual in a room.
 
         Raises:
             TypeError, ValueError: naming the argument.
         """
         rows, columns = check_shape(shape)
-        away = np.array([USUAL_M, 0.0, 0.0])
+        away = np.array([10.0, 0.0, 0.0])
         strongest = float(free_space_gain(away, np.zeros(3), check_frequency(frequency_hz)))
         noise = 1e-6 * strongest if floor is None else check_positive("floor", floor, "linear noise floor")
         return cls(
@@ -312,9 +306,7 @@ class SpectrumDataset:
             TypeError: for anything but a whole number.
         """
         if isinstance(index, bool) or not isinstance(index, int | np.integer):
-            raise TypeError(
-                f"index: got {index!r}, expected a whole number; subset() takes several receivers"
-            )
+            raise TypeError(f"index: got {index!r}, expected a whole number; subset() takes several")
         return Spectrum(
             path_gain=self.path_gain[index],
             delay_s=self.delay_s[index],
@@ -367,9 +359,7 @@ class SpectrumDataset:
         train, test = np.flatnonzero(self.role == "train"), np.flatnonzero(self.role == "test")
         check_count("n_train", n_train, most=len(train))
         if len(test) == 0:
-            raise ValueError(
-                "role: there are no test receivers; give simulate(..., roles=) or assign_roles some"
-            )
+            raise ValueError("role: there are no test receivers; give simulate(..., roles=) some")
         if check_seed(seed) != 0:
             train = np.random.default_rng(seed).permutation(train)
         return self.subset(train[:n_train]), self.subset(test)
@@ -381,7 +371,7 @@ class SpectrumDataset:
         boresight_gain_dbi: float | None = None,
         noise: float = 0.0,
         progress: _device.Progress | None = None,
-        **options: Unpack[DeembedOptions],
+        **options: Any,
     ) -> SpectrumDataset:
         """These spectra without the antenna that measured them.
 
@@ -552,17 +542,14 @@ def _check_flags(name: str, value: ArrayLike, count: int) -> np.ndarray:
 
 def _check_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
     """What a file can hold beside the fields, under names of its own."""
+    most_attribute_bytes = 60_000  # HDF5 takes 64 kB
     for name, value in attributes.items():
         if not isinstance(name, str) or not name or name.startswith("_") or {"/", "\0"} & set(name):
-            raise ValueError(
-                f"attributes: got the name {name!r}, expected text without / that does not begin with _"
-            )
+            raise ValueError(f"attributes: got the name {name!r}, expected text without / or a leading _")
         if name in dataset_files.RESERVED:
-            raise ValueError(
-                f"attributes: got {name!r}, which a data set's file needs itself; take another name"
-            )
+            raise ValueError(f"attributes: got {name!r}, which the file needs itself; take another name")
         held = np.asarray(value)
-        if held.dtype.kind not in "biufU" or held.ndim > 1 or held.nbytes > _MOST_ATTRIBUTE_BYTES:
+        if held.dtype.kind not in "biufU" or held.ndim > 1 or held.nbytes > most_attribute_bytes:
             raise TypeError(
                 f"attributes: {name!r} is a {type(value).__name__}, expected text, a number, or a short list of these"
             )

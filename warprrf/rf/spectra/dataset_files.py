@@ -134,11 +134,9 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
 def _rounded(arrays: Mapping[str, np.ndarray], floor: float) -> dict[str, np.ndarray]:
     """What a compact file holds of path gain, delay and departure; a pixel that becomes zero is empty altogether."""
     gain = _round_mantissa(arrays["path_gain"], COMPACT_GAIN_BITS, COMPACT_GAIN_OF_FLOOR * floor)
-    delay = np.where(
-        gain == 0, np.nan, np.round(arrays["delay"] / COMPACT_DELAY_STEP_S) * COMPACT_DELAY_STEP_S
-    )
+    delay = np.round(arrays["delay"] / COMPACT_DELAY_STEP_S) * COMPACT_DELAY_STEP_S
     aod = (np.round(arrays["aod"] / COMPACT_AOD_STEP_RAD) * COMPACT_AOD_STEP_RAD).astype(np.float32)
-    aod[gain == 0] = np.nan
+    delay[gain == 0] = aod[gain == 0] = np.nan
     return {"path_gain": gain, "delay": delay, "aod": aod}
 
 

@@ -14,13 +14,13 @@ from numpy.typing import ArrayLike
 
 from warprrf.checks import some_of, users_level
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.spectra.spectrum import to_db
 
 MARGIN_DB = 18.0
 """By how much all paths together may exceed line of sight: three mirror reflections in a corridor of perfect conductors
 give 16.4 dB, two in a furnished room of them 10.3 dB, a lobby of building materials 3.9 dB."""
 FADING_DB = 10.0
 """By how much a power at one place may exceed the mean of its fading: 1 in 20,000 does, if it is Rayleigh's."""
-_FAINT_DB = 150.0  # below line of sight nothing is measured
 
 
 def free_space_gain(transmitters: np.ndarray, receivers: np.ndarray, frequency_hz: float) -> np.ndarray:
@@ -47,9 +47,7 @@ def question_levels(
     Warns:
         UserWarning: naming rows that are further above line of sight, and the likely unit.
     """
-    with np.errstate(divide="ignore"):
-        level_db = 10.0 * np.log10(np.nan_to_num(power, posinf=1e300))
-    line_of_sight_db = 10.0 * np.log10(free_space)
+    level_db, line_of_sight_db = to_db(np.nan_to_num(power, posinf=1e300)), to_db(free_space)
     above = level_db - line_of_sight_db
     wrong = np.flatnonzero(above > margin_db)
     impossible = np.flatnonzero(level_db >= 0.0)
@@ -61,9 +59,7 @@ def question_levels(
     rows = f"{name}: {len(wrong)} of {len(power)} (rows {some_of(wrong)})"
     end = f"{unit}{hint}; expected received over transmitted power"
     if len(impossible):
-        raise ValueError(
-            f"{rows} are up to {level_db[wrong].max():.4g} dB, no less than was transmitted{end}"
-        )
+        raise ValueError(f"{rows} are up to {level_db[wrong].max():.4g} dB, not less than transmitted{end}")
     warnings.warn(
         f"{rows} are up to {above[wrong].max():.3g} dB above line of sight in free space, where reflections add "
         f"{float(np.max(margin_db)):g} dB at most{end}",
@@ -83,5 +79,6 @@ def _likely_unit(level_db: np.ndarray, line_of_sight_db: np.ndarray) -> str:
             "decibels, their minus signs lost, given as linear": -(10.0 ** (level_db / 10.0)),
         }
     away = {unit: float(np.nanmax(db - line_of_sight_db, initial=-np.inf)) for unit, db in readings.items()}
-    fits = {unit: abs(excess) for unit, excess in away.items() if -_FAINT_DB < excess <= MARGIN_DB}
+    faint_db = 150.0  # below line of sight nothing is measured
+    fits = {unit: abs(excess) for unit, excess in away.items() if -faint_db < excess <= MARGIN_DB}
     return f"; they look like {min(fits, key=lambda unit: fits[unit])}" if fits else ""

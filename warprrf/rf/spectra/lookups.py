@@ -19,8 +19,6 @@ from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.metrics import psnr, unit_image
 from warprrf.rf.spectra.spectrum import Spectrum, check_whole, to_db
 
-SAME_PLACE_M = 1e-9  # a receiver nearer than this to a training one is that one
-
 
 @checked
 @dataclass(frozen=True)
@@ -46,9 +44,7 @@ class Lookup:
         """
         places = check_array("receivers", receivers, (..., 3))
         if places.size == 0:
-            raise ValueError(
-                f"receivers: got shape {places.shape}, expected (3,) or (R, 3) with R at least 1"
-            )
+            raise ValueError(f"receivers: got shape {places.shape}, expected (3,) or (R, 3), R at least 1")
         found = [self._predict(place) for place in places.reshape(-1, 3)]
         return found[0] if places.ndim == 1 else Spectrum.stack(found)
 
@@ -122,14 +118,7 @@ def mean(train: SpectrumDataset) -> Lookup:
 
 
 def _nearest(receivers: np.ndarray, train: SpectrumDataset, receiver: np.ndarray) -> Spectrum:
-    i = int(np.argmin(np.linalg.norm(receivers - receiver, axis=-1)))
-    return Spectrum(
-        path_gain=np.array(train.path_gain[i], dtype=np.float32),
-        delay_s=np.array(train.delay_s[i]),
-        aod=np.array(train.aod[i]),
-        floor=float(train.floor),
-        range_db=train.range_db,
-    )
+    return train[int(np.argmin(np.linalg.norm(receivers - receiver, axis=-1)))]
 
 
 def _idw(
@@ -148,7 +137,8 @@ def _average(
 ) -> np.ndarray:
     """Path gain at ``at`` (3,), averaged over a table of spectra (R, H, W) in its domain."""
     distance = np.linalg.norm(receivers - at, axis=-1)
-    same = distance < SAME_PLACE_M
+    same_place_m = 1e-9  # a receiver nearer than this to a training one is that one
+    same = distance < same_place_m
     weight = same.astype(np.float64) if same.any() else distance**-power
     average = np.tensordot(weight / weight.sum(), table, axes=1)
     return np.maximum(10 ** (average / 10) - floor, 0.0) if domain == "db" else average

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 import warnings
+from collections import defaultdict
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
@@ -44,9 +45,7 @@ def unit_image(path_gain: np.ndarray, floor: float, range_db: tuple[float, float
     """The dB image of a spectrum mapped to [0, 1] by the data set's range, shape of ``path_gain``, float64."""
     low, high = check_array("range_db", range_db, (2,))
     if not high > low:
-        raise ValueError(
-            f"range_db: got ({low}, {high}), expected (lowest, highest) with highest above lowest"
-        )
+        raise ValueError(f"range_db: got ({low}, {high}), expected (lowest, highest), the latter above")
     path_gain = check_array("path_gain", path_gain, finite=False)
     if (path_gain < 0).any():
         raise ValueError(f"path_gain: got {path_gain.min()}, expected gains of at least 0")
@@ -224,16 +223,7 @@ def evaluate(
     predict = _on_grid(predict, test.path_gain.shape[1:])
     check_number("beam_width_rad", beam_width_rad, NARROWEST_BEAM_RAD, 2 * np.pi)
     floor, range_db = float(test.floor), test.range_db
-    names = (
-        "psnr_db",
-        "ssim",
-        "rmse_db",
-        "direction_error_deg",
-        "beam_gain_loss_db",
-        "tof_error_ns",
-        "aod_error_deg",
-    )
-    rows = {name: np.full(count, np.nan) for name in names}
+    rows = defaultdict[str, np.ndarray](lambda: np.full(count, np.nan))
     seconds = np.zeros(count)
     for i, receiver in enumerate(np.asarray(test.receivers, dtype=np.float64)):
         start = time.perf_counter()

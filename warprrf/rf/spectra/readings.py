@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,8 +23,10 @@ from scipy.special import digamma, polygamma
 
 from warprrf.checks import (
     check_array,
+    check_choice,
     check_chosen,
     check_count,
+    check_each,
     check_number,
     check_positive,
     check_type,
@@ -49,12 +51,7 @@ NEEDED = (*COLUMNS["transmitter"], *COLUMNS["receiver"], "power_db")
 NUMBERS = (*NEEDED, *COLUMNS["arrival"], *COLUMNS["departure"], "delay_ns", "std_db")
 NOT_MEASURED = ("", "na", "n/a", "#n/a", "<na>", "nan", "null", "none")
 """What stands in a file, in small letters, for a power that was not measured."""
-WIDEST_HORN_RAD = 2.0 * np.pi / 3.0
-"""Full width at half maximum of the widest horns; a larger number is one in degrees."""
-WEIGHTS_AT_ONCE = 1_000_000  # of readings and paths: some MB of temporary arrays
-ALIKE = 0.7  # of two names' letters: one is misspelt for the other
 WINDOWS = ("rectangular", "hann")
-STEADIEST = 1e-6  # relative variance of the power of a single wave
 
 
 @runtime_checkable
@@ -68,7 +65,42 @@ class Table(Protocol):
 
 @checked
 @dataclass(frozen=True, repr=False)
-class Readings:
+class PowerTable:
+    """Received over transmitted powers, row by row, and the places that they are of: what :class:`Readings` and
+    :class:`~warprrf.rf.channel.array_spectra.ArraySpectra` share."""
+
+    transmitters: np.ndarray
+    receivers: np.ndarray
+    power: np.ndarray
+    frequency_hz: float
+
+    _rows: ClassVar[tuple[str, ...]] = ("transmitters", "receivers", "power")
+
+    def __len__(self) -> int:
+        return len(self.power)
+
+    def subset(self, rows: ArrayLike) -> Self:
+        """Some of the rows, by index or mask."""
+        index = check_chosen("rows", rows, len(self), 1)
+        columns = {name: getattr(self, name) for name in self._rows}
+        taken: dict[str, Any] = {name: value[index] for name, value in columns.items() if value is not None}
+        return replace(self, **taken)
+
+    def _checked(self, *shape: int) -> dict[str, Any]:
+        """The columns, each row's powers of ``shape``; ValueError or TypeError names them."""
+        power = check_array("power", self.power, (None, *shape), finite=False)
+        count = len(power)
+        if count == 0 or not (np.isnan(power) | (np.isfinite(power) & (power >= 0))).all():
+            raise ValueError(
+                f"power: got {count} rows, expected one or more, each of linear powers, or NaN where not measured"
+            )
+        places = {name: check_each(name, getattr(self, name), count, 3) for name in self._rows[:2]}
+        return {"power": power, "frequency_hz": check_frequency(self.frequency_hz), **places}
+
+
+@checked
+@dataclass(frozen=True, repr=False)
+class Readings(PowerTable):
     """N received powers over transmitted power.
 
     Attributes:
@@ -104,10 +136,6 @@ class Readings:
         field = wr.RadioField.fit(rec, horn)
     """
 
-    transmitters: np.ndarray
-    receivers: np.ndarray
-    power: np.ndarray
-    frequency_hz: float
     floor: ArrayLike
     arrival: np.ndarray | None = None
     departure: np.ndarray | None = None
@@ -124,52 +152,32 @@ class Readings:
     azimuth_known: bool = True
     position_std_m: float = 0.0
 
+    _rows = (*PowerTable._rows, "floor", "arrival", "departure", "delay_s", "chain", "std_db")
+
     def __post_init__(self) -> None:
-        power = check_array("power", self.power, (None,), finite=False)
-        count = len(power)
-        if count == 0 or not (np.isnan(power) | (np.isfinite(power) & (power >= 0))).all():
-            raise ValueError(
-                f"power: got {count} values, expected one or more, each a linear power or NaN where not measured"
-            )
-        floor = check_array("floor", self.floor)
-        if floor.shape not in ((), (count,)) or not (floor > 0).all():
-            raise ValueError(
-                f"floor: got {self.floor!r}, expected one linear noise floor above 0, or {count}"
-            )
-        floor = np.broadcast_to(floor, (count,)).copy()
-        if not (power > floor).any():
+        fields = self._checked()
+        count = len(fields["power"])
+        floor, std = (check_each(name, getattr(self, name), count) for name in ("floor", "std_db"))
+        if not (floor > 0).all():
+            raise ValueError(f"floor: got {floor.min():g}, expected linear noise floors above 0")
+        if not (fields["power"] > floor).any():
             raise ValueError(f"power: got no value above the floor of {floor.min():g}")
-        fields: dict[str, Any] = {
-            "power": power,
-            "floor": floor,
-            "frequency_hz": check_frequency(self.frequency_hz),
-        }
-        for name in ("transmitters", "receivers"):
-            value = check_array(name, getattr(self, name))
-            if value.shape not in ((3,), (count, 3)):
-                raise ValueError(f"{name}: got shape {value.shape}, expected (3,) or ({count}, 3)")
-            fields[name] = np.broadcast_to(value, (count, 3)).copy()
+        fields |= {"floor": floor, "std_db": std}
         for turned, pattern in (("arrival", "receive_pattern"), ("departure", "transmit_pattern")):
             value, gain = getattr(self, turned), getattr(self, pattern)
             if (value is None) != (gain is None):
-                raise ValueError(
-                    f"{pattern}: it goes with {turned}, got one of the two; expected both or neither"
-                )
+                raise ValueError(f"{pattern}: got one of it and {turned}; expected both or neither")
             if value is not None:
                 fields[turned] = check_turned(turned, value, count)
                 check_gains(pattern, gain)
         if (self.delay_s is None) != (self.bandwidth_hz is None):
-            raise ValueError(
-                "bandwidth_hz: it goes with delay_s, got one of the two; expected both or neither"
-            )
+            raise ValueError("bandwidth_hz: got one of it and delay_s; expected both or neither")
         if self.delay_s is not None:
             fields["delay_s"] = check_array("delay_s", self.delay_s, (count,))
             fields["bandwidth_hz"] = check_positive("bandwidth_hz", self.bandwidth_hz)
         check_type("azimuth_known", self.azimuth_known, bool)
         if not self.azimuth_known and self.arrival is None:
-            raise ValueError(
-                "azimuth_known: got False without arrival; expected the azimuths whose zero is to be found"
-            )
+            raise ValueError("azimuth_known: got False without arrival, whose zero is to be found")
         check_number("position_std_m", self.position_std_m, 0.0, 1.0)
         if self.position_std_m > 0 and self.total:
             raise ValueError(
@@ -178,20 +186,15 @@ class Readings:
             )
         if self.samples is not None:
             check_count("samples", self.samples)
-        if self.window not in WINDOWS:
-            raise ValueError(f"window: got {self.window!r}, expected one of {', '.join(WINDOWS)}")
+        check_choice("window", self.window, WINDOWS)
         chain = np.full(count, "") if self.chain is None else np.asarray(self.chain, dtype=object)
         if chain.shape != (count,) or not all(isinstance(name, str) for name in chain):
             raise ValueError(f"chain: got {self.chain!r:.200}, expected a name for each of {count} readings")
-        std = check_array("std_db", self.std_db)
-        if std.shape not in ((), (count,)) or (std < 0).any():
-            raise ValueError(f"std_db: got {self.std_db!r}, expected one number or {count}, at least 0")
-        fields |= {"chain": chain.astype(str), "std_db": np.broadcast_to(std, (count,)).copy()}
+        if (std < 0).any():
+            raise ValueError(f"std_db: got {std.min():g}, expected numbers of at least 0")
+        fields["chain"] = chain.astype(str)
         for name, value in fields.items():
             object.__setattr__(self, name, value)
-
-    def __len__(self) -> int:
-        return len(self.power)
 
     def __repr__(self) -> str:
         places = len(np.unique(self.receivers, axis=0))
@@ -199,24 +202,6 @@ class Readings:
             f"Readings({len(self)} of {places} receivers and {len(np.unique(self.transmitters, axis=0))} transmitters at "
             f"{self.frequency_hz / 1e9:g} GHz, {int((self.power <= self.floor).sum())} at the floor)"
         )
-
-    def subset(self, rows: ArrayLike) -> Readings:
-        """Some of the readings, by index or mask."""
-        index = check_chosen("rows", rows, len(self), 1)
-        own = (
-            "transmitters",
-            "receivers",
-            "power",
-            "floor",
-            "arrival",
-            "departure",
-            "delay_s",
-            "chain",
-            "std_db",
-        )
-        columns = {name: getattr(self, name) for name in own}
-        taken: dict[str, Any] = {name: value[index] for name, value in columns.items() if value is not None}
-        return replace(self, **taken)
 
     @property
     def total(self) -> bool:
@@ -302,7 +287,7 @@ def _check_columns(names: Sequence[str]) -> None:
     """Refuse names of columns that are missing, repeated or misspelt; warn of others that are not read."""
     _check_once(names)
     known, unknown = (*NUMBERS, "chain"), [name for name in names if name not in (*NUMBERS, "chain")]
-    alike = {name: get_close_matches(name.lower(), known, 2, ALIKE) for name in unknown}
+    alike = {name: get_close_matches(name.lower(), known, 2, 0.7) for name in unknown}
     meant = [
         f"{name!r} for {' or '.join(absent)}"
         for name, near in alike.items()
@@ -406,7 +391,8 @@ def fading_db(samples: int | None, steady: ArrayLike = 0.0) -> tuple[np.ndarray,
         samples: independent ones that a reading is the mean of; None where fading is averaged out.
         steady: sum of the squared shares of single waves, 0 to 1.
     """
-    left = np.maximum(1.0 - np.asarray(steady, float), STEADIEST)
+    steadiest = 1e-6  # relative variance of the power of a single wave
+    left = np.maximum(1.0 - np.asarray(steady, float), steadiest)
     if samples is None:
         return np.zeros_like(left), np.zeros_like(left)
     shape = samples / left
@@ -430,7 +416,8 @@ def path_weights(
         delay_s: delays [s], shape ``(K,)``.
     """
     weight = np.empty((len(rows), len(delay_s)), dtype)
-    at_once = max(1, WEIGHTS_AT_ONCE // max(1, len(delay_s)))
+    weights_at_once = 1_000_000  # of readings and paths: some MB of temporary arrays
+    at_once = max(1, weights_at_once // max(1, len(delay_s)))
     for first in range(0, len(rows), at_once):
         some = rows[first : first + at_once]
         weight[first : first + at_once] = _path_weights(readings, some, arrival, departure, delay_s)
@@ -458,16 +445,16 @@ def horn(width_rad: float, floor_db: float = -60.0) -> Pattern:
     """Gain of a horn over the angle off boresight: Gaussian in the angle, lossless.
 
     Args:
-        width_rad: full width at half maximum [rad], at most :data:`WIDEST_HORN_RAD`.
+        width_rad: full width at half maximum [rad], at most 2 pi / 3, that of the widest; a larger number is one in degrees.
         floor_db: of the side lobes below the peak [dB].
 
     Raises:
         ValueError: for other numbers.
     """
     width, low = check_positive("width_rad", width_rad), check_number("floor_db", floor_db, -200.0, 0.0)
-    if width > WIDEST_HORN_RAD:
+    if width > 2.0 * np.pi / 3.0:
         raise ValueError(
-            f"width_rad: got {width:g}, expected radians, at most {WIDEST_HORN_RAD:.3g}: "
+            f"width_rad: got {width:g}, expected radians, at most 2.09: "
             f"horn(np.radians({width:g})) is {width:g} degrees wide"
         )
     angle = np.linspace(0.0, np.pi, 20_001)
@@ -502,9 +489,7 @@ def check_turned(name: str, value: ArrayLike, count: int) -> np.ndarray:
     angles = check_array(name, value, (count, 2))
     wrong = angles[np.abs(angles[:, 0] - np.pi / 2) > np.pi / 2 + 1e-6, 0]
     if len(wrong):
-        raise ValueError(
-            f"{name}: got a zenith of {wrong[0]:g}, expected 0 to pi (elevations from -90 to 90 degrees)"
-        )
+        raise ValueError(f"{name}: got a zenith of {wrong[0]:g}, expected 0 to pi (elevations: -90 to 90)")
     return angles
 
 
@@ -512,9 +497,7 @@ def check_gains(name: str, pattern: Pattern) -> None:
     """Raise ValueError, naming the argument, unless a pattern holds gains, some above zero."""
     gain = sample_pattern(pattern, np.linspace(0.0, np.pi, 721))
     if not np.isfinite(gain).all() or (gain < 0).any() or not gain.max() > 0:
-        raise ValueError(
-            f"{name}: got negative, NaN or infinite gains, or none above zero; expected linear power gains"
-        )
+        raise ValueError(f"{name}: got negative, NaN, infinite or no gains; expected linear power gains")
 
 
 def _tap(place: np.ndarray, window: str) -> np.ndarray:

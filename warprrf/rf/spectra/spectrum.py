@@ -19,7 +19,15 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_number, check_positive, check_type, checked, one_line
+from warprrf.checks import (
+    check_array,
+    check_known_whole,
+    check_number,
+    check_positive,
+    check_type,
+    checked,
+    one_line,
+)
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
 
@@ -31,22 +39,9 @@ NARROWEST_BEAM_RAD = 1e-4
 DEFAULT_SHAPE = (90, 180)
 """Default grid: 2 by 2 degrees."""
 
-BEAM_CUTOFF = 7.0
-"""Beyond this many sigma a path is cut off: 106 dB below its peak; 2.3e-11 of its power, given back by normalising."""
-
-FLOOR_BELOW_MEDIAN_DB = 60.0
-"""The default N0 lies this far below the median over views of the view's maximum."""
-
-_ANGLE_ROUNDING = 1e-3  # radians by which angles of departure may lie out of range: what compact files round
-
-_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
-
-
-MOST_PIXELS = 1 << 24  # a sixteenth of a degree each
-
 
 def check_shape(shape: Sequence[int]) -> tuple[int, int]:
-    """``shape`` as (rows, columns), each at least 2, at most :data:`MOST_PIXELS` in all.
+    """``shape`` as (rows, columns), each at least 2, at most 2^24 in all (a sixteenth of a degree each).
 
     Raises:
         ValueError: otherwise.
@@ -57,8 +52,8 @@ def check_shape(shape: Sequence[int]) -> tuple[int, int]:
         raise ValueError(f"shape: got {shape!r}, expected (rows, columns) such as (90, 180)") from error
     if rows < 2 or columns < 2 or (rows, columns) != tuple(shape):
         raise ValueError(f"shape: got {shape!r}, expected two whole numbers of at least 2, such as (90, 180)")
-    if rows * columns > MOST_PIXELS:
-        raise ValueError(f"shape: got {rows} x {columns} pixels, expected at most {MOST_PIXELS} in all")
+    if rows * columns > 1 << 24:
+        raise ValueError(f"shape: got {rows} x {columns} pixels, expected at most {1 << 24} in all")
     return rows, columns
 
 
@@ -78,8 +73,8 @@ def check_range_db(range_db: Sequence[float]) -> tuple[float, float]:
         TypeError, ValueError: if it is not two finite numbers, or the first lies above the second.
     """
     low, high = (float(value) for value in check_array("range_db", range_db, (2,)))
-    if low > high:
-        raise ValueError(f"range_db: got {low:g} to {high:g}, expected the lowest value first")
+    if not -1e4 <= low <= high <= 1e4:
+        raise ValueError(f"range_db: got {low:g} to {high:g}, expected decibels, the lowest value first")
     return low, high
 
 
@@ -93,12 +88,12 @@ def check_pixels(path_gain: np.ndarray, delay_s: np.ndarray | None, aod: np.ndar
         bad = int((path_gain < 0).sum())
         raise ValueError(f"path_gain: got {bad} negative values, expected linear path gain")
     if delay_s is not None and not (np.isnan(delay_s) | (delay_s >= 0) & (delay_s < np.inf)).all():
-        raise ValueError(
-            "delay_s: got values that are negative or infinite, expected seconds, or NaN where empty"
-        )
+        raise ValueError("delay_s: got negative or infinite values, expected seconds, or NaN where empty")
+    angle_rounding = 1e-3  # radians by which angles of departure may lie out of range: by compact files
     if aod is not None:
-        zenith, azimuth, most = aod[..., 0], aod[..., 1], np.pi + _ANGLE_ROUNDING
-        if ((zenith < -_ANGLE_ROUNDING) | (zenith > most) | (azimuth < -most) | (azimuth > most)).any():
+        check_known_whole("aod", aod)
+        zenith, azimuth, most = aod[..., 0], aod[..., 1], np.pi + angle_rounding
+        if ((zenith < -angle_rounding) | (zenith > most) | (azimuth < -most) | (azimuth > most)).any():
             raise ValueError(
                 "aod: got angles out of range, expected zeniths 0 to pi and azimuths -pi to pi, or NaN where empty"
             )
@@ -108,9 +103,7 @@ def check_whole(name: str, path_gain: ArrayLike) -> None:
     """Raise ValueError, naming the argument, if pixels of spectra were not measured."""
     missing = int(np.isnan(path_gain).sum())
     if missing:
-        raise ValueError(
-            f"{name}: {missing} of {np.size(path_gain)} pixels were not measured (NaN), expected whole spectra"
-        )
+        raise ValueError(f"{name}: {missing} of {np.size(path_gain)} pixels are NaN, expected whole spectra")
 
 
 def pixel_angles(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -148,12 +141,13 @@ def sub_pixel_directions(shape: tuple[int, int], sub_pixels: int) -> tuple[np.nd
     """
     rows, columns = shape
     count = sub_pixels**2
+    golden = 0.5 * (np.sqrt(5.0) - 1.0)
     step = min(
-        (a for a in range(1, count + 1) if np.gcd(a, count) == 1), key=lambda a: abs(a - count * _GOLDEN)
+        (a for a in range(1, count + 1) if np.gcd(a, count) == 1), key=lambda a: abs(a - count * golden)
     )
     k, i, j = np.arange(count), np.arange(rows)[:, None, None], np.arange(columns)[None, :, None]
-    across = (k + np.mod(i * _GOLDEN, 1.0)) / count  # one value a row and direction: no two alike in a column
-    down = (k * step % count + np.mod(j * _GOLDEN, 1.0)) / count
+    across = (k + np.mod(i * golden, 1.0)) / count  # one value a row and direction: no two alike in a column
+    down = (k * step % count + np.mod(j * golden, 1.0)) / count
     top, bottom = np.cos(i * np.pi / rows), np.cos((i + 1) * np.pi / rows)
     azimuth = -np.pi + (j + across) * 2.0 * np.pi / columns
     directions = directions_from_angles(np.arccos(top + (bottom - top) * down), azimuth).reshape(-1, 3)
@@ -163,9 +157,8 @@ def sub_pixel_directions(shape: tuple[int, int], sub_pixels: int) -> tuple[np.nd
 def directions_from_angles(zenith: ArrayLike, azimuth: ArrayLike) -> np.ndarray:
     """Unit vectors, shape ``(..., 3)``, of zenith in [0, pi] and azimuth in (-pi, pi] [rad]."""
     zenith, azimuth = np.broadcast_arrays(np.asarray(zenith, float), np.asarray(azimuth, float))
-    return np.stack(
-        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1
-    )
+    sine = np.sin(zenith)
+    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=-1)
 
 
 def angles_from_directions(directions: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
@@ -178,9 +171,8 @@ def angles_from_directions(directions: ArrayLike) -> tuple[np.ndarray, np.ndarra
 def transverse_basis(directions: ArrayLike) -> np.ndarray:
     """Zenith and azimuth unit vectors at unit directions ``(..., 3)``, shape ``(..., 2, 3)``."""
     zenith, azimuth = angles_from_directions(directions)
-    up = np.stack(
-        [np.cos(zenith) * np.cos(azimuth), np.cos(zenith) * np.sin(azimuth), -np.sin(zenith)], axis=-1
-    )
+    cosine = np.cos(zenith)
+    up = np.stack([cosine * np.cos(azimuth), cosine * np.sin(azimuth), -np.sin(zenith)], axis=-1)
     around = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)], axis=-1)
     return np.stack([up, around], axis=-2)
 
@@ -193,9 +185,10 @@ def pixel_of(directions: ArrayLike, shape: tuple[int, int]) -> tuple[np.ndarray,
     return row, np.floor((azimuth + np.pi) * columns / (2.0 * np.pi)).astype(np.int64) % columns
 
 
-def to_db(path_gain: ArrayLike, floor: float) -> np.ndarray:
-    """10 log10(P + N0) [dB], of linear path gain and the noise floor N0."""
-    return 10.0 * np.log10(np.asarray(path_gain, dtype=np.float64) + floor)
+def to_db(path_gain: ArrayLike, floor: float = 0.0) -> np.ndarray:
+    """10 log10(P + N0) [dB], of linear path gain and the noise floor N0; minus infinity of nothing."""
+    with np.errstate(divide="ignore"):
+        return 10.0 * np.log10(np.asarray(path_gain, dtype=np.float64) + floor)
 
 
 def default_floor(path_gain: np.ndarray) -> float:
@@ -208,7 +201,9 @@ def default_floor(path_gain: np.ndarray) -> float:
     peak = np.nan_to_num(path_gain).reshape(len(path_gain), -1).max(axis=1)
     if not (peak > 0.0).any():
         raise ValueError("path_gain: all spectra are empty, expected power to set a floor from")
-    return float(np.median(peak[peak > 0.0])) * 10.0 ** (-FLOOR_BELOW_MEDIAN_DB / 10.0)
+    # The default N0 lies this far below the median over views of the view's maximum
+    floor_below_median_db = 60.0
+    return float(np.median(peak[peak > 0.0])) * 10.0 ** (-floor_below_median_db / 10.0)
 
 
 class SpreadPaths(NamedTuple):
@@ -375,7 +370,10 @@ def unit_beams(directions: np.ndarray, shape: tuple[int, int], sigma: float) -> 
 
 def _cutoff(shape: tuple[int, int], sigma: float) -> float:
     """Where a beam ends [rad]; one narrower than the grid still reaches the centre of the pixel it falls in."""
-    return float(min(max(BEAM_CUTOFF * sigma, np.hypot(np.pi / shape[0], 2.0 * np.pi / shape[1])), np.pi))
+    # Beyond this many sigma a path is cut off: 106 dB below its peak; 2.3e-11 of its power, given back by
+    # normalising
+    beam_cutoff = 7.0
+    return float(min(max(beam_cutoff * sigma, np.hypot(np.pi / shape[0], 2.0 * np.pi / shape[1])), np.pi))
 
 
 class _BeamGrid(NamedTuple):
@@ -424,9 +422,8 @@ def _least_falls(shape: tuple[int, int], sigma: float, device: str) -> tuple[wp.
     cosine = np.cos(zenith)[:, None] * np.cos(zenith[cell])
     sine = np.sin(zenith)[:, None] * np.sin(zenith[cell])
     chord = np.sqrt(np.maximum(2.0 - 2.0 * (cosine[..., None] + sine[..., None] * apart), 0.0))
-    nearest = np.maximum(
-        chord - 0.5 * np.hypot(np.pi / rows, 2.0 * np.pi / columns), 0.0
-    )  # of a ray in the cell
+    # of a ray in the cell
+    nearest = np.maximum(chord - 0.5 * np.hypot(np.pi / rows, 2.0 * np.pi / columns), 0.0)
     fall = 0.5 * (nearest / sigma) ** 2 * (1.0 - 1e-6)
     fall[nearest > 2.0 * np.sin(0.5 * _cutoff(shape, sigma)) * (1.0 + 1e-6)] = np.inf
     return (
@@ -527,8 +524,7 @@ class Spectrum:
     @property
     def path_gain_db(self) -> np.ndarray:
         """10 log10(P + N0) [dB], shape of ``path_gain``."""
-        with np.errstate(divide="ignore"):
-            return to_db(self.path_gain, self.floor)
+        return to_db(self.path_gain, self.floor)
 
     @property
     def total_path_gain(self) -> Any:
@@ -544,9 +540,7 @@ class Spectrum:
             ValueError: for spectra of several receivers.
         """
         if self.path_gain.ndim > 2:
-            raise ValueError(
-                f"spectrum: got {len(self.path_gain)} receivers, expected one: spectrum[0].plot()"
-            )
+            raise ValueError(f"spectrum: got {len(self.path_gain)} receivers, expected one: spectrum[0]")
         pyplot = _device.require("matplotlib.pyplot", extra="plots")
         if ax is None:
             _, ax = pyplot.subplots(figsize=(8.0, 4.0))

@@ -25,15 +25,18 @@ class Interreflection:
 
     Args:
         tracer: casts the rays.
+        most: slabs that first scatterings may pass, at most.
 
     Attributes:
         lit: what the rays of sides see of first scatterings: records whose ray is the side, of irradiance where the
             transmitter gives cos(theta_i) / d1^2 [1/m^2].
+        through: the same of surfaces that are lit through slabs.
+        behind: the same of surfaces that are seen through slabs.
         between: irradiance of sides (rows) by radiance of sides (columns), shape ``(E, E)``: those of first sides, and of
             second ones that light can reach; solids' inner ones are left dark.
     """
 
-    def __init__(self, tracer: Tracer) -> None:
+    def __init__(self, tracer: Tracer, most: int) -> None:
         surface, grid = tracer.surface, tracer.grid
         point, normal = _sample_points(surface)
         known = np.arange(len(point))
@@ -44,15 +47,20 @@ class Interreflection:
             known = np.union1d(known, surface.side_met(face[ray], grid.directions[ray]))
         shift = np.random.default_rng(0).random((2, len(surface.element_area)))
         scale = np.float32(np.pi / RAYS * (4.0 * np.pi / tracer.wavelength_m) ** 2)
-        self.lit: list[Records] = []
+        self.lit, self.through, self.behind = list[Records](), list[Records](), list[Records]()
         rows, columns, values, new = [], [], [], known
         while len(new):
             directions = _hemispheres(normal[new], shift[:, new % shift.shape[1]])
             hits = grid.hit_along(point[new] + LIFT_M * normal[new], directions, np.ones(len(directions)))
             hit = np.flatnonzero(hits.face >= 0)
             side, met = np.repeat(new, RAYS), surface.side_met(hits.face[hit], directions[hit])
-            found = tracer.lit(Rays(hits, side))
-            self.lit.append(replace(found, power=scale * found.power))
+            rays = Rays(hits, side)
+            tables = [(self.lit, tracer.lit(rays))]
+            if most:
+                onward = tracer.behind(rays, most)
+                tables += [(self.through, tracer.lit_through(rays, most)), (self.behind, tracer.lit(onward))]
+            for table, found in tables:
+                table.append(replace(found, power=scale * found.power))
             rows.append(side[hit])
             columns.append(met)
             values.append(np.pi / RAYS * np.broadcast_to(grid.transmittance(hits.range_m[hit]), len(hit)))
@@ -67,10 +75,12 @@ def irradiance(tracer: Tracer, p: Parameters, effects: Effects) -> np.ndarray | 
     transmitter gives cos(theta_i) / d1^2 [1/m^2], shape ``(E,)``; None where ``effects`` hold no second scattering."""
     if effects.scatterings < 2:
         return None
-    light = tracer.kept.get("interreflection", lambda: Interreflection(tracer.of_transmitter))
-    materials, sides = Evaluation(p, device=tracer.grid.device), tracer.surface.element_sides
+    most, sides = effects.transmissions, tracer.surface.element_sides
+    light = tracer.kept.get(("interreflection", most), lambda: Interreflection(tracer.of_transmitter, most))
+    materials = Evaluation(p, slabs=tracer.slabs(most), device=tracer.grid.device)
     share = p.scattered_share[tracer.surface.side_group] / np.pi
-    got = sum(np.bincount(r.ray, r.powers(materials), minlength=sides) for r in light.lit)
+    tables = [*light.lit, *light.through, *(light.behind if effects.scatter_mirror else [])]
+    got = sum(np.bincount(r.ray, r.powers(materials), minlength=sides) for r in tables)
     if effects.mirror_scatter:
         onto = tracer.mirrored.onto
         got = got + light.between @ (share * np.bincount(onto.ray, onto.powers(materials), minlength=sides))

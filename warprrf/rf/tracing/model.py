@@ -32,7 +32,9 @@ class Effects:
         scatterings: most scatterings on a path, 0 to 3; from the second on surfaces light each other evenly over half a
             metre.
         mirror_scatter: whether mirrors light surfaces that scatter.
-        scatter_mirror: whether lit surfaces are seen in mirrors. Sionna RT has no such paths.
+        scatter_mirror: whether lit surfaces are seen in mirrors, and through slabs. Sionna RT has no such paths.
+        transmissions: most slabs that a path passes, 0 to 3.
+        diffractions: most edges on a path, 0 or 1; beside one mirror at most, and no scattering.
         residual: whether what surfaces scatter differs within their group.
 
     Example::
@@ -45,19 +47,25 @@ class Effects:
     scatterings: int = 3
     mirror_scatter: bool = True
     scatter_mirror: bool = True
+    transmissions: int = 3
+    diffractions: int = 1
     residual: bool = True
 
     def __post_init__(self) -> None:
         check_count("mirrors", self.mirrors, 0, 3)
         check_count("scatterings", self.scatterings, 0, 3)
+        check_count("transmissions", self.transmissions, 0, 3)
+        check_count("diffractions", self.diffractions, 0, 1)
 
 
 SETS = {
-    "single": Effects(mirrors=1, scatterings=1, mirror_scatter=False, scatter_mirror=False),
-    "room": Effects(scatter_mirror=False),
-    "everything": Effects(),
+    "single": Effects(
+        mirrors=1, scatterings=1, mirror_scatter=False, scatter_mirror=False, transmissions=0, diffractions=0
+    ),
+    "room": Effects(scatter_mirror=False, transmissions=0, diffractions=0),
+    "everything": Effects(transmissions=0, diffractions=0),
 }
-"""Sets of effects that a fit tries."""
+"""Sets of effects that a fit tries; it adds what passes slabs and goes over edges where the scene needs it."""
 
 MOST_NEPERS = 40.0  # of any logarithm: 174 dB from one, where no surface is
 _EXCESS = (0.05, 200.0)  # of epsilon_r - 1: the last reflects like metal
@@ -67,6 +75,7 @@ ARRAYS = {
     "log_weight": Expected("G L", most=MOST_NEPERS),
     "log_excess": Expected("G", -MOST_NEPERS, MOST_NEPERS),
     "log_mirror": Expected("G", most=MOST_NEPERS),
+    "log_through": Expected("G", most=MOST_NEPERS),
 }
 """What the arrays of :class:`Parameters` must be: G groups, L lobes."""
 
@@ -84,6 +93,8 @@ class Parameters:
             (2007), Sionna RT's, do not.
         log_gain: ln of a gain common to all paths (an uncalibrated receiver).
         roughness: power of the carrier with which roughness counts; 2 by Ament (1953).
+        log_through: ln of the share of what its slab lets through, by permittivity and thickness as far as they are known, that
+            it does let through, shape ``(G,)``; by default 0.
         log_gains: ln of the unknown gains of measuring chains, shape ``(C,)``; only while a fit lasts.
 
     Raises:
@@ -97,6 +108,7 @@ class Parameters:
     reciprocal: bool = False
     log_gain: float = 0.0
     roughness: float = ROUGHNESS
+    log_through: np.ndarray = None  # type: ignore[assignment]  # made when it is not given
     log_gains: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
@@ -106,6 +118,8 @@ class Parameters:
                 f"lobes: got {self.lobes!r}, expected different exponents, whole numbers from 0 to {NARROWEST_LOBE}"
             )
         object.__setattr__(self, "lobes", tuple(lobes))
+        if self.log_through is None:
+            object.__setattr__(self, "log_through", np.zeros(len(self.log_excess)))
         check_arrays(vars(self), ARRAYS, L=len(lobes))
         check_type("reciprocal", self.reciprocal, bool)
         check_number("roughness", self.roughness, -10.0, 10.0)
@@ -199,12 +213,12 @@ class Model:
 
 
 class Layout:
-    """Order of the free parameters in a vector: per group lobes, excess, mirror; then the common gain, then the power of
-    the carrier that roughness goes with, then the gains of measuring chains.
+    """Order of the free parameters in a vector: per group lobes, excess, mirror, and what it lets through; then the common gain,
+    then the power of the carrier that roughness goes with, then the gains of measuring chains.
 
     Attributes:
         groups, lobes: how many.
-        gain, roughness: whether these are free.
+        through, gain, roughness: whether these are free.
         chains: how many gains of measuring chains are free.
         stride: parameters of a group.
         first_chain: place of the first chain's gain.
@@ -212,16 +226,18 @@ class Layout:
     """
 
     def __init__(
-        self, groups: int, lobes: int, *, gain: bool = False, roughness: bool = False, chains: int = 0
+        self,
+        groups: int,
+        lobes: int,
+        *,
+        through: bool = False,
+        gain: bool = False,
+        roughness: bool = False,
+        chains: int = 0,
     ) -> None:
-        self.groups, self.lobes, self.gain, self.roughness, self.chains = (
-            groups,
-            lobes,
-            gain,
-            roughness,
-            chains,
-        )
-        self.stride = lobes + 2
+        self.groups, self.lobes, self.through = groups, lobes, through
+        self.gain, self.roughness, self.chains = gain, roughness, chains
+        self.stride = lobes + 2 + through
         self.first_chain = groups * self.stride + gain + roughness
         self.size = self.first_chain + chains
 
@@ -247,17 +263,31 @@ class Layout:
         """Places of the mirror share of each of ``group``."""
         return self.stride * group + self.lobes + 1
 
+    def passage(self, group: np.ndarray) -> np.ndarray:
+        """Places of what each of ``group`` lets through, if that is free."""
+        return self.stride * group + self.lobes + 2
+
+    def columns(self, groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where the parameters of each group begin in a table of those of ``groups`` alone, shape ``(G,)`` int32, and the places of
+        its columns in the vector."""
+        own = np.unique(groups)
+        place = np.zeros(self.groups, np.int32)
+        place[own] = self.stride * np.arange(len(own))
+        return place, (self.stride * own[:, None] + np.arange(self.stride)).ravel()
+
     def pack(self, p: Parameters) -> np.ndarray:
         """Vector of ``p``."""
-        table = np.concatenate([p.log_weight, p.log_excess[:, None], p.log_mirror[:, None]], axis=1).ravel()
+        columns = [p.log_excess, p.log_mirror, *[p.log_through] * self.through]
+        table = np.column_stack([p.log_weight, *columns]).ravel()
         single = [p.log_gain] * self.gain + [p.roughness] * self.roughness
         return np.concatenate([table, single, p.log_gains])
 
     def unpack(self, vector: np.ndarray, like: Parameters) -> Parameters:
         """Parameters of a vector; what it does not hold is as in ``like``."""
         table = vector[: self.groups * self.stride].reshape(self.groups, self.stride)
+        through = table[:, self.lobes + 2].copy() if self.through else like.log_through
         return replace(
-            like, log_weight=table[:, : self.lobes].copy(), log_excess=table[:, self.lobes].copy(),
+            like, log_through=through, log_weight=table[:, : self.lobes].copy(), log_excess=table[:, self.lobes].copy(),
             log_mirror=table[:, self.lobes + 1].copy(), log_gains=vector[self.first_chain :].copy(),
             log_gain=float(vector[self.common_gain]) if self.gain else like.log_gain,
             roughness=float(vector[self.carrier_power]) if self.roughness else like.roughness,

@@ -1,12 +1,14 @@
 """Records of paths as geometry fixes them, and what parameters make of them: powers, slopes, columns.
 
 A table holds the paths of one sequence of interactions, named from the transmitter to the receiver: ``M`` a mirror, ``S`` a
-surface that scatters, ``E`` an element of the surface that sends on what it got of others. Mirrors and line of sight, paths
-of one direction each, are the table ``"specular"``. All kinds are evaluated by :mod:`warprrf.kernels.radio.records`.
+surface that scatters, ``E`` an element of the surface that sends on what it got of others, ``T`` slabs that are passed.
+Mirrors and line of sight, paths of one direction each, are the table ``"specular"``. All kinds are evaluated by
+:mod:`warprrf.kernels.radio.records`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Any
@@ -35,8 +37,8 @@ class Records:
         ray: ray of the receiver's grid that sees it, or row of a specular path, or side of an element that is lit, ``(N,)``.
         index: group that each interaction meets, or side of the element that sends, -1 for none, shape ``(N, K)`` int32.
         angle: its angles, see :mod:`warprrf.kernels.radio.records`, shape ``(N, K, 3)``.
-        rough: column of what leaves light unpolarised, K where there is none.
-        kind: of that, ``kernels.SCATTER`` or ``kernels.SOURCE``; 0 for none.
+        kind: of its interactions: ``MIRROR``, ``SCATTER``, ``SLAB``, ``SOURCE`` of the kernels or 0, shape ``(N, K)`` int32, or
+            ``(1, K)`` where all records have the same.
         residual_row: which row of the residual holds the gain of the cell that its ray sees, -1 for none.
         half_width: half of the cosine's stretch that a ray stands for.
     """
@@ -45,8 +47,7 @@ class Records:
     ray: np.ndarray
     index: np.ndarray
     angle: np.ndarray
-    rough: int
-    kind: int = 0
+    kind: np.ndarray
     residual_row: int = -1
     half_width: float = 0.0
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(1))
@@ -54,21 +55,50 @@ class Records:
     def __len__(self) -> int:
         return len(self.power)
 
+    @property
+    def rough(self) -> int:
+        """Column of what leaves light unpolarised, K where there is none."""
+        found = np.isin(self.kind[:1], (kernels.SCATTER, kernels.SOURCE)).nonzero()[1]
+        return int(found[0]) if len(found) else self.index.shape[1]
+
+    @property
+    def is_sent(self) -> bool:
+        """Whether elements send."""
+        return bool((self.kind[:1] == kernels.SOURCE).any())
+
+    @classmethod
+    def joined(cls, tables: Sequence[Records]) -> Records:
+        """Tables of one sequence one after another, each with kinds of its own; shorter records meet nothing at their end."""
+        most = max(table.index.shape[1] for table in tables)
+
+        def column(name: str, nothing: int) -> np.ndarray:
+            arrays = [getattr(table, name) for table in tables]
+            more = [[(0, 0), (0, most - a.shape[1]), (0, 0)][: a.ndim] for a in arrays]
+            return np.concatenate(
+                [np.pad(a, pad, constant_values=nothing) for a, pad in zip(arrays, more, strict=True)]
+            )
+
+        power, ray = (np.concatenate([getattr(table, name) for table in tables]) for name in ("power", "ray"))
+        return replace(
+            tables[0], power=power, ray=ray, index=column("index", -1), angle=column("angle", 0), kind=column("kind", 0)
+        )  # fmt: skip
+
     def take(self, rows: np.ndarray) -> Records:
         """The records ``rows``."""
-        return replace(
-            self, **{name: getattr(self, name)[rows] for name in ("power", "ray", "index", "angle")}
-        )
+        kind = self.kind if len(self.kind) == 1 else self.kind[rows]
+        own = {name: getattr(self, name)[rows] for name in ("power", "ray", "index", "angle")}
+        return replace(self, kind=kind, **own)
 
     def rough_groups(self, side_group: np.ndarray) -> np.ndarray:
         """Group that scatters or sends in each, shape ``(N,)``; ``side_group`` (E,) is that of each side of an element."""
         own = self.index[:, self.rough]
-        return side_group[own] if self.kind == kernels.SOURCE else own
+        return side_group[own] if self.is_sent else own
 
     def groups(self, side_group: np.ndarray) -> np.ndarray:
         """Groups that any of its interactions meets."""
-        found = [own for k, own in enumerate(self.index.T) if k != self.rough]
-        found += [self.rough_groups(side_group)] if self.kind else []
+        rough = self.rough
+        found = [own for k, own in enumerate(self.index.T) if k != rough]
+        found += [self.rough_groups(side_group)] if rough < self.index.shape[1] else []
         every = np.concatenate([np.zeros(0, int), *found])
         return np.unique(every[every >= 0])
 
@@ -76,7 +106,7 @@ class Records:
         """Power of each under ``materials``, shape ``(N,)``."""
         if len(self) == 0:
             return np.zeros(0)
-        if self.kind == kernels.SOURCE and not materials.has_sources:
+        if self.is_sent and not materials.has_sources:
             raise ValueError(
                 "materials: got none that elements send by, expected an evaluation with their radiance"
             )
@@ -85,18 +115,24 @@ class Records:
         launch(
             kernels.build(REALS[self.power.dtype]).record_power,
             len(self),
-            [table, m, m.weight, m.excess, m.mirror, out],
+            [table, m, m.weight, m.excess, m.mirror, m.through, out],
         )
         return np.asarray(out.numpy(), np.float64)
 
     def add_slopes(self, materials: Evaluation, bins: Bins, place: np.ndarray, slopes: np.ndarray) -> None:
         """Add to ``slopes`` (B, C) the derivatives of the powers summed in ``bins`` to logarithms of parameters; those of
-        material m stand from column ``place[m]`` on: lobe weights, epsilon_r - 1, mirrored share."""
+        material m stand from column ``place[m]`` on: lobe weights, epsilon_r - 1, mirrored share, share let through."""
         if isinstance(materials, SlabEvaluation):
             raise TypeError("materials: got slabs, expected half-spaces, which have slopes")
         self._add(
             "bin_slopes", materials, bins, [wp.array(place, dtype=wp.int32, device=materials.device)], slopes
         )
+
+    def slopes(self, materials: Evaluation, place: np.ndarray, count: int) -> np.ndarray:
+        """Those of each record, shape ``(N, count)``."""
+        found = np.zeros((len(self), count))
+        self.add_slopes(materials, Bins.of(np.arange(len(self)), len(self)), place, found)
+        return found
 
     def components(self, materials: Evaluation, bins: Bins) -> tuple[np.ndarray, np.ndarray]:
         """What groups scatter into each bin at unit weight: the groups that do, shape ``(A,)``, and sums by lobe and
@@ -133,7 +169,8 @@ class Records:
             table.power = wp.array(self.power, dtype=real, device=where, copy=False)
             table.index = wp.array(self.index, dtype=wp.int32, device=where, copy=False)
             table.angle = wp.array(self.angle, dtype=wp.types.vector(3, real), device=where, copy=False)
-            table.rough, table.kind, table.half_width = self.rough, self.kind, self.half_width
+            table.kind = wp.array(self.kind, dtype=wp.int32, device=where)
+            table.rough, table.half_width = self.rough, self.half_width
             return table
 
         table = self._uploaded.get(where, upload)
@@ -172,6 +209,7 @@ class Evaluation:
         material: row of each group in them, shape ``(G,)``; by default groups are rows.
         side_group: group of each element's side, shape ``(E,)``; None where no element sends.
         radiance: that each side sends [1/(m^2 sr)], in units of (4 pi / lambda)^2, shape ``(E,)``.
+        slabs: complex permittivity of each group, 0 where it is not known, and its thickness in wavelengths, ``(G,)`` each.
         device: where powers are computed.
     """
 
@@ -181,9 +219,11 @@ class Evaluation:
         material: np.ndarray | None = None,
         side_group: np.ndarray | None = None,
         radiance: np.ndarray | None = None,
+        slabs: tuple[np.ndarray, np.ndarray] | None = None,
         *,
         device: DeviceLike = None,
     ) -> None:
+        self.slabs = (np.zeros(0, complex), np.zeros(0)) if slabs is None else slabs
         self.parameters, self.device = parameters, str(_device.resolve(device))
         self.material = np.arange(len(parameters.log_excess)) if material is None else material
         self._side_group = np.zeros(0, int) if side_group is None else side_group
@@ -197,7 +237,9 @@ class Evaluation:
 
     def by_materials(self, parameters: Parameters, material: np.ndarray) -> Evaluation:
         """The same with parameters of materials in place of those of groups; ``material`` (G,) is that of each."""
-        return Evaluation(parameters, material, self._side_group, self._radiance, device=self.device)
+        return Evaluation(
+            parameters, material, self._side_group, self._radiance, self.slabs, device=self.device
+        )
 
     def on_device(self, real: Any) -> Any:
         """The kernels' view of it."""
@@ -209,7 +251,7 @@ class Evaluation:
         rows, count = self.material, len(p.log_excess)
         values = {
             "weight": p.weight, "excess": p.excess, "mirror": np.exp(p.log_mirror), "even_slope": slope / even,
-            "radiance": self._radiance, "thickness": np.zeros(0),
+            "radiance": self._radiance, "through": np.exp(p.log_through), "thickness": self.slabs[1],
         }  # fmt: skip
         indices = {
             "row": rows,
@@ -220,9 +262,8 @@ class Evaluation:
             setattr(m, name, wp.array(np.ascontiguousarray(value), dtype=real, device=where))
         for name, value in indices.items():
             setattr(m, name, wp.array(value, dtype=wp.int32, device=where))
-        m.permittivity = wp.empty(
-            0, dtype=wp.types.vector(2, real), device=where
-        )  # Warp's tape takes no null arrays
+        eta = np.column_stack([self.slabs[0].real, self.slabs[0].imag])
+        m.permittivity = wp.array(eta, dtype=wp.types.vector(2, real), device=where)
         m.exponent, m.scale = _lobes(p.lobes, (p.reciprocal,) * len(p.lobes), real, where, COSINES)
         return m
 
@@ -241,18 +282,18 @@ class SlabEvaluation(Evaluation):
         self, table: SurfaceTable, wavelength_m: float, material: np.ndarray, device: DeviceLike
     ) -> None:
         count = len(table.scattering)
-        super().__init__(Parameters.prior(count), material, device=device)
-        self._slabs = table, wavelength_m
+        slabs = table.permittivity, table.thickness_m / wavelength_m
+        super().__init__(Parameters.prior(count), material, slabs=slabs, device=device)
+        self._table = table
 
     def _upload(self, real: Any) -> Any:
-        (table, wavelength_m), where = self._slabs, self.device
+        table, where = self._table, self.device
         m, scattering = super()._upload(real), table.scattering**2
         kinds = list(zip(table.alpha_r.tolist(), table.reciprocal.tolist(), strict=True))
         lobes = sorted(set(kinds))
         weight = np.array([[kind == lobe for lobe in lobes] for kind in kinds]) * scattering[:, None]
-        eta = np.column_stack([table.permittivity.real, table.permittivity.imag])
-        m.slab, m.permittivity = 1, wp.array(eta, dtype=wp.types.vector(2, real), device=where)
-        values = {"weight": weight, "mirror": 1.0 - scattering, "thickness": table.thickness_m / wavelength_m}
+        m.slab = 1
+        values = {"weight": weight, "mirror": 1.0 - scattering}
         for name, value in values.items():
             setattr(m, name, wp.array(value, dtype=real, device=where))
         m.reciprocal = wp.array(table.reciprocal, dtype=wp.int32, device=where)

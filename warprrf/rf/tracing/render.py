@@ -51,10 +51,11 @@ def evaluation(tracer: Tracer, model: Model) -> Evaluation:
     """The parameters of ``model`` under a transmitter, as kernels take them."""
     p, surface = model.parameters, tracer.surface
     got = irradiance(tracer, p, model.effects)
+    slabs = tracer.slabs(model.effects.transmissions)
     if got is None:
-        return Evaluation(p, device=tracer.grid.device)
+        return Evaluation(p, slabs=slabs, device=tracer.grid.device)
     radiance = got * p.scattered_share[surface.side_group] / np.pi
-    return Evaluation(p, None, surface.side_group, radiance, device=tracer.grid.device)
+    return Evaluation(p, None, surface.side_group, radiance, slabs, device=tracer.grid.device)
 
 
 def path_gains(view: View, model: Model, materials: Evaluation) -> PathGains:

@@ -24,7 +24,10 @@ from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh, components, smoot
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.scans import is_scan, scanned_patches
 from warprrf.geometry.splats.gaussians import gaussians_of
-from warprrf.rf.em.materials import is_name_alone
+from warprrf.rf.em.fresnel import SurfaceTable
+from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, is_name_alone, itu_material, itu_name
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.paths.slabs import Walls
 from warprrf.rf.tracing.colours import Colours, colour_groups
 from warprrf.rf.tracing.shapes import SHAPES, shape_groups
 
@@ -36,9 +39,13 @@ least width holds up to 7500 m^2 of surfaces (a hall's), the largest up to 19 km
 LEAST_ELEMENTS = 300
 CELLS = 3  # along an element
 LARGEST_FACE = 1.2  # elements' widths; longer edges are split, so that elements can be small
-MIN_MIRROR_M2 = 0.05  # smaller patches reflect too little to search for
+MIN_MIRROR = 0.2  # of an element's area in a room: smaller patches reflect too little to search for
 POSITION_ERROR_M = 0.02  # of a reconstructed surface: shadow rays end so far before it
 TRUE_ERROR_M = 1e-4
+LOSSY = 4.0 * (1.0 - 0.06j)
+"""Permittivity of walls of unknown material: the loss tangent of plasterboard and wood at 300 GHz (ITU-R P.2040-4, table 3)."""
+ASSUMED_THICKNESS_M = 0.0125  # of walls of unknown thickness: a plasterboard
+MOST_ABSORBED = 30.0  # nepers
 _UNIT = Expected("F 3", -1.001, 1.001)
 ARRAYS = {
     "normal": _UNIT,
@@ -56,6 +63,7 @@ ARRAYS = {
     "element_area": Expected("E", 0.0, LARGEST_M**2),
     "element_group": index_to("G", "E"),
     "thickness_m": Expected("G", 0.0, np.inf, nan=True),
+    "dispersion": Expected("G 4", nan=True),
 }
 """What the arrays of a :class:`Surface` must be: F faces, P patches, G groups, E elements, X cells, K looks."""
 
@@ -80,6 +88,8 @@ class Surface:
         cell_element: element of each cell, shape ``(X,)`` int32.
         element_centre, element_area, element_group: of each element, shapes ``(E, 3)`` [m], ``(E,)`` [m^2], ``(E,)``.
         thickness_m: thickness of what each group is a slab of [m], shape ``(G,)``; NaN where nobody knows.
+        dispersion: a, b, c and d of each group's relative permittivity a f^b and conductivity c f^d [S/m], f in GHz, shape
+            ``(G, 4)``; NaN where ITU-R P.2040-4 tells by the name, or nobody knows.
         group_names: what the groups are called.
         position_error_m: of the surface [m]: rays end so far before it.
         two_sided: whether faces have two sides; False: mirrors that of ``plane_normal``, elements the front one, of a surface
@@ -105,6 +115,7 @@ class Surface:
     element_area: np.ndarray
     element_group: np.ndarray
     thickness_m: np.ndarray
+    dispersion: np.ndarray
     group_names: tuple[str, ...]
     position_error_m: float
     two_sided: bool = False
@@ -191,14 +202,15 @@ class Surface:
             normal, error_m = _on_patches(patches, mesh.face_normals), max(TRUE_ERROR_M, patches.tolerance_m)
         patch, planes = patches.face_patch, (patches.normal, patches.offset)
         if patches.two_sided:
-            patch, planes = _mirrors(_apart(patches, alike[group]))
+            least_m2 = MIN_MIRROR * min(element_m, ELEMENT_M) ** 2
+            patch, planes = _mirrors(_apart(patches, alike[group]), least_m2)
         sides = patches.two_sided
         mesh, parent = _split_long(mesh, np.flatnonzero(patches.once), LARGEST_FACE * element_m)
         group, patch = group[parent].astype(np.int32), patch[parent].astype(np.int32)
         return cls(
             mesh=mesh, normal=np.asarray(normal[parent]), patch=patch, plane_normal=planes[0], plane_offset=planes[1],
             group=group, material=alike, appearance=appearance, patch_group=_largest_groups(mesh, patch, group, len(planes[1])),
-            thickness_m=_thickness(geometry, material, len(names)), group_names=tuple(names), position_error_m=error_m,
+            **_slabs(geometry, material, len(names)), group_names=tuple(names), position_error_m=error_m,
             two_sided=sides, **_elements(mesh, patch, group, element_m),
         )  # fmt: skip
 
@@ -212,7 +224,7 @@ class Surface:
             plane_offset=patches.offset, group=material, material=np.arange(groups, dtype=np.int32),
             appearance=np.full((groups, 4), np.nan), patch_group=faces, element=none, cell=none, cell_element=none[:1],
             element_centre=mesh.center[None], element_area=np.array([mesh.areas.sum()]), element_group=none[:1],
-            thickness_m=np.full(groups, np.nan), group_names=tuple(names), position_error_m=TRUE_ERROR_M, two_sided=True,
+            **_slabs(mesh, None, groups), group_names=tuple(names), position_error_m=TRUE_ERROR_M, two_sided=True,
         )  # fmt: skip
 
     @cached_property
@@ -229,6 +241,43 @@ class Surface:
             return flat, wp.array(self.normal, dtype=wp.types.vector(3, real), device=where)
 
         return self._uploaded.get((str(where), real), upload)
+
+    def slabs(self, frequency_hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What each group lets through before any measurement: complex permittivity, 0 where that or the thickness is not known;
+        thickness in wavelengths; and, where it is not known, ln of the share of power that is not absorbed, by an assumed
+        one, else 0; shape ``(G,)`` each."""
+        wavelength_m, eta = SPEED_OF_LIGHT / frequency_hz, np.full(self.groups, LOSSY)
+        known = np.isfinite(self.dispersion).all(axis=1)
+        a, b, c, d = self.dispersion[known].T
+        ghz = frequency_hz / 1e9
+        eta[known] = a * ghz**b - 1j * c * ghz**d / (2.0 * np.pi * frequency_hz * VACUUM_PERMITTIVITY)
+        for g, name in enumerate(map(itu_name, self.group_names)):
+            if name is not None and not known[g]:
+                eta[g], known[g] = itu_material(name).extrapolated().permittivity(frequency_hz), True
+        known_slab = known & ~np.isnan(self.thickness_m)
+        thickness = np.where(np.isnan(self.thickness_m), ASSUMED_THICKNESS_M, self.thickness_m) / wavelength_m
+        absorbed = 4.0 * np.pi * np.where(known_slab, 0.0, thickness) * np.sqrt(eta).imag
+        return (
+            np.where(known_slab, eta, 0.0),
+            thickness,
+            np.where(known_slab, 0.0, np.maximum(absorbed, -MOST_ABSORBED)),
+        )
+
+    def table(self, frequency_hz: float) -> SurfaceTable:
+        """Its groups as smooth surfaces, before any measurement: slabs as far as :meth:`slabs` knows them, else half-spaces."""
+        eta, thickness, _ = self.slabs(frequency_hz)
+        known, none = np.abs(eta) > 0, np.zeros(self.groups, np.int32)
+        thickness_m = np.where(known, thickness * SPEED_OF_LIGHT / frequency_hz, np.inf)
+        return SurfaceTable(np.where(known, eta, LOSSY), thickness_m, np.zeros(self.groups), none, none > 0)
+
+    def walls(self, frequency_hz: float, most: int, device: DeviceLike = None) -> Walls:
+        """Its faces that may be passed, as far as :meth:`slabs` tells, up to ``most`` on one way."""
+        eta, thickness, absorbed = self.slabs(frequency_hz)
+        wavelength_m, known = SPEED_OF_LIGHT / frequency_hz, np.abs(eta) > 0
+        permittivity = np.where(known, eta, 1.0 + 0.5j * absorbed / (np.pi * thickness))[self.group]
+        return Walls.of_slabs(
+            self.mesh, permittivity, (wavelength_m * thickness)[self.group], wavelength_m, most, self.position_error_m, device
+        )  # fmt: skip
 
     @cached_property
     def patches(self) -> PlanarPatches:
@@ -295,12 +344,18 @@ def _named_faces(geometry: GeometryLike, mesh: Mesh) -> tuple[np.ndarray | None,
     return group.reshape(-1).astype(np.int32), tuple((*names, "unnamed")[k] for k in used)
 
 
-def _thickness(geometry: GeometryLike, named: np.ndarray | None, groups: int) -> np.ndarray:
-    """Thickness of each group [m], where the groups are a Scene's materials; else NaN."""
+def _slabs(geometry: GeometryLike, named: np.ndarray | None, groups: int) -> dict[str, np.ndarray]:
+    """Thickness and dispersion of each group, where the groups are a Scene's materials; else NaN."""
     materials = getattr(geometry, "materials", ())
-    if named is None or len(materials) != groups:
-        return np.full(groups, np.nan)
-    return np.array([np.nan if is_name_alone(m) else float(m.thickness_m) for m in materials])
+    thickness, dispersion = np.full(groups, np.nan), np.full((groups, 4), np.nan)
+    if named is not None and len(materials) == groups:
+        for g, m in enumerate(materials):
+            if not is_name_alone(m):
+                thickness[g] = float(m.thickness_m)
+                if getattr(m, "bands", ()) and m.itu is None:
+                    band = m.bands[0]
+                    dispersion[g] = band.a, band.b, band.c, band.d
+    return {"thickness_m": thickness, "dispersion": dispersion}
 
 
 def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray, width_m: float) -> dict[str, np.ndarray]:
@@ -348,12 +403,12 @@ def _element_width(mesh: Mesh) -> float:
     return width_m
 
 
-def _mirrors(patches: PlanarPatches) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Patches large enough to mirror, those of one group in one plane as one: patch of each face, -1 for none, and planes.
+def _mirrors(patches: PlanarPatches, least_m2: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Patches of at least ``least_m2``, those of one group in one plane as one: patch of each face, -1 for none, and planes.
 
     Faces that overlap in a plane, or sheets closer than the tolerance, would mirror twice.
     """
-    large = np.flatnonzero(patches.area >= MIN_MIRROR_M2)
+    large = np.flatnonzero(patches.area >= least_m2)
     middle = patches.mesh.center
     height = patches.offset[large] - patches.normal[large] @ middle
     reach = 0.5 * float(np.linalg.norm(np.ptp(patches.mesh.bounds, axis=0)))

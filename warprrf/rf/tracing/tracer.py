@@ -2,8 +2,9 @@
 
 Rays fill the sphere around a receiver. What they hit is connected to the transmitter (``S``) and to its images in mirrors
 (``MS``); some go on turned at a mirror and are connected there (``SM``, ``MSM``). Elements of the surface send on what they
-got of others (:mod:`warprrf.rf.tracing.interreflection`), and are seen directly (``E``) or in a mirror (``EM``). Line
-of sight and mirrors alone come from the image method (:mod:`warprrf.rf.paths.mirror_paths`).
+got of others (:mod:`warprrf.rf.tracing.interreflection`), and are seen directly (``E``) or in a mirror (``EM``). Slabs
+(``T``) may stand in the way of light to a surface (``TS``), or of sight (``ST``, ``ET``), where rays go straight on. Line
+of sight and mirrors alone, through slabs too, come from the image method (:mod:`warprrf.rf.paths.mirror_paths`).
 
 A :class:`Tracer` belongs to a surface, a transmitter and a grid of rays; what it traced gives the :class:`View` of a receiver.
 """
@@ -20,10 +21,13 @@ import numpy as np
 
 from warprrf.cache import Cache, making
 from warprrf.device import DeviceLike, Progress, resolve
-from warprrf.kernels.radio.records import SCATTER, SOURCE
+from warprrf.kernels.radio.records import MIRROR, SCATTER, SLAB, SOURCE
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.paths.edge_paths import EdgeFinder
 from warprrf.rf.paths.images import MirrorImages
 from warprrf.rf.paths.mirror_paths import MirrorPaths, ZoneRays, zone_paths
+from warprrf.rf.paths.polarisation import turns
+from warprrf.rf.paths.slabs import Slabs, Walls
 from warprrf.rf.spectra.spectrum import unit_beams
 from warprrf.rf.tracing.model import Effects
 from warprrf.rf.tracing.rays import NEAREST_M, Hits, RayGrid
@@ -41,13 +45,24 @@ _TRACED = Cache(6)  # a lobby's take up to 90 MB each; the bound is the process'
 
 
 def sequences(effects: Effects) -> tuple[str, ...]:
-    """Names of the tables that ``effects`` want besides :data:`SPECULAR`."""
-    found = ["S", *["MS"] * effects.mirror_scatter, *["SM"] * effects.scatter_mirror] * (
-        effects.scatterings > 0
-    )
-    found += ["MSM"] * (effects.scatterings > 0 and effects.mirror_scatter and effects.scatter_mirror)
-    found += ["E", *["EM"] * effects.scatter_mirror] * (effects.scatterings > 1)
-    return tuple(found)
+    """Names of the tables that ``effects`` want besides :data:`SPECULAR`; a number behind a name is how many slabs at most."""
+    e, slabs = effects, effects.transmissions > 0
+    wanted = {
+        "S": True,
+        "MS": e.mirror_scatter,
+        "SM": e.scatter_mirror,
+        "MSM": e.mirror_scatter and e.scatter_mirror,
+        "E": e.scatterings > 1,
+        "EM": e.scatterings > 1 and e.scatter_mirror,
+        "TS": slabs,
+        "TSM": slabs and e.scatter_mirror,
+        "ST": slabs and e.scatter_mirror,
+        "TST": slabs and e.scatter_mirror,
+        "MST": slabs and e.mirror_scatter and e.scatter_mirror,
+        "ET": slabs and e.scatterings > 1 and e.scatter_mirror,
+    }
+    names = [name for name, own in wanted.items() if own and e.scatterings > 0]
+    return tuple(name + str(e.transmissions) * ("T" in name) for name in names)
 
 
 @dataclass(frozen=True)
@@ -61,7 +76,9 @@ class View:
         paths: line of sight and mirror paths, L in all.
         records: tables by sequence, of those that were asked for; of line of sight and mirrors under :data:`SPECULAR`, one row
             for each of ``paths``.
-        keeps: whether what is made when it is first asked for is kept; tables of single bounces are in any case.
+        keeps: whether what is made when it is first asked for is kept.
+        lit: where it is not, rays that the transmitter lights, as bits, once that is known: the table of single bounces is
+            made of them without casting rays.
     """
 
     tracer: Tracer
@@ -70,6 +87,7 @@ class View:
     paths: MirrorPaths
     records: dict[str, Records] = field(repr=False)
     keeps: bool = True
+    lit: list[np.ndarray] = field(default_factory=list, repr=False)
     _beams: list[np.ndarray] = field(init=False, repr=False, default_factory=list)
 
     @property
@@ -104,28 +122,55 @@ class View:
         wanted = (SPECULAR, *sequences(effects))
         missing = [name for name in wanted if name not in self.records]
         made = self.tracer.trace(self, missing) if missing else {}
-        if made:
+        if made and self.keeps:
             with making:
-                self.records.update(
-                    {name: table for name, table in made.items() if self.keeps or name == "S"}
-                )
+                self.records.update(made)
+        elif "S" in made and not self.lit:
+            bits = np.zeros(len(self.hits.face), bool)
+            bits[made["S"].ray] = True
+            self.lit[:] = [np.packbits(bits)]
         return {name: made[name] if name in made else self.records[name] for name in wanted}
 
     def kept_paths(self, effects: Effects) -> np.ndarray:
         """Which line of sight and mirror paths count, shape ``(L,)`` bool."""
-        order = self.paths.order
-        return np.asarray((order <= effects.mirrors) & ((order > 0) | effects.line_of_sight))
+        order, slabs = self.paths.order, self.paths.slabs
+        few = (order <= effects.mirrors) & (slabs <= effects.transmissions)
+        few &= ~self.paths.over_edge | (effects.diffractions > 0)
+        return np.asarray(few & (~self.paths.in_sight | effects.line_of_sight))
+
+
+@dataclass(frozen=True)
+class Interactions:
+    """Interactions of one kind, K in a row: mirrors or slabs.
+
+    Attributes:
+        index: group of each, from the transmitter on, -1 for none, shape ``(N, K)``.
+        angle: its angles, see :mod:`warprrf.kernels.radio.records`, shape ``(N, K, 3)``.
+        kind: of all.
+    """
+
+    index: np.ndarray
+    angle: np.ndarray
+    kind: int
+
+    @classmethod
+    def of_mirrors(cls, group: np.ndarray, cosine: np.ndarray) -> Interactions:
+        """One mirror each: group ``(N,)`` and cosine of incidence ``(N,)``."""
+        return cls(group[:, None], np.column_stack([cosine, 0.0 * cosine, 0.0 * cosine])[:, None], MIRROR)
+
+    def take(self, rows: np.ndarray) -> Interactions:
+        """Those of ``rows``."""
+        return replace(self, index=self.index[rows], angle=self.angle[rows])
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays and what they hit: ``ray`` of the receiver's grid that each belongs to, and the interaction between the hit and
-    the receiver, if any: group ``(N,)`` and cosine ``(N,)`` of a mirror."""
+    """Rays and what they hit: ``ray`` of the receiver's grid that each belongs to, and the interactions between the hit and
+    the receiver, if any."""
 
     hits: Hits
     ray: np.ndarray
-    group: np.ndarray | None = None
-    cosine: np.ndarray | None = None
+    after: Interactions | None = None
 
 
 class Tracer:
@@ -137,6 +182,7 @@ class Tracer:
         frequency_hz: carrier.
         grid: rays of a receiver.
         beam_sigma_rad: width of the receiver's beam; None where no beams are asked for.
+        walls: what may be passed, where that is known; else the surface tells.
 
     Attributes:
         wavelength_m: wavelength.
@@ -150,8 +196,9 @@ class Tracer:
         frequency_hz: float,
         grid: RayGrid,
         beam_sigma_rad: float | None = None,
+        walls: Walls | None = None,
     ) -> None:
-        self.surface, self.grid, self.beam_sigma_rad = surface, grid, beam_sigma_rad
+        self.surface, self.grid, self.beam_sigma_rad, self._walls = surface, grid, beam_sigma_rad, walls
         self.transmitter = np.array(transmitter, np.float64)
         self.frequency_hz = frequency_hz
         self.wavelength_m = SPEED_OF_LIGHT / frequency_hz
@@ -215,60 +262,112 @@ class Tracer:
         """Images of the transmitter in the surface's mirrors."""
         return self.kept.get("images", lambda: images_of(self.surface, self.transmitter, self.grid.device))
 
-    def paths(self, receivers: np.ndarray, order: int, progress: Progress | None = None) -> MirrorPaths:
-        """Line of sight and mirror paths of ``receivers`` (R, 3) with at most ``order`` reflections."""
-        return zone_paths(
-            self.images, receivers, order, self.wavelength_m, self.surface.position_error_m, progress
-        )
+    def walls(self, most: int) -> Walls | None:
+        """What may be passed, up to ``most`` slabs on one way; None for none."""
+        if most == 0:
+            return None
+        make = partial(self.surface.walls, self.frequency_hz, most, self.grid.device)
+        return self._walls or self.kept.get(("walls", most), make)
+
+    def slabs(self, most: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Permittivity and thickness in wavelengths of each group, as :class:`Evaluation` takes them; None where ``most`` is 0."""
+        return self.surface.slabs(self.frequency_hz)[:2] if most else None
+
+    def paths(self, receivers: np.ndarray, effects: Effects, progress: Progress | None = None) -> MirrorPaths:
+        """Line of sight and mirror paths of ``receivers`` (R, 3) that ``effects`` want."""
+        found = zone_paths(
+            self.images, receivers, effects.mirrors, self.wavelength_m, self.surface.position_error_m, progress,
+            self.walls(effects.transmissions),
+        )  # fmt: skip
+        if not effects.diffractions:
+            return found
+        edges = self.kept.get("edges", self._edges)
+        return edges.find(receivers, min(effects.mirrors, 1), progress).beside(found)
+
+    def _edges(self) -> EdgeFinder:
+        """Paths over edges, between surfaces as they are taken to be before any measurement."""
+        images = MirrorImages(self.surface.patches, self.transmitter, device=self.grid.device)
+        return EdgeFinder(images, self.wavelength_m, self.surface.table(self.frequency_hz))
 
     def view(
-        self, receivers: np.ndarray, mirrors: int, *, paths: MirrorPaths | None = None, keeps: bool = True
+        self, receivers: np.ndarray, effects: Effects, *, paths: MirrorPaths | None = None, keeps: bool = True
     ) -> View:
         """What ``receivers``, (3,) or (R, 3) [m], see.
 
         Args:
             receivers: positions, off the surface.
-            mirrors: most reflections of mirror paths.
+            effects: whose mirrors and slabs line of sight and mirror paths are sought over.
             paths: line of sight and mirror paths, if they are known.
             keeps: whether the view keeps what is made when it is first asked for.
         """
         places = np.asarray(receivers, np.float64).reshape(-1, 3)
-        found = self.paths(places, mirrors) if paths is None else paths
+        found = self.paths(places, effects) if paths is None else paths
         return View(self, places, self.grid.hit(places), found, {SPECULAR: self._specular(found)}, keeps)
 
     def trace(self, view: View, names: Sequence[str]) -> dict[str, Records]:
         """Tables of sequences that a receiver sees, by name."""
-        first, turned = Rays(view.hits, np.arange(len(view.hits.face))), None
-        if any(name.endswith("M") for name in names):
-            turned = self._turned(view)
-        return {name: self._trace(name, turned if name.endswith("M") and turned else first) for name in names}
+        first = Rays(view.hits, np.arange(len(view.hits.face)))
+        seen: dict[str, Rays] = {}
+        made = {}
+        for name in names:
+            sequence, most = name.rstrip("0123456789"), int(name[-1]) if name[-1].isdigit() else 0
+            last = sequence[-1]
+            if last not in seen:
+                seen[last] = (
+                    self._turned(view) if last == "M" else self.behind(first, most) if last == "T" else first
+                )
+            if name == "S" and view.lit:
+                made[name] = self.lit(first, np.flatnonzero(np.unpackbits(view.lit[0], count=len(first.ray))))
+            else:
+                made[name] = self._trace(sequence, seen[last], most)
+        return made
 
-    def _trace(self, name: str, rays: Rays) -> Records:
-        """Records of one sequence."""
-        if name.startswith("E"):
+    def _trace(self, sequence: str, rays: Rays, most: int) -> Records:
+        """Records of one sequence, over at most so many slabs."""
+        if sequence[0] == "E":
             return self.seen(rays)
-        return self.lit_by_mirrors(rays) if name.startswith("M") else self.lit(rays)
+        if sequence[0] == "M":
+            return self.lit_by_mirrors(rays)
+        return self.lit_through(rays, most) if sequence[0] == "T" else self.lit(rays)
 
     def _specular(self, p: MirrorPaths) -> Records:
         """Line of sight and mirror paths as records, in double precision."""
         friis = (self.wavelength_m / (4.0 * np.pi * p.length_m)) ** 2 * p.share**2
+        mirrors, slabs = p.patch >= 0, p.slab >= 0
         group = np.append(self.surface.patch_group, -1)[p.patch]  # no patch has no group
-        angle = np.stack([p.cosine, np.where(p.patch >= 0, p.turn, 0.0), 0.0 * p.cosine], axis=2)
+        group = np.where(slabs, self.surface.group[p.slab], group)
+        thickness = np.nan_to_num(p.thickness_m) / self.wavelength_m
+        angle = np.stack([p.cosine, np.where(mirrors | slabs, p.turn, 0.0), thickness], axis=2)
         power = friis * self.grid.transmittance(p.length_m)
-        return Records(
-            power, np.arange(len(p), dtype=np.int32), group.astype(np.int32), angle, group.shape[1]
-        )
+        kind = MIRROR * mirrors + SLAB * slabs
+        row = np.arange(len(p), dtype=np.int32)
+        return Records(power, row, group.astype(np.int32), angle, kind.astype(np.int32))
 
-    def lit(self, rays: Rays) -> Records:
-        """What rays see of surfaces that the transmitter lights."""
+    def lit(self, rays: Rays, row: np.ndarray | None = None) -> Records:
+        """What rays see of surfaces that the transmitter lights: the rays ``row``, if that is known."""
+        if row is not None:
+            light = self.grid.light_through(rays.hits, self.transmitter, row)
+            return self.scattered(rays, row, light.strength, light.angle)
         light = self.grid.light(rays.hits, self.transmitter)
         row = np.flatnonzero(light.strength > 0)
         return self.scattered(rays, row, light.strength[row], light.angle[row])
 
+    def lit_through(self, rays: Rays, most: int) -> Records:
+        """What rays see of surfaces that the transmitter lights through slabs, up to ``most``."""
+        light, walls = self.grid.light_through(rays.hits, self.transmitter), self.walls(most)
+        row = np.flatnonzero(light.strength > 0)
+        if walls is None:
+            raise ValueError("most: got 0, expected slabs")
+        arrived, slabs = walls.between(self.transmitter, light.point[row])
+        own = np.flatnonzero(slabs.count > 0)
+        row, slabs = row[arrived[own]], slabs.take(own)
+        before = self._through(slabs, light.point[row] - self.transmitter)
+        return self.scattered(rays, row, light.strength[row], light.angle[row], before)
+
     def lit_by_mirrors(self, rays: Rays) -> Records:
         """What some rays of each pixel see of surfaces that images of the transmitter light."""
         chosen, times = np.flatnonzero(rays.hits.face >= 0), 1.0
-        if rays.group is None:
+        if rays.after is None:
             places = ((np.arange(THROUGH_MIRRORS) + 0.5) * self.grid.per_pixel / THROUGH_MIRRORS).astype(int)
             places = np.unique(places)
             times = self.grid.per_pixel / len(places)
@@ -281,7 +380,7 @@ class Tracer:
         way = m.image[image[k]] - light.point[k]
         way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
         cosine = np.abs(np.einsum("ni,ni->n", way, self.surface.plane_normal[patch]))
-        before = self.surface.patch_group[patch], cosine
+        before = Interactions.of_mirrors(self.surface.patch_group[patch], cosine)
         return self.scattered(
             rays, row[k], light.strength[k] * self.grid.dtype.type(times), light.angle[k], before
         )
@@ -306,9 +405,9 @@ class Tracer:
         row: np.ndarray,
         strength: np.ndarray,
         angle: np.ndarray,
-        before: tuple[np.ndarray, np.ndarray] | None = None,
+        before: Interactions | None = None,
     ) -> Records:
-        """Records of scattering where the rays ``row`` hit, after a mirror of group and cosine ``before``."""
+        """Records of scattering where the rays ``row`` hit, after the interactions ``before``."""
         group = self.surface.group[rays.hits.face[row]]
         return self._records(rays, row, self.wavelength_m**2 * strength, group, angle, SCATTER, before)
 
@@ -320,19 +419,48 @@ class Tracer:
         index: np.ndarray,
         angle: np.ndarray,
         kind: int,
-        before: tuple[np.ndarray, np.ndarray] | None = None,
+        before: Interactions | None = None,
     ) -> Records:
-        after = None if rays.group is None or rays.cosine is None else (rays.group[row], rays.cosine[row])
-        columns, angles, dtype = [index], [angle], self.grid.dtype
-        for mirror, where in ((before, 0), (after, len(columns) + (before is not None))):
-            if mirror is not None:
-                columns.insert(where, mirror[0])
-                angles.insert(where, np.column_stack([mirror[1], 0.0 * mirror[1], 0.0 * mirror[1]]))
+        after, dtype = None if rays.after is None else rays.after.take(row), self.grid.dtype
+        legs = [
+            leg
+            for leg in (before, Interactions(index[:, None], angle[:, None], kind), after)
+            if leg is not None
+        ]
         residual_row = -1 if after is not None else int(kind == SOURCE or before is not None)
+        kinds = np.concatenate([np.full(leg.index.shape[1], leg.kind, np.int32) for leg in legs])[None]
         return Records(
-            np.asarray(power, dtype), rays.ray[row].astype(np.int32), np.stack(columns, axis=1).astype(np.int32),
-            np.stack(angles, axis=1).astype(dtype), int(before is not None), kind, residual_row, self.grid.half_width,
+            np.asarray(power, dtype), rays.ray[row].astype(np.int32),
+            np.concatenate([leg.index for leg in legs], axis=1).astype(np.int32),
+            np.concatenate([leg.angle for leg in legs], axis=1).astype(dtype), kinds, residual_row, self.grid.half_width,
         )  # fmt: skip
+
+    def _through(self, slabs: Slabs, way: np.ndarray) -> Interactions:
+        """Slabs that are passed along ``way`` (N, 3), not of unit length, in this order."""
+        slabs = slabs.trimmed
+        met, s = slabs.face >= 0, self.surface
+        normal = np.where(met[..., None], s.mesh.face_normals[slabs.face], way[:, None])
+        stops = np.arange(slabs.face.shape[1] + 2)[:, None] * way[:, None]
+        turn = np.where(met, turns(stops, normal), 0.0)
+        thickness = np.nan_to_num(slabs.thickness_m) / self.wavelength_m
+        return Interactions(
+            np.where(met, s.group[slabs.face], -1), np.stack([slabs.cosine, turn, thickness], axis=2), SLAB
+        )
+
+    def behind(self, rays: Rays, most: int) -> Rays:
+        """``rays`` that go straight on through what they hit, and what they meet behind up to ``most`` slabs."""
+        hits, walls = rays.hits, self.walls(most)
+        if walls is None:
+            raise ValueError("most: got 0, expected slabs")
+        ray = np.flatnonzero(hits.face >= 0)
+        ray = ray[walls.passes[hits.face[ray]]]
+        origins = hits.origins[ray // (len(hits.face) // len(hits.origins))]
+        directions = hits.directions[ray % len(hits.directions)]
+        row, face, range_m, slabs = walls.behind(origins, directions, hits.face[ray], hits.range_m[ray])
+        after = self._through(slabs.reversed, -directions[row])
+        solid_angle = hits.solid_angle[ray[row] % len(hits.solid_angle)]
+        found = Hits(origins[row], directions[row], solid_angle, face.astype(np.int32), range_m)
+        return Rays(found, rays.ray[ray[row]], after)
 
     def _turned(self, view: View) -> Rays:
         """Rays of a coarser lattice turned at the mirrors that they hit, and what they hit there. Of the receiver's grid each
@@ -354,7 +482,7 @@ class Tracer:
         place = ((place + 0.5) * per_pixel / grid.per_pixel).astype(int)
         met = view.hits.face.reshape(-1, per_pixel) >= 0
         place = np.where(met[pixel, place], place, met.argmax(axis=1)[pixel])
-        return Rays(found, pixel * per_pixel + place, s.group[face], cosine)
+        return Rays(found, pixel * per_pixel + place, Interactions.of_mirrors(s.group[face], cosine))
 
     def adopted(self, view: View) -> View:
         """What :func:`traced` found, as a view of this tracer."""
@@ -366,7 +494,7 @@ def traced(
     again: Callable[[], Tracer], effects: Effects, keeps: bool, part: tuple[np.ndarray, MirrorPaths]
 ) -> View:
     """What a receiver (3,) of known line of sight and mirror paths sees, without what all receivers share."""
-    view = again().view(part[0], effects.mirrors, paths=part[1], keeps=keeps)
+    view = again().view(part[0], effects, paths=part[1], keeps=keeps)
     view.tables(effects)
     none: dict[str, Any] = {"directions": None, "solid_angle": None}
     return replace(view, tracer=None, hits=replace(view.hits, **none))  # type: ignore[arg-type]
@@ -411,8 +539,9 @@ class MirroredLight:
         share = s.mesh.areas[face] / s.element_area[s.element[face]]
         power = share * cos_in / np.maximum(length, NEAREST_M) ** 2 * grid.transmittance(length)
         cosine = np.abs((toward * s.plane_normal[patch]).sum(axis=1))
-        angle = np.column_stack([cosine, 0.0 * cosine, 0.0 * cosine])[:, None]
-        self.onto = Records(power, s.side_met(face, -normal), s.patch_group[patch][:, None], angle, 1)
+        mirror = Interactions.of_mirrors(s.patch_group[patch], cosine)
+        kind = np.array([[MIRROR]], np.int32)
+        self.onto = Records(power, s.side_met(face, -normal), mirror.index, mirror.angle, kind)
 
     def pairs(self, face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows of ``face`` (N,) and images that light them, one for each pair."""

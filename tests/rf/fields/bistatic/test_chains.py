@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from furnished import RECEIVERS, ROOM, TX, F, spectra
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths
+from furnished import RECEIVERS, ROOM, TX
+from radio_scenes import joined, mirror_paths
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.kernels.radio.records import MIRROR
 from warprrf.rf.paths.polarisation import turns
-from warprrf.rf.paths.trace import MirrorTracer
-from warprrf.rf.tracing.model import Effects, Parameters
+from warprrf.rf.tracing.model import Parameters
 from warprrf.rf.tracing.records import Evaluation, Records
 from warprrf.rf.tracing.surface import POSITION_ERROR_M, Surface
 
@@ -40,36 +39,8 @@ def reflected(excess: np.ndarray, cosine: np.ndarray, turn: np.ndarray) -> np.nd
     none = np.zeros(excess.size)
     p = Parameters(none[:, None], np.log(np.where(excess > 0, excess, 1.0)).ravel(), none, (0,))
     angle = np.stack([cosine, turn, 0.0 * turn], axis=2)
-    ones, mirrors = np.ones(len(excess)), excess.shape[1]
-    return Records(ones, np.arange(len(excess)), index, angle, mirrors).powers(Evaluation(p))
-
-
-@pytest.mark.usefixtures("device")
-def test_mirrors_one_after_the_other_reflect_as_jones_matrices_say() -> None:
-    """The image method on the true scene multiplies Jones matrices."""
-    mesh, part = joined(ROOM, box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 1.0]))
-    room = [
-        SlabMaterial("walls", 3.0, 0.0, np.inf, 0.5),
-        SlabMaterial("box", 7.0, 0.0, np.inf, 0.6),
-    ]
-    scene = RadioScene(mesh, part, room)
-    ds = spectra(scene, RX[None], shape=(12, 24), sigma=np.radians(10.0))
-    field = BistaticField.prior(scene, ds, effects=Effects(mirrors=2, scatterings=0))
-    permittivity = np.array([m.relative_permittivity for m in room])
-    mirrored = 1.0 - np.array([m.scattering for m in room]) ** 2
-    p = replace(field.parameters, log_excess=np.log(permittivity - 1.0), log_mirror=np.log(mirrored))
-    field = replace(field, parameters=p)
-    view = field.view(RX)
-    found = view.paths
-    true = MirrorTracer(scene, transmitter=TX, frequency_hz=F).trace(RX, 2)
-    power = field.path_gains(view).specular
-    for path in range(len(found)):
-        same = (np.abs(true.length_m - found.length_m[path]) < 1e-6) & (
-            true.arrival @ found.arrival[path] > 1 - 1e-9
-        )
-        assert same.sum() == 1
-        assert power[path] == pytest.approx(true.power[same][0], rel=1e-6)
-    assert (np.bincount(found.order) >= [0, 5, 8]).all()  # fewer mirrors leave columns of none
+    kind = np.full((1, excess.shape[1]), MIRROR, np.int32)
+    return Records(np.ones(len(excess)), np.arange(len(excess)), index, angle, kind).powers(Evaluation(p))
 
 
 def test_a_mirror_met_head_on_has_no_plane_of_incidence() -> None:
@@ -117,6 +88,7 @@ def _surface(mesh: Mesh) -> Surface:
     return replace(Surface.of(mesh), position_error_m=POSITION_ERROR_M)
 
 
+@pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("mirrors", [1, 2, 3])
 def test_any_chain_reflects_as_fields_in_space_do(mirrors: int) -> None:
     """Two field vectors across the first leg, reflected one mirror after the other in room coordinates.

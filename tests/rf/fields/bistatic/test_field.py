@@ -2,7 +2,6 @@
 
 import warnings
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +9,7 @@ from furnished import MATERIALS, RECEIVERS, ROOM, SHAPE, SIGMA, TX, F, spectra
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths, observation
 
 from warprrf.rf.em.fresnel import fresnel_curves, slab_transmission
+from warprrf.rf.em.materials import itu_material
 from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import fit as fitting
@@ -25,6 +25,7 @@ from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.spectrum import spread, sub_pixel_directions, to_db
 from warprrf.rf.tracing.model import SETS, Effects, Parameters
 from warprrf.rf.tracing.surface import Surface
+from warprrf.rf.tracing.tracer import SPECULAR
 
 WAVELENGTH = SPEED_OF_LIGHT / F
 
@@ -50,6 +51,24 @@ def test_spectra_that_would_not_fit_into_memory_are_refused(
     with pytest.raises(ValueError, match="ds: 10 spectra of 24 x 48 pixels take 4.6e.04 rays"):
         trace(scene, data, sub_pixels=2)
     assert len(trace(scene, data.subset(np.arange(9)), sub_pixels=2).views) == 9
+
+
+def test_a_fit_to_many_keeps_no_records_and_is_the_same(
+    scene: RadioScene, data: SpectrumDataset, field: BistaticField, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of each ray 4 bytes of its face, 8 of its range, and a bit that says whether it is lit; records alone would take 24."""
+    monkeypatch.setattr(fitting, "MOST_KEPT", 0)
+    few = data.subset(np.arange(6))
+    views = trace(scene, few)
+    again = RadioField.fit(scene, few, views=views)
+    for view in views.views:
+        assert sum(a.nbytes for a in (view.hits.face, view.hits.range_m, *view.lit)) < 13 * len(
+            view.hits.face
+        )
+        assert set(view.records) == {SPECULAR}
+    assert np.array_equal(again.residual, field.residual)
+    for name in ("log_weight", "log_excess", "log_mirror"):
+        assert np.array_equal(getattr(again.parameters, name), getattr(field.parameters, name))
 
 
 def test_ten_times_better_than_the_nearest_measurement(field: BistaticField, data: SpectrumDataset) -> None:
@@ -84,16 +103,6 @@ def test_paths_carry_the_spectrum_and_line_of_sight_is_exact(field: BistaticFiel
     assert several.gain.shape == (2, 5)
 
 
-def test_a_saved_field_answers_the_same(field: BistaticField, tmp_path: Path) -> None:
-    file = tmp_path / "field.safetensors"
-    field.save(file)
-    again = RadioField.load(file)
-    assert isinstance(again, BistaticField)
-    before, after = (f.spectrum(RECEIVERS[7], uncertainty=True) for f in (field, again))
-    assert np.array_equal(before.path_gain, after.path_gain)
-    assert np.array_equal(before.std_db, after.std_db)
-
-
 def test_before_any_spectrum_the_field_is_that_of_the_prior(scene: RadioScene, data: SpectrumDataset) -> None:
     prior = BistaticField.prior(scene, data)
     unfitted = BistaticField.fit(scene, data.subset([0]), iterations=0)
@@ -101,14 +110,8 @@ def test_before_any_spectrum_the_field_is_that_of_the_prior(scene: RadioScene, d
     assert np.allclose(image, unfitted.spectrum(RECEIVERS[4]).path_gain, rtol=1e-6)
     dark = replace(data, path_gain=np.zeros_like(data.path_gain))
     assert np.array_equal(image, BistaticField.prior(scene, dark).spectrum(RECEIVERS[4]).path_gain)
-    bare = BistaticField.prior(scene, data, effects=Effects(line_of_sight=False, mirrors=0, scatterings=0))
+    bare = BistaticField.prior(scene, data, effects=Effects(False, 0, 0, transmissions=0, diffractions=0))
     assert bare.spectrum(RECEIVERS[4]).path_gain.max() == 0
-
-
-def test_fitting_twice_gives_the_same_numbers(scene: RadioScene, data: SpectrumDataset) -> None:
-    train = data.subset(np.arange(3))
-    a, b = (RadioField.fit(scene, train) for _ in range(2))
-    assert np.array_equal(a.parameters.log_weight, b.parameters.log_weight)
 
 
 def test_an_uncalibrated_gain_is_found(scene: RadioScene, data: SpectrumDataset) -> None:
@@ -139,12 +142,6 @@ def test_the_beam_keeps_power_and_its_adjoint_is_one() -> None:
     assert (whole * y).sum() == pytest.approx((x * beam.adjoint(y.astype(np.float32))).sum(), rel=1e-5)
     assert 0 < np.abs(beam(x, quick=True) - whole).max() < 3e-6 * whole.max()
     assert np.abs(beam.adjoint(y, quick=True) - back).max() < 3e-6 * back.max()
-
-
-def test_grazing_scatter_stays_finite(scene: RadioScene, field: BistaticField) -> None:
-    found = field.spectrum([2.0, 0.002, 1.0]).path_gain  # every ray along the wall leaves at grazing
-    assert np.isfinite(found).all()
-    assert found.sum() < 1.0
 
 
 def test_element_at_the_transmitter_is_bounded(field: BistaticField) -> None:
@@ -205,25 +202,27 @@ def test_an_empty_spectrum_is_refused_and_one_among_others_is_not(
     ).all()
 
 
-def test_what_glass_lets_through_is_said_to_be_left_out_at_any_carrier() -> None:
-    """Of a pane of 10 mm the estimate is Friis's power less the slab's transmission, over all power that the field has."""
+def test_what_glass_lets_through_is_found_at_any_carrier_or_said_to_be_left_out() -> None:
+    """A pane of 10 mm: line of sight behind it is Friis's power less the slab's transmission."""
     corner = [[2.6, y, z] for y, z in ((0, 0), (3, 0), (3, 3), (0, 3))]
     mesh, part = joined(ROOM, (np.array(corner), np.array([[0, 1, 2], [0, 2, 3]])))
     glass = SlabMaterial("glass", 6.31, 2.0, 0.01, 0.3)
     scene, carrier_hz = RadioScene(mesh, part, [MATERIALS[0], glass]), 140e9
     known = spectra(scene, RECEIVERS[[1, 3, 4, 7]], frequency_hz=carrier_hz)
     with pytest.warns(UserWarning, match="transmission is not modelled.* 2 of 2 blocked receivers") as told:
-        field = RadioField.fit(scene, known, quick=True)
+        RadioField.fit(scene, known, quick=True, effects=SETS["single"])
     assert told[0].filename == __file__
-    estimate = field.report["left_out"]
-    for k, receiver in enumerate(estimate["receivers"]):
+    field = RadioField.fit(scene, known, quick=True)
+    assert field.effects.transmissions == 3
+    before = replace(field, parameters=replace(field.parameters, log_through=np.zeros(2)))
+    for receiver in RECEIVERS[[3, 4]]:
         way = TX - receiver
         friis = field.wavelength_m / (4 * np.pi * np.linalg.norm(way))
-        eta = (1 + field.parameters.excess[1]) * (1 - 0.06j)
+        eta = itu_material("glass").extrapolated().permittivity(carrier_hz)
         waves = slab_transmission(abs(way[0]) / np.linalg.norm(way), eta, 0.01, field.wavelength_m)
-        more = friis**2 * np.mean(np.abs(waves) ** 2)
-        whole = field.spectrum(receiver).path_gain.sum()
-        assert estimate["transmission"][k] == pytest.approx(10 * np.log10(1 + more / whole), abs=0.02)
+        view = before.view(receiver)
+        sight = before.path_gains(view).specular[(view.paths.order == 0) & (view.paths.slabs == 1)]
+        assert sight == pytest.approx(friis**2 * np.mean(np.abs(waves) ** 2), rel=1e-6)
 
 
 def test_an_open_room_s_fit_leaves_nothing_out(scene: RadioScene, data: SpectrumDataset) -> None:

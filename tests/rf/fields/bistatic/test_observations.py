@@ -12,7 +12,6 @@ import warp as wp
 from furnished import RECEIVERS, SHAPE, SIGMA, TX, F, spectra
 from radio_scenes import RadioScene, as_fits_predict, observation
 
-from warprrf.kernels.radio.records import build
 from warprrf.rf.channel.array_spectra import UP, hemisphere
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -153,30 +152,18 @@ def test_errors_of_a_fit_have_the_slopes_of_differences(
     assert np.mean(np.array(caught)[index]) > 0.7  # planted errors, but those of what is hardly seen
 
 
-def taped(records: Records, materials: Evaluation) -> np.ndarray:
-    """What a row of a Jacobian is, of the sum of all powers, by Warp's tape."""
-    table, m, _ = records._table(materials)
-    given = [wp.clone(array, requires_grad=True) for array in (m.weight, m.excess, m.mirror)]
-    power = wp.empty(len(records), dtype=wp.float64, requires_grad=True)
-    with wp.Tape() as tape:
-        kernel = build(wp.float64).record_power
-        wp.launch(kernel, dim=len(records), inputs=[0, table, m, *given, power])
-    tape.backward(grads={power: wp.ones_like(power)})
-    return np.column_stack([array.grad.numpy() * array.numpy() for array in given]).ravel()
-
-
 @pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("reciprocal", [False, True])
 def test_slopes_of_records_of_every_sequence_are_those_of_differences(
     scene: RadioScene, reciprocal: bool
 ) -> None:
-    """In float64 and summed by pixels; what comes to the elements that send is held. Warp's tape has the same. And, in
-    float32, what is read of all."""
+    """In float64 and summed by pixels; what comes to the elements that send is held. And, in float32, what is read of
+    all. What Warp's tape says is in tests/gradients."""
     field = BistaticField.prior(scene, spectra(scene, RX[None]), effects=EVERYTHING, reciprocal=reciprocal)
     view, side = field.view(RX), field.surface.side_group
     got = irradiance(view.tracer, field.parameters, EVERYTHING)
     groups, lobes = field.parameters.log_weight.shape
-    layout = Layout(groups, lobes)
+    layout = Layout(groups, lobes, through=True)
     x = layout.pack(field.parameters) + np.random.default_rng(1).normal(0.0, 0.3, layout.size)
 
     def materials(x: np.ndarray) -> Evaluation:
@@ -193,8 +180,6 @@ def test_slopes_of_records_of_every_sequence_are_those_of_differences(
         bins = Bins.of(own, int(own.max()) + 1)
         found = np.zeros((bins.count, layout.size))
         exact.add_slopes(materials(x), bins, where, found)
-        if "E" not in name:  # whose senders' radiance is no input of the kernel
-            np.testing.assert_allclose(taped(exact, materials(x)), found.sum(axis=0), rtol=1e-9, err_msg=name)
         slopes = differences(partial(sums, exact, own), x, 1e-5)
         bound = 1e-7 * np.abs(slopes).max(axis=1)
         assert (np.abs(found.T - slopes).max(axis=1) <= bound).all(), name
@@ -203,7 +188,8 @@ def test_slopes_of_records_of_every_sequence_are_those_of_differences(
     o = observation(view, pixels(view), field.floor)
     table, index = o.slopes(EVERYTHING, materials(x), layout)
     slopes = differences(lambda x: o.predicted(field.state, materials(x)), x, 0.02)
-    bound = 5e-3 * np.abs(slopes).max(axis=1)
+    rounding = np.finfo(np.float32).eps * o.predicted(field.state, materials(x)).max() / 0.02
+    bound = 5e-3 * np.abs(slopes).max(axis=1) + rounding
     assert (np.abs(dense(table, index, layout) - slopes).max(axis=1) <= bound).all()
 
 

@@ -18,7 +18,6 @@ from warprrf.rf.fields.bistatic.residual import Shares, fit_residual, shares_of
 from warprrf.rf.maps.links import LinkOptions
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.tracing.model import Effects
-from warprrf.rf.tracing.surface import CELLS, ELEMENT_M, Surface
 
 RECEIVERS = RECEIVERS[:5]
 MEASURED = SpectrumPixels(BeamOperator(SHAPE, SIGMA))
@@ -44,18 +43,6 @@ def planted_shares(field: BistaticField, planted: np.ndarray) -> list[Shares]:
         again = MEASURED.of_bins((found[-1].power @ np.exp(planted).ravel())[:, None])[:, 0] + found[-1].rest
         np.testing.assert_allclose(again, power, rtol=1e-4, atol=1e-6 * power.max())
     return found
-
-
-def test_cells_are_pieces_of_elements(field: BistaticField) -> None:
-    s = field.surface
-    assert s.cells > 3 * len(s.element_area)
-    assert np.array_equal(s.cell_element[s.cell], s.element)
-    centre = s.mesh.triangles.mean(axis=1)
-    for k in range(0, s.cells, 7):
-        assert np.ptp(centre[s.cell == k], axis=0).max() <= ELEMENT_M / CELLS
-    large = Surface.of(Mesh(*ROOM))  # of faces larger than cells, each of which is one
-    assert np.array_equal(large.cell_element[large.cell], large.element)
-    assert np.bincount(large.cell, minlength=large.cells).min() >= 1
 
 
 def test_planted_gains_come_back(field: BistaticField) -> None:

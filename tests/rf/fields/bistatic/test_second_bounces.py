@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from furnished import RECEIVERS, ROOM, SHAPE, TX, F, spectra
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths, observation
+from trimesh.creation import icosphere
 
+from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
@@ -24,10 +26,11 @@ WAVELENGTH = SPEED_OF_LIGHT / F
 RECEIVERS = RECEIVERS[:6]
 
 
-def test_a_surface_too_small_for_a_mirror_has_line_of_sight_alone() -> None:
-    vertices = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
-    mesh, part = joined((vertices, np.array([[0, 1, 2]])))
-    surface = Surface.of(RadioScene(mesh, part, [SlabMaterial()]))
+def test_facets_too_small_for_mirrors_leave_line_of_sight_alone() -> None:
+    ball = icosphere(subdivisions=4, radius=0.3)
+    surface = Surface.of(
+        RadioScene(Mesh(ball.vertices, ball.faces), np.zeros(len(ball.faces), int), [SlabMaterial()])
+    )
     assert len(surface.plane_offset) == 0
     assert len(mirror_paths(surface, TX, np.array([[1.0, 1, 1]]), WAVELENGTH, 3)) == 1
 

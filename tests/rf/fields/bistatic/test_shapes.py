@@ -1,7 +1,6 @@
 """Groups of a mesh without colours or names: what shape alone tells, how scans come in, and what it is worth."""
 
 import numpy as np
-import pytest
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined, tube
 from trimesh.remesh import subdivide_to_size
 
@@ -110,11 +109,6 @@ def test_planes_are_found_in_a_scan_with_errors_of_2_cm_and_holes():
     surface = Surface.of(mesh)
     assert surface.groups == 6
     assert (surface.patch >= 0) @ surface.mesh.areas > 0.93 * surface.mesh.areas.sum()
-
-
-@pytest.mark.parametrize("shape", [ROOM, tube(48, 1.5, 3.0)])
-def test_a_drawn_mesh_is_no_scan(shape):
-    assert not is_scan(Mesh(*shape))
 
 
 def test_a_bare_mesh_is_nearly_as_good_as_one_with_names():

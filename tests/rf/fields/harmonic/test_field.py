@@ -288,20 +288,6 @@ def test_max_paths_keeps_the_strongest(truth: HarmonicField) -> None:
     assert few.gain == pytest.approx(everything.gain[np.argsort(-everything.power)[:5]])
 
 
-def test_a_saved_field_predicts_the_same_bits(
-    room: SimpleNamespace, spectra: SimpleNamespace, tmp_path: Path
-) -> None:
-    for model in ("rf3dgs+", "rf3dgs"):
-        field = HarmonicField.fit(room, spectra, model, iterations=2)
-        field.save(tmp_path / "field.safetensors")
-        again = HarmonicField.load(tmp_path / "field.safetensors")
-        a, b = field.spectrum(VISIBLE), again.spectrum(VISIBLE)
-        assert np.array_equal(a.path_gain, b.path_gain)
-        assert np.array_equal(a.delay_s, b.delay_s) and np.array_equal(a.aod, b.aod)
-        assert again.options == field.options and again.report == field.report
-    assert [f.name for f in tmp_path.iterdir()] == ["field.safetensors"]
-
-
 def test_options_that_do_not_exist_are_refused(room: SimpleNamespace, spectra: SimpleNamespace) -> None:
     for name in ("transmittance", "interaction_point", "gain", "line_of_sight", "sh_degree"):
         with pytest.raises((ValueError, TypeError), match=name):

@@ -128,14 +128,6 @@ def test_loss_and_gradient_against_numpy_and_finite_differences(kind: str, with_
         assert (gradient * direction).sum() == pytest.approx(numeric, rel=2e-5, abs=1e-9)
 
 
-def test_batches_split_the_receivers_and_each_epoch_uses_all_of_them() -> None:
-    problem = Problem(synthetic_transport(receivers=7), batch=2, seed=3)
-    assert sorted(np.concatenate([b.receivers for b in problem.batches])) == list(range(7))
-    count = len(problem.batches)
-    for epoch in range(3):
-        assert sorted(problem.batch_at(epoch * count + i) for i in range(count)) == list(range(count))
-
-
 def test_gradient_does_not_depend_on_how_launches_are_split(monkeypatch: pytest.MonkeyPatch) -> None:
     import warprrf.device as device
 
@@ -172,6 +164,9 @@ def test_coefficients_above_the_degree_stay_zero(degree: int, count: int) -> Non
     assert not state.coefficients[:, count:].any()
 
 
+RANGE_DB = (-60.0, 0.0)
+
+
 def test_the_ridge_holds_a_gaussian_at_its_start() -> None:
     problem = Problem(synthetic_transport(), batch=3)
     target = gain_target(problem)
@@ -187,9 +182,6 @@ def test_a_pixels_weight_is_the_sum_of_its_pairs_and_zero_without_any() -> None:
     seen = synthetic_transport()
     expected = np.bincount(seen.pixel, seen.weight, 3 * SHAPE[0] * SHAPE[1]).reshape(3, *SHAPE)
     assert np.allclose(seen.pixel_weight, expected, rtol=1e-12, atol=0)
-
-
-RANGE_DB = (-60.0, 0.0)
 
 
 def shell(count: int = 250, seed: int = 0) -> Gaussians:

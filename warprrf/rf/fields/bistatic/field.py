@@ -39,13 +39,13 @@ from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.channel.array_spectra import check_steering
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Air, Gas, air_of
-from warprrf.rf.em.materials import assumed_permittivity
 from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import Data, Measured, RadioField, with_settings
 from warprrf.rf.fields.bistatic import files
 from warprrf.rf.fields.bistatic.fit import SUB_PIXELS, FitOptions, TrainingViews, fit
 from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, read
+from warprrf.rf.fields.bistatic.needs import assumed
 from warprrf.rf.fields.bistatic.observations import (
     Frame,
     Observation,
@@ -133,7 +133,7 @@ class BistaticField(RadioField):
             raise ValueError(
                 f"material: got {np.unique(self.material)}, expected all of 0 to {materials - 1}"
             )
-        known = Layout(materials, sizes["L"]).size
+        known = Layout(materials, sizes["L"], through=True).size
         if self.errors is not None and len(self.errors.covariance) not in (known, known + 1):
             raise ValueError(
                 f"errors: got a covariance of {len(self.errors.covariance)} parameters, expected {known}, or one more for a "
@@ -238,8 +238,8 @@ class BistaticField(RadioField):
             device=device,
         )
         places_of(data, prior.mesh, device)
-        known = [assumed_permittivity(name, prior.frequency_hz) for name in prior.surface.group_names]
-        parameters = replace(prior.parameters, log_excess=np.log(np.array(known) - 1.0))
+        own = assumed(prior.surface, prior.frequency_hz)
+        parameters = replace(prior.parameters, log_excess=own.log_excess)
         report = {"receivers": 0, "held_out": 0, "chains": {}, "unexplained": {}}
         return replace(prior, parameters=parameters, report=report)
 
@@ -280,8 +280,9 @@ class BistaticField(RadioField):
             range_db=(float(ds.range_db[0]), float(ds.range_db[1])),
             beam_sigma_rad=float(ds.beam_sigma_rad),
             effects=replace(SETS["single"], residual=False) if effects is None else effects,
-            parameters=Parameters.prior(
-                surface.groups, *([] if lobes is None else [lobes]), reciprocal=reciprocal
+            parameters=replace(
+                Parameters.prior(surface.groups, *([] if lobes is None else [lobes]), reciprocal=reciprocal),
+                log_through=surface.slabs(float(ds.frequency_hz))[2],
             ),
             material=surface.material,
             residual=np.zeros((2, surface.cells)),
@@ -400,10 +401,10 @@ class BistaticField(RadioField):
         """Several receivers are traced at once."""
         tracer, found = self.tracer(transmitter), np.empty((len(receivers), *self.shape), np.float32)
         batch = max(1, RAYS_AT_A_TIME // len(tracer.grid.directions))
-        paths = tracer.paths(receivers, self.effects.mirrors)  # chains of mirrors are searched once for all
+        paths = tracer.paths(receivers, self.effects)  # chains of mirrors are searched once for all
         for first in range(0, len(receivers), batch):
             some = np.arange(first, min(first + batch, len(receivers)))
-            view = tracer.view(receivers[some], self.effects.mirrors, paths=paths.of(some))
+            view = tracer.view(receivers[some], self.effects, paths=paths.of(some))
             found[some] = images(self.path_gains(view), self._beam)
         return found
 
@@ -455,7 +456,7 @@ class BistaticField(RadioField):
         return self._view(ends.receivers[0], ends.transmitters[0])
 
     def _view(self, receiver: np.ndarray, transmitter: np.ndarray) -> View:
-        return self.tracer(transmitter).view(receiver, self.effects.mirrors)
+        return self.tracer(transmitter).view(receiver, self.effects)
 
     def path_gains(self, view: View) -> PathGains:
         """Path gain of all that is seen, by sequence of interactions."""
@@ -535,7 +536,7 @@ class BistaticField(RadioField):
         rows = np.unique(self.material, return_index=True)[1]
         lit = self.evaluation(view.tracer)
         materials = lit.by_materials(self.parameters.take(rows), self.material)
-        layout = Layout(len(rows), len(self.parameters.lobes))
+        layout = Layout(len(rows), len(self.parameters.lobes), through=True)
         place = Place(
             0, rows[:1], view.tracer.transmitter, view.receivers[0], self.frequency_hz, self.shape, self.air
         )

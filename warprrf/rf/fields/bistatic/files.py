@@ -15,9 +15,9 @@ from warprrf.rf.tracing.surface import Surface
 
 _SURFACE = (
     "normal", "patch", "plane_normal", "plane_offset", "group", "material", "patch_group", "element", "element_centre",
-    "element_area", "element_group", "appearance", "thickness_m", "cell", "cell_element",
+    "element_area", "element_group", "appearance", "thickness_m", "dispersion", "cell", "cell_element",
 )  # fmt: skip
-_PARAMETERS = ("log_weight", "log_excess", "log_mirror")
+_PARAMETERS = ("log_weight", "log_excess", "log_mirror", "log_through")
 _SINGLE = ("lobes", "reciprocal", "log_gain", "roughness")
 
 

@@ -23,9 +23,10 @@ from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import Data, Measured
-from warprrf.rf.fields.bistatic.gauss_newton import Fitted, Problem, gauss_newton, layout_of
+from warprrf.rf.fields.bistatic.gauss_newton import THROUGH, Fitted, Problem, gauss_newton, layout_of
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, WeighedPaths, read
 from warprrf.rf.fields.bistatic.merging import BY_SHAPE, Merging, merge
+from warprrf.rf.fields.bistatic.needs import MOST_BLOCKED, RARE, RAYS, evenly, needed, total
 from warprrf.rf.fields.bistatic.observations import (
     NOISE_DB,
     Observation,
@@ -39,10 +40,9 @@ from warprrf.rf.fields.bistatic.observations import (
 from warprrf.rf.fields.bistatic.placing import moved, position_offset, with_azimuths
 from warprrf.rf.fields.bistatic.residual import fit_residual, shares_of
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
-from warprrf.rf.paths.blockage import Walls, past_obstacles
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings
-from warprrf.rf.tracing.model import LOBES, SETS, Effects, Model, Parameters
+from warprrf.rf.tracing.model import LOBES, SETS, Effects, Layout, Model, Parameters
 from warprrf.rf.tracing.records import Evaluation
 from warprrf.rf.tracing.render import evaluation, path_gains
 from warprrf.rf.tracing.surface import Surface
@@ -72,8 +72,6 @@ KNOWN_BETTER = 2.0
 SIDE_LOBES_DB = 3.0
 """Standard deviation of the level of an antenna's side lobes, which few measure."""
 HANGING_DB = 1.0  # that this moves a chain's gain by and is worth a warning
-MOST_BLOCKED = 12
-"""Blocked places at which effects that are left out are estimated."""
 DARK = 0.01  # share of line of sight below which a place is blocked
 LEFT_OUT_DB = 0.5  # of them is too little for a warning
 CLEAR_DB = 10.0  # above its floor a reading's decibels err as they are
@@ -104,7 +102,8 @@ class FitOptions:
         effects: what is modelled: :class:`Effects`, the name of one of :data:`SETS` (``"single"``, ``"room"``,
             ``"everything"``), or ``"auto"``: the set that errs least on receivers held out (a quarter, 30 at most), and the
             residual if it does not err more; a larger set is tried where the one before it was better. With fewer than
-            eight receivers it is ``"room"``, or ``"single"`` if that fits much better.
+            eight receivers it is ``"room"``, or ``"single"`` if that fits much better. Slabs are passed and edges gone over
+            where that is worth more than 0.25 dB to all power of blocked receivers (:mod:`.needs`).
         lobes: exponents of the scattering lobes ((1 + cos psi) / 2)^n, 0 for Lambertian; None for 0, 2, 5, 12, 30.
         reciprocal: lobes that scatter alike when transmitter and receiver change places. By default they are those of
             Degli-Esposti et al. (2007), Sionna RT's, which do not.
@@ -148,6 +147,9 @@ class FitOptions:
             Effects(**{f.name: min(getattr(one, f.name), getattr(most, f.name)) for f in fields(Effects)})
             for one in given
         ]
+        rare: dict[str, Any] = {"transmissions": most.transmissions, "diffractions": most.diffractions}
+        if self.relevance is not None:
+            found = [replace(one, **rare) for one in found]
         return list(dict.fromkeys(found))
 
     def exponents(self, frequency_hz: float) -> tuple[int, ...]:
@@ -171,13 +173,13 @@ class TrainingViews:
     Attributes:
         places: receivers under their transmitters.
         views: one for each place.
-        mirrors: most reflections that were sought.
+        effects: whose mirrors, slabs and edges were sought.
         seconds: what it took.
     """
 
     places: list[Place] = field(repr=False)
     views: list[View] = field(repr=False)
-    mirrors: int
+    effects: Effects
     seconds: float
 
     @property
@@ -207,6 +209,7 @@ def trace(
     ds: Data,
     *,
     effects: Effects | None = None,
+    decides: bool = True,
     sub_pixels: int = SUB_PIXELS,
     client: Any = None,
     device: DeviceLike = None,
@@ -217,6 +220,7 @@ def trace(
     Args:
         effects: which tables are traced at once (others when they are first asked for); None for single bounces, and for
             as many mirrors up to 3 as can be searched (2 in a city).
+        decides: whether paths pass slabs and go over edges as the scene needs it (:func:`needed`), else as ``effects`` say.
         sub_pixels: square root of the rays per pixel.
         client: a ``dask.distributed.Client`` whose workers trace, to the same bits; this process by default.
         device: where rays are cast.
@@ -235,6 +239,8 @@ def trace(
     tell("patches", 0, 1)
     surface = Surface.of(geometry)
     tell("patches", 1, 1)
+    if decides:
+        wanted = needed(wanted, surface, places, device)
     keeps = len(places) * places[0].shape[0] * places[0].shape[1] * sub_pixels**2 <= MOST_KEPT
     together: dict[tuple[object, ...], list[int]] = {}  # places under one transmitter
     for k, place in enumerate(places):
@@ -250,13 +256,14 @@ def trace(
         receivers = np.stack([places[k].receiver for k in own])
         if effects is None:
             wanted = replace(wanted, mirrors=tracer.images.affordable(receivers, wanted.mirrors))
-        found = tracer.paths(receivers, wanted.mirrors, progress)
+        found = tracer.paths(receivers, wanted, progress)
         parts = [(receivers[r], found.subset(np.flatnonzero(found.receiver == r))) for r in range(len(own))]
         for r, view in each(partial(traced, tracer.again, wanted, keeps), parts, client):
             views[own[r]] = tracer.adopted(view)
             tell("transport", len(views), len(places))
     seconds = time.perf_counter() - started
-    return TrainingViews(places, [views[k] for k in range(len(places))], wanted.mirrors, seconds)
+    every = [views[k] for k in range(len(places))]
+    return TrainingViews(places, every, wanted, seconds)
 
 
 def _check_rays(places: Sequence[Place], sub_pixels: int) -> None:
@@ -301,6 +308,7 @@ def fit(
     candidates = options.candidates(frequency_hz)
     where: dict[str, Any] = {"client": client, "device": device, "progress": progress}
     where |= {"effects": candidates[0] if len(candidates) == 1 else None, "sub_pixels": options.rays}
+    where |= {"decides": options.effects == "auto" and options.relevance is None}
     if views is not None:
         places = places_of(data, as_mesh(geometry, "geometry"), device)
         views.check(places, options.sub_pixels)
@@ -396,10 +404,12 @@ class Training:
         frequency_hz, count = frame_of(data).frequency_hz, len(seen.places)
         observations, chains = observe(data, seen.places, seen.views, frequency_hz)
         totals = all(isinstance(one, Readings) and one.total for one in data)
-        candidates = [replace(one, mirrors=min(one.mirrors, seen.mirrors)) for one in candidates]
+        sought = seen.effects
+        rare: dict[str, Any] = {"transmissions": sought.transmissions, "diffractions": sought.diffractions}
+        candidates = [replace(one, mirrors=min(one.mirrors, sought.mirrors), **rare) for one in candidates]
         if len(candidates) > 1 and any(isinstance(one, ArraySpectra) for one in data):
             candidates = [
-                replace(one, mirrors=seen.mirrors) for one in candidates
+                replace(one, mirrors=sought.mirrors) for one in candidates
             ]  # they hear the phases of all
         if len(candidates) > 1 and totals:
             candidates = candidates[1:2]
@@ -439,7 +449,9 @@ class Training:
 
     def start(self, material: np.ndarray) -> Parameters:
         """Parameters of materials before any measurement."""
-        return Parameters.prior(int(material.max()) + 1, self.lobes, reciprocal=self.options.reciprocal)
+        prior = Parameters.prior(int(material.max()) + 1, self.lobes, reciprocal=self.options.reciprocal)
+        through = self.surface.slabs(frame_of(self.data).frequency_hz)[2]
+        return replace(prior, log_through=np.bincount(material, through) / np.bincount(material))
 
     def few(self, times: int) -> np.ndarray:
         """Places that fits which only decide about something learn from, those of every chain among them."""
@@ -538,7 +550,10 @@ def _fitted(t: Training) -> Fit:
         t = without(t, wrong.rows)
         choice, model = everyone(t, choice, residual)
     if errors is not None:
-        errors = replace(errors, covariance=_covariance(choice.fitted, t.options.gain_offset))
+        errors = replace(
+            errors,
+            covariance=_covariance(choice.fitted, t.options.gain_offset, choice.effects.transmissions > 0),
+        )
     missed = left_out(t, model)
     t.step(last=True)
     rays = t.observations[0].view.tracer.grid.sub_pixels
@@ -656,7 +671,11 @@ def cross_validate(t: Training, choice: Choice) -> tuple[bool, ErrorModel | None
         for k, x, shape in zip(order, power[keep], shapes, strict=True)
     ]
     return keep, learn_errors(
-        images, missed, np.array(gaps), places, _covariance(choice.fitted, t.options.gain_offset)
+        images,
+        missed,
+        np.array(gaps),
+        places,
+        _covariance(choice.fitted, t.options.gain_offset, choice.effects.transmissions > 0),
     )
 
 
@@ -695,16 +714,15 @@ class Unexplained:
 
 def unexplained(t: Training, model: Model) -> Unexplained:
     """What ``model`` cannot explain."""
-    rows, left = [], dict[str, list[float]]()
-    predicted = t.predicted(model, range(len(t.observations)))
-    for o, power in zip(t.observations, predicted, strict=True):
-        wrong, target = np.zeros(0, int), o.target
-        if isinstance(o.measured, WeighedPaths) and target.trust is not None and target.censored is not None:
+    rows, left = [np.zeros(0, int) for _ in t.observations], dict[str, list[float]]()
+    tables = [k for k, o in enumerate(t.observations) if isinstance(o.measured, WeighedPaths)]
+    for k, power in zip(tables, t.predicted(model, tables), strict=True):
+        o, target = t.observations[k], t.observations[k].target
+        if target.trust is not None and target.censored is not None:
             error = target.error(power)
-            wrong = np.flatnonzero(np.abs(error) > UNEXPLAINED * NOISE_DB)
+            rows[k] = np.flatnonzero(np.abs(error) > UNEXPLAINED * NOISE_DB)
             clear = ~target.censored & (target.db > CLEAR_DB)
             left.setdefault(t.names[o.place.data], []).extend((error / target.trust)[clear])
-        rows.append(wrong)
     noise = {
         name: NORMAL_MEDIAN * float(np.median(np.abs(errors))) for name, errors in left.items() if errors
     }
@@ -742,41 +760,31 @@ def _offsets(t: Training, found: Fit) -> dict[int, list[tuple[Place, np.ndarray]
 
 
 def left_out(t: Training, model: Model) -> dict[str, Any]:
-    """Effects that are not modelled, estimated at a few ``"receivers"`` that are blocked: by how much what goes round edges and
-    through walls would raise all power there [dB], by name; and ``"error_db"``, by how much the fit has more than was read
-    there, rms. What it lacks is no measure of its error: it may be just these effects."""
+    """Effects of :data:`RARE` that are not modelled, estimated at a few ``"receivers"`` that are blocked: by how much they would
+    raise all power there [dB], by name; and ``"error_db"``, by how much the fit has more than was read there, rms. What it
+    lacks is no measure of its error: it may be just these effects."""
     blocked = list({o.place.seen_from: k for k, o in enumerate(t.observations) if _is_dark(o.view)}.values())
-    chosen = np.linspace(0, len(blocked) - 1, min(len(blocked), MOST_BLOCKED)).astype(int)
-    seen, s = list(t.evaluated(model, [blocked[i] for i in chosen])), t.surface
-    walls = Walls.of(s.mesh, 1.0 + model.parameters.excess[s.group], s.thickness_m[s.group])
-    receivers = np.array([o.place.receiver for o, *_ in seen]).reshape(-1, 3)
-    total, over = np.zeros((2, len(seen)))
+    seen = list(t.evaluated(model, evenly(np.array(blocked, int), MOST_BLOCKED)))
+    lacking = {name: on for name, on in RARE.items() if not any(getattr(model.effects, key) for key in on)}
+    change, over = {name: np.zeros(len(seen)) for name in RARE}, np.zeros(len(seen))
     for k, (o, here, materials) in enumerate(seen):
-        gains = path_gains(o.view, here, materials)
-        total[k] = gains.specular.sum() + gains.by_ray().sum()
+        gains, tracer = path_gains(o.view, here, materials), o.view.tracer.on_grid(*RAYS)
+        whole = gains.specular.sum() + gains.by_ray().sum() + o.floor
         read_sum, predicted = o.target.sums(o.predicted(here, materials))
         over[k] = NEPER * max(np.log1p(predicted) - np.log1p(read_sum), 0.0)
-    floor = np.array([o.floor for o, *_ in seen])
-    change = {name: np.zeros(len(seen)) for name in ("diffraction", "transmission")}
-    for tracer in {id(o.view.tracer): o.view.tracer for o, *_ in seen}.values():
-        own = np.array([k for k, (o, *_) in enumerate(seen) if o.view.tracer is tracer])
-        link, grid = (tracer.transmitter, receivers[own], tracer.wavelength_m), tracer.grid
-        for name, paths in past_obstacles(
-            walls, *link, position_error_m=s.position_error_m, device=grid.device
-        ).items():
-            power = model.parameters.gain * paths.power * grid.transmittance(paths.length_m)
-            more = np.bincount(paths.receiver, power, minlength=len(own))
-            change[name][own] = NEPER * np.log1p(more / (total[own] + floor[own]))
+        few = total(tracer, o.place.receiver, here, {}) if lacking else 0.0
+        for name, on in lacking.items():
+            more = total(tracer, o.place.receiver, here, on) - few
+            change[name][k] = NEPER * np.log1p(max(more, 0.0) / whole)
     error_db = float(np.sqrt(np.mean(over**2))) if len(seen) else 0.0
-    return {"receivers": receivers.tolist(), "error_db": error_db} | {
-        n: c.tolist() for n, c in change.items()
-    }
+    found: dict[str, Any] = {"receivers": [o.place.receiver.tolist() for o, *_ in seen], "error_db": error_db}
+    return found | {name: own.tolist() for name, own in change.items()}
 
 
 def _is_dark(view: View) -> bool:
     """Whether less than :data:`DARK` of line of sight passes what is in its way."""
     p = view.paths
-    return bool((p.share[p.order == 0] ** 2).sum() < DARK)
+    return bool((p.share[p.in_sight] ** 2).sum() < DARK)
 
 
 def side_lobes(t: Training, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
@@ -811,11 +819,17 @@ def side_lobes(t: Training, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
     return share, moved
 
 
-def _covariance(found: Fitted, gain: bool) -> np.ndarray:
-    """Of what a field keeps: parameters of materials and the common gain, if that was free."""
-    p = found.parameters
-    kept = p.log_weight.size + p.log_excess.size + p.log_mirror.size + gain
-    return found.covariance[:kept, :kept]
+def _covariance(found: Fitted, gain: bool, through: bool) -> np.ndarray:
+    """Of what a field keeps: parameters of materials, with what they let through as it is known before where that was not free;
+    and the common gain, if that was."""
+    layout, whole = (
+        Layout(*found.parameters.log_weight.shape, through=t, gain=gain) for t in (through, True)
+    )
+    free = np.ones(whole.size, bool)
+    free[whole.passage(np.arange(whole.groups))] = through
+    covariance = np.where(free, 0.0, THROUGH**2) * np.eye(whole.size)
+    covariance[np.ix_(free, free)] = found.covariance[: layout.size, : layout.size]
+    return covariance
 
 
 def _report(t: Training, choice: Choice, wrong: Unexplained, seconds: float) -> dict[str, Any]:
@@ -835,7 +849,8 @@ def _report(t: Training, choice: Choice, wrong: Unexplained, seconds: float) -> 
     }
     deviation = np.sqrt(np.diag(found.covariance))
     if t.options.gain_offset:
-        place = found.parameters.log_weight.size + 2 * len(found.parameters.log_excess)
+        shape, through = found.parameters.log_weight.shape, choice.effects.transmissions > 0
+        place = Layout(*shape, through=through).size
         report["gain_offset_db"] = NEPER * found.parameters.log_gain
         report["gain_offset_std_db"] = NEPER * float(deviation[place])
     known = NEPER * deviation[len(deviation) - len(t.chains) :]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -27,11 +28,13 @@ from warprrf.rf.fields.bistatic.observations import (
     huber,
 )
 from warprrf.rf.tracing.model import ROUGHNESS, Effects, Layout, Model, Parameters
-from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.records import Evaluation, Records
 from warprrf.rf.tracing.render import evaluation
+from warprrf.rf.tracing.tracer import SPECULAR
 
-WEIGHT, EXCESS, MIRROR = 2.0, 0.8, 1.5
-"""Standard deviations a priori of lobe weights, permittivity less one and mirrored share from where a fit starts [nepers]."""
+WEIGHT, EXCESS, MIRROR, THROUGH = 2.0, 0.8, 1.5, 1.5
+"""Standard deviations a priori of lobe weights, permittivity less one, mirrored share and share let through from where a fit
+starts [nepers]."""
 ENERGY = 0.25
 """That of scattered and mirrored shares from a sum of one."""
 GAIN, CHAIN = 1.0, 10.0
@@ -90,18 +93,37 @@ class Problem:
         """Columns of materials instead of groups."""
         return [c.by_materials(self.material) for c in self.columns]
 
+    @cached_property
+    def direct(self) -> tuple[Records, list[slice]]:
+        """Line of sight and mirrors of all observations, and which are of each: one launch serves all."""
+        tables = [o.view.records[SPECULAR] for o in self.observations]
+        ends = np.cumsum([0, *map(len, tables)])
+        return Records.joined(tables), [slice(*own) for own in pairwise(ends)]
+
+    def materials(self, p: Parameters, ratio: float) -> Evaluation:
+        """Parameters ``p`` at ``ratio`` times their carrier, as kernels take them."""
+        tracer = self.observations[0].view.tracer
+        slabs = tracer.slabs(self.effects.transmissions)
+        return Evaluation(p.at_ratio(ratio), self.material, slabs=slabs, device=tracer.grid.device)
+
     def evaluated(self, p: Parameters) -> Iterator[tuple[Observation, Columns, Evaluation, np.ndarray]]:
         """Observations with the columns of their materials, the parameters ``p`` at their carriers as kernels take them,
         and predictions without the gains of chains, in units of each floor."""
-        known: dict[float, Evaluation] = {}
-        for o, columns in zip(self.observations, self.by_materials, strict=True):
+        if not self.observations:
+            return
+        known: dict[float, tuple[Evaluation, np.ndarray]] = {}
+        for o, columns, own in zip(self.observations, self.by_materials, self.direct[1], strict=True):
             if o.ratio not in known:
-                known[o.ratio] = Evaluation(
-                    p.at_ratio(o.ratio), self.material, device=o.view.tracer.grid.device
-                )
-            here = known[o.ratio].parameters
-            power = here.gain * (columns.power(here) + o.direct(self.effects, known[o.ratio]))
-            yield o, columns, known[o.ratio], power
+                materials = self.materials(p, o.ratio)
+                known[o.ratio] = materials, self.direct[0].powers(materials)
+            materials, direct = known[o.ratio]
+            here = materials.parameters
+            yield (
+                o,
+                columns,
+                materials,
+                here.gain * (columns.power(here) + o.direct(self.effects, materials, direct[own])),
+            )
 
     def errors_db(self, p: Parameters) -> Iterator[np.ndarray]:
         """Predictions less what was read, as it counts [dB]."""
@@ -112,10 +134,20 @@ class Problem:
         self, p: Parameters, layout: Layout
     ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """:meth:`errors_db` ``(N,)``, derivatives ``(C, N)`` float32, and the places of those parameters ``(C,)``."""
-        for o, columns, materials, power in self.evaluated(p):
+        if not self.observations:
+            return
+        rise: dict[float, np.ndarray] = {}
+        specular, own = self.direct
+        side = self.observations[0].view.tracer.surface.side_group
+        whole, every = layout.columns(self.material[specular.groups(side)])
+        for rows, (o, columns, materials, power) in zip(own, self.evaluated(p), strict=True):
+            if o.ratio not in rise:
+                rise[o.ratio] = specular.slopes(materials, whole, len(every))
+            place, index = layout.columns(self.material[o.view.records[SPECULAR].groups(side)])
+            slopes = np.ascontiguousarray(rise[o.ratio][rows][:, np.searchsorted(every, index)])
             table, index = _joined(
                 columns.slopes(materials.parameters, layout),
-                o.slopes(self.effects, materials, layout, specular=True),
+                (o.direct_slopes(self.effects, materials, place, slopes), index),
             )
             table *= np.float32(materials.parameters.gain)
             if layout.gain:
@@ -166,7 +198,8 @@ def layout_of(problem: Problem, start: Parameters) -> Layout:
     """What is free."""
     carriers = {o.ratio for o in problem.observations}
     return Layout(
-        *start.log_weight.shape, gain=problem.gain_offset, roughness=bool(carriers - {1.0}), chains=len(start.log_gains)
+        *start.log_weight.shape, through=problem.effects.transmissions > 0, gain=problem.gain_offset,
+        roughness=bool(carriers - {1.0}), chains=len(start.log_gains),
     )  # fmt: skip
 
 
@@ -185,6 +218,8 @@ def priors(p: Parameters, start: Parameters, layout: Layout, energy: float) -> t
         add((p.log_weight[:, j] - start.log_weight[:, j]) / WEIGHT, places, 1.0 / WEIGHT)
     add((p.log_excess - start.log_excess) / EXCESS, layout.excess(own), 1.0 / EXCESS)
     add((p.log_mirror - start.log_mirror) / MIRROR, layout.mirror(own), 1.0 / MIRROR)
+    if layout.through:
+        add((p.log_through - start.log_through) / THROUGH, layout.passage(own), 1.0 / THROUGH)
     if layout.gain:
         add(np.array([p.log_gain / GAIN]), np.array([layout.common_gain]), 1.0 / GAIN)
     if layout.roughness:

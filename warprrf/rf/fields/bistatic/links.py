@@ -67,7 +67,7 @@ class LinkTracer:
 
     def __call__(self, receivers: np.ndarray) -> Links:
         """Links of at most :attr:`batch` receivers (R, 3)."""
-        view, count = self._tracer.view(receivers, self._model.effects.mirrors), len(receivers)
+        view, count = self._tracer.view(receivers, self._model.effects), len(receivers)
         gains = path_gains(view, self._model, self._materials)
         paths, specular = view.paths, gains.specular
         total, moment, square = (

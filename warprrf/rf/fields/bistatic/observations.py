@@ -18,6 +18,7 @@ import numpy as np
 from warprrf.cache import cached_property
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
+from warprrf.kernels.radio.records import MIRROR
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.fresnel import fresnel_curves
@@ -135,17 +136,6 @@ class Target:
     db: np.ndarray
     trust: np.ndarray | None = None
     censored: np.ndarray | None = None
-
-    @classmethod
-    def joined(cls, targets: Sequence[Target]) -> Target:
-        """All readings of ``targets``, one after another."""
-        trust = [np.ones(len(t.db)) if t.trust is None else t.trust for t in targets]
-        censored = [np.zeros(len(t.db), bool) if t.censored is None else t.censored for t in targets]
-        return cls(
-            np.concatenate([t.db for t in targets]),
-            np.concatenate(trust) if any(t.trust is not None for t in targets) else None,
-            np.concatenate(censored) if any(t.censored is not None for t in targets) else None,
-        )
 
     def part(self, index: np.ndarray) -> Target:
         """Some of the readings."""
@@ -278,53 +268,51 @@ class Observation:
         single = self.view.tables(SETS["single"])
         return [table for name, table in self.view.tables(effects).items() if name not in single]
 
-    def direct(self, effects: Effects, materials: Evaluation) -> np.ndarray:
-        """Readings of line of sight and mirrors in units of the floor, shape ``(N,)``."""
-        kept, specular, together = (
-            self.view.kept_paths(effects),
-            self.view.records[SPECULAR],
-            self.measured.together,
-        )
+    def direct(self, effects: Effects, materials: Evaluation, power: np.ndarray) -> np.ndarray:
+        """Readings of line of sight and mirrors of ``power`` (L,) in units of the floor, shape ``(N,)``."""
+        kept, together = self.view.kept_paths(effects), self.measured.together
         if together is None:
-            return np.where(kept, specular.powers(materials), 0.0).astype(np.float32) @ self.path
-        amplitude = together.amplitudes(specular, materials.parameters, materials.material)[0]
+            return np.where(kept, power, 0.0).astype(np.float32) @ self.path
+        amplitude = together.amplitudes(
+            self.view.records[SPECULAR], materials.parameters, materials.material
+        )[0]
         return together.received(np.where(kept, amplitude, 0.0)) / self.floor
 
     def slopes(
-        self, effects: Effects, materials: Evaluation, layout: Layout, *, specular: bool = False
+        self, effects: Effects, materials: Evaluation, layout: Layout
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of readings to the parameters of materials ``(C, N)`` float32, and their places ``(C,)``; those of
-        line of sight and mirrors alone, if ``specular``."""
-        tables = [] if specular else [(n, r) for n, r in self.view.tables(effects).items() if n != SPECULAR]
-        side, (own, count) = self.view.tracer.surface.side_group, self.ray_bins
-        groups = [r.groups(side) for r in (self.view.records[SPECULAR], *(r for _, r in tables))]
-        seen = np.unique(materials.material[np.concatenate(groups)])
-        index = (layout.stride * seen[:, None] + np.arange(layout.stride)).ravel()
-        place = np.zeros(layout.groups, np.int32)
-        place[seen] = layout.stride * np.arange(len(seen))
-        direct, columns = self._direct_slopes(effects, materials, place, len(index))
-        table = direct.T.astype(np.float32) @ columns
-        if tables:
-            sums = np.zeros((count, len(index)), np.float32)
-            for _, records in tables:
-                records.add_slopes(materials, Bins.of(own[records.ray], count), place, sums)
-            table = table + np.asarray(self.measured.of_bins(sums, quick=True)).T / np.float32(self.floor)
-        return table, index
+        """Derivatives of readings to the parameters of materials ``(C, N)`` float32, and their places ``(C,)``."""
+        tables, (own, count) = self.view.tables(effects), self.ray_bins
+        side, specular = self.view.tracer.surface.side_group, tables.pop(SPECULAR)
+        groups = [records.groups(side) for records in (specular, *tables.values())]
+        place, index = layout.columns(materials.material[np.concatenate(groups)])
+        rise = specular.slopes(materials, place, len(index))
+        sums = np.zeros((count, len(index)), np.float32)
+        for records in tables.values():
+            records.add_slopes(materials, Bins.of(own[records.ray], count), place, sums)
+        scattered = np.asarray(self.measured.of_bins(sums, quick=True)).T / np.float32(self.floor)
+        return self.direct_slopes(effects, materials, place, rise) + scattered, index
 
-    def _direct_slopes(
-        self, effects: Effects, materials: Evaluation, place: np.ndarray, count: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of path powers, or amplitudes where phases count, ``(L, count)``, and what each reads ``(L, N)``."""
+    def direct_slopes(
+        self, effects: Effects, materials: Evaluation, place: np.ndarray, rise: np.ndarray
+    ) -> np.ndarray:
+        """Derivatives of what is read of line of sight and mirrors ``(C, N)`` float32, of whose powers they are ``rise``
+        (L, C); those to the parameters of material m stand from ``place[m]`` on."""
         kept, specular, p = self.view.kept_paths(effects), self.view.records[SPECULAR], materials.parameters
-        found = np.zeros((len(specular), count))
-        if (together := self.measured.together) is None:
-            specular.add_slopes(materials, Bins.of(np.arange(len(specular)), len(specular)), place, found)
-            return found * kept[:, None], self.path
-        amplitude, rise = together.amplitudes(specular, p, materials.material)
-        for path, mirror in zip(*np.nonzero(specular.index >= 0), strict=True):
-            at = place[materials.material[specular.index[path, mirror]]] + len(p.lobes)
-            found[path, at : at + 2] += rise[path, mirror], 0.5 * amplitude[path]
-        return found * kept[:, None], together.slopes(np.where(kept, amplitude, 0.0)) / self.floor
+        columns = self.path
+        if (together := self.measured.together) is not None:
+            amplitude, slope = together.amplitudes(specular, p, materials.material)
+            rise, columns = (
+                np.zeros_like(rise),
+                together.slopes(np.where(kept, amplitude, 0.0)) / self.floor,
+            )
+            for path, mirror in zip(*np.nonzero(specular.index >= 0), strict=True):
+                at = place[materials.material[specular.index[path, mirror]]] + len(p.lobes)
+                if specular.kind[path, mirror] == MIRROR:
+                    rise[path, at : at + 2] += slope[path, mirror], 0.5 * amplitude[path]
+                else:
+                    rise[path, at + 2] += 0.5 * amplitude[path]
+        return np.asarray((rise * kept[:, None]).T.astype(np.float32) @ columns)
 
     @cached_property
     def ray_bins(self) -> tuple[np.ndarray, int]:
@@ -568,7 +556,7 @@ class _Arrays(Kind):
         start = Parameters.prior(view.tracer.surface.groups)
         materials, single = Evaluation(start, device=view.tracer.grid.device), SETS["single"]
         scattered = columns_of(bare, single, materials).power(start)
-        total = scattered + bare.direct(single, materials)
+        total = scattered + bare.direct(single, materials, view.records[SPECULAR].powers(materials))
         gain = bare.gain(start, total)
         std_db = (
             NEPER
@@ -622,7 +610,7 @@ def _shares(o: Observation) -> tuple[np.ndarray, np.ndarray]:
     materials = Evaluation(model.parameters, device=o.view.tracer.grid.device)
     single = o.view.records[SPECULAR].powers(materials)[:, None] * o.path
     share = single / np.maximum(o.predicted(model, materials), np.maximum(single.sum(axis=0), 1e-300))
-    return share[o.view.paths.order == 0].sum(axis=0), (share**2).sum(axis=0)
+    return share[o.view.paths.in_sight].sum(axis=0), (share**2).sum(axis=0)
 
 
 def _pointings(one: Readings, view: View) -> tuple[np.ndarray, np.ndarray] | None:

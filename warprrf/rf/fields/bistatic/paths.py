@@ -32,7 +32,11 @@ def paths_of(
     view, found = gains.view, gains.view.paths
     exact = np.flatnonzero(gains.specular > 0)
     specular, vertices = gains.specular[exact], found.point[exact]
-    kinds = np.where(found.order[exact] == 0, "los", "mirror").astype("<U7")
+    kinds = np.select(
+        [found.over_edge[exact], found.slabs[exact] > 0, found.order[exact] > 0],
+        ["edge", "slab", "mirror"],
+        "los",
+    ).astype("<U7")
     diffuse = gains.by_ray().reshape(*image.shape, -1).sum(axis=-1)
     point = _bounce_points(view, gains.single, floor)
     kept = diffuse > floor

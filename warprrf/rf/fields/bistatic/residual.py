@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
+from itertools import groupby, pairwise
 
 import numpy as np
 from scipy.sparse import block_diag, csr_matrix, hstack, identity, vstack
@@ -32,6 +32,7 @@ LARGEST = 4.0  # gain [nepers]
 LONGEST = 3.0  # step of a gain, in standard deviations
 STEPS, QUICK_STEPS = (4, 12), (2, 8)
 """Gauss-Newton steps and of conjugate gradients in each; the few of a quick fit find three quarters of what is to be found."""
+AT_ONCE = 64  # receivers that go through a measurement together
 
 
 @dataclass(frozen=True)
@@ -100,11 +101,10 @@ def fit_residual(
     """
     rounds, conjugate = QUICK_STEPS if quick else STEPS
     power = vstack([s.power for s in shares], format="csr")
-    rest = np.concatenate([s.rest for s in shares])
-    target = Target.joined([s.target for s in shares])
-    threshold = np.repeat([s.huber_db for s in shares], [len(s.rest) for s in shares])
+    own_rows = [slice(*own) for own in pairwise(np.cumsum([0, *(len(s.rest) for s in shares)]))]
     # Receivers that are measured alike go through the measurement together.
-    batches = [list(own) for _, own in groupby(shares, key=lambda s: s.measured.alike)]
+    alike = [list(own) for _, own in groupby(shares, key=lambda s: s.measured.alike)]
+    batches = [own[k : k + AT_ONCE] for own in alike for k in range(0, len(own), AT_ONCE)]
     bins = np.cumsum([0, *(len(b) * b[0].power.shape[0] for b in batches)])
     rows = np.cumsum([0, *(len(b) * len(b[0].rest) for b in batches)])
 
@@ -132,17 +132,19 @@ def fit_residual(
     unknown = np.zeros(gains.shape[1])
     for _ in range(rounds):
         gain = np.exp(np.clip(gains @ unknown, -LARGEST, LARGEST))
-        total = np.maximum(spread(gain, quick=False), 0.0) + rest
-        error, slope = target.error(total), target.slope(total)
-        robust = huber(error, threshold)[1] / noise_db**2
+        pull, weight = spread(gain, quick=False), np.empty(rows[-1])
+        for s, own in zip(shares, own_rows, strict=True):
+            total = np.maximum(pull[own], 0.0) + s.rest
+            error, slope = s.target.error(total), s.target.slope(total)
+            robust = huber(error, s.huber_db)[1] / noise_db**2
+            pull[own], weight[own] = slope * robust * error, slope**2 * robust
 
-        def curvature(
-            v: np.ndarray, gain: np.ndarray = gain, weight: np.ndarray = slope**2 * robust
-        ) -> np.ndarray:
-            found: np.ndarray = gains.T @ (gain * gather(weight * spread(gain * (gains @ v)))) + v
-            return found
+        def curvature(v: np.ndarray, gain: np.ndarray = gain, weight: np.ndarray = weight) -> np.ndarray:
+            readings = spread(gain * (gains @ v))
+            readings *= weight
+            return np.asarray(gains.T @ (gain * gather(readings)) + v)
 
-        gradient = gains.T @ (gain * gather(slope * robust * error)) + unknown
+        gradient = gains.T @ (gain * gather(pull)) + unknown
         system = LinearOperator((len(unknown),) * 2, matvec=curvature, dtype=np.float64)
         step = cg(system, -gradient, rtol=0.0, atol=1e-6, maxiter=conjugate)[0]
         unknown += np.clip(step, -LONGEST, LONGEST)

@@ -89,7 +89,7 @@ class Sensitivity:
 
     def powers(self, place: np.ndarray) -> tuple[csr_matrix, np.ndarray]:
         """Power that is due to each gain in each pixel at ``place`` (3,), shape ``(P, U)``, and all power ``(P,)``."""
-        view = self.tracer.view(place, self.model.effects.mirrors)
+        view = self.tracer.view(place, self.model.effects)
         found = path_gains(view, self.model, self.materials)
         s, count = self.tracer.surface, SHAPE[0] * SHAPE[1]
         elements, element = len(s.element_area), s.element.take(view.hits.face, mode="wrap")

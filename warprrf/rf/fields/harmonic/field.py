@@ -10,7 +10,8 @@ from transmitter and receiver. ``rf3dgs`` has no lengths; its delay and angle of
 blended plainly and trained on delay and AoD spectra. The paper leaves the gain's domain open; ours: A = exp(SH), or
 max(0, SH) with ``gain="linear"``, SH of degree 3; loss 0.8 L1 + 0.2 (1 - SSIM) on the dB image. Delay and AoD are
 those of the single bounce, in float64; for ``rf3dgs+`` the pixels around a transmitter that the mesh lets be seen carry
-those of the line of sight, although the paper's surfaces must carry its power.
+those of the line of sight, although the paper's surfaces must carry its power. Absorption by the air is that of the path's
+length; ``rf3dgs``, which has none, learns it with the gain.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields, replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -43,22 +46,33 @@ from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField, with_settings
-from warprrf.rf.fields.harmonic.fitting import KINDS, SAVED_EVERY, Checkpoint, State, fit_layer, targets
+from warprrf.rf.fields.harmonic.fitting import (
+    KINDS,
+    State,
+    fit_layer,
+    load_states,
+    save_states,
+    targets,
+)
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining, list_responses
-from warprrf.rf.fields.harmonic.options import FieldOptions, Rates, SingleBounce
+from warprrf.rf.fields.harmonic.options import FieldOptions, Rates
 from warprrf.rf.fields.harmonic.paths import View, near_line_of_sight, paths_of
 from warprrf.rf.fields.harmonic.problem import Problem, harmonics
-from warprrf.rf.fields.harmonic.transport import Transport, transport
+from warprrf.rf.fields.harmonic.transport import (
+    Lengths,
+    Transport,
+    interaction_points,
+    path_lengths,
+    transport,
+)
 from warprrf.rf.paths.trace import Paths
 from warprrf.rf.positions import Ends, check_dataset
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.spectrum import Spectrum, angles_from_directions
+from warprrf.rf.spectra.spectrum import Spectrum, angles_from_directions, pixel_solid_angles, spread
 from warprrf.steps import digest
 
 LAYERS = {"rf3dgs+": ("gain",), "rf3dgs": ("gain", "delay", "aod_x", "aod_y", "aod_z")}
 """Layers that each model may have."""
-MOST_COEFFICIENT = 1e9
-CHANNEL_STEPS = 100  # of each delay and AoD channel: they start at means that are nearly right
 CHANNEL_RATES = Rates(constant=0.1, directional=0.05, ridge=0.02, ridge_directional=0.1)
 
 
@@ -107,17 +121,11 @@ class HarmonicField(RadioField):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        wanted = set(self.layers) - set(LAYERS[self.model])
-        if wanted:
-            raise ValueError(
-                f"layers: got {', '.join(sorted(wanted))}, expected {', '.join(LAYERS[self.model])}"
-            )
-        lacking = set(LAYERS[self.model]) - set(self.layers)
-        if lacking and len(self.layers) > 1:
-            raise ValueError(
-                f"layers: got no {', '.join(sorted(lacking))}, expected the gain alone or every layer"
-            )
-        table = Expected(f"N {_kernels.COEFFICIENTS}", -MOST_COEFFICIENT, MOST_COEFFICIENT)
+        given, known = ", ".join(self.layers), LAYERS[self.model]
+        if set(self.layers) not in (set(), {"gain"}, set(known)):
+            raise ValueError(f"layers: got {given}, expected the gain alone or {', '.join(known)}")
+        most_coefficient = 1e9
+        table = Expected(f"N {_kernels.COEFFICIENTS}", -most_coefficient, most_coefficient)
         check_arrays(self.layers, dict.fromkeys(self.layers, table), N=len(self.gaussians))
         check_positive("gain_unit", self.gain_unit)
         check_number("delay_unit", self.delay_unit, 0.0, 1.0)
@@ -169,9 +177,7 @@ class HarmonicField(RadioField):
         gaussians, mesh = _geometry(geometry)
         receivers, transmitter = check_dataset(mesh, ds, device=device)
         if mesh is None and (chosen.line_of_sight == "explicit" or chosen.interaction_point == "mesh"):
-            raise ValueError(
-                'line_of_sight="explicit" and interaction_point="mesh" need a mesh; the geometry has none'
-            )
+            raise ValueError('line_of_sight="explicit" and interaction_point="mesh" need a mesh; got none')
         images = check_array("ds.path_gain", ds.path_gain, (len(receivers), None, None), np.float64)
         blank = cls(
             gaussians=gaussians,
@@ -289,19 +295,41 @@ class HarmonicField(RadioField):
             "delay_unit": header["delay_unit"],
         }
 
-    @property
-    def law(self) -> SingleBounce:
-        """Path lengths, spreading loss and line of sight of this field."""
-        return SingleBounce(
-            self.gaussians,
-            self.mesh,
-            self.options,
-            self.shape,
-            self.frequency_hz,
-            self.beam_sigma_rad,
-            self.air,
-            self.device,
+    def _lengths(self, seen: Transport, transmitter: np.ndarray) -> Lengths:
+        """Path lengths of every pixel of ``seen`` by the interaction point that the options name."""
+        points = interaction_points(
+            seen, self.gaussians, self.options.interaction_point, mesh=self.mesh, device=self.device
         )
+        return path_lengths(points, transmitter, seen.receivers)
+
+    def _factor(self, lengths: Lengths) -> np.ndarray:
+        """Solid angle [sr], times spreading loss for ``rf3dgs+``; zero where the ray meets nothing."""
+        loss = np.isfinite(lengths.total) if self.model == "rf3dgs" else self._free_space(lengths.total)
+        return np.nan_to_num(pixel_solid_angles(self.shape)[:, None] * loss, posinf=0.0)
+
+    def _line_of_sight(self, receiver: np.ndarray, transmitter: np.ndarray) -> tuple[bool, float]:
+        """Whether the mesh lets them see each other, and their Friis gain, less absorption."""
+        distance = float(np.linalg.norm(receiver - transmitter))
+        if distance == 0:
+            raise ValueError("receivers: got the transmitter's own position; expected them apart")
+        visible = self.mesh is not None and self.mesh.visible(receiver, transmitter, device=self.device)[0]
+        return bool(visible), float(self._free_space(distance))
+
+    def _beam(self, receiver: np.ndarray, transmitter: np.ndarray) -> np.ndarray | None:
+        """The explicit line of sight's beam on the grid, or None."""
+        if self.options.line_of_sight != "explicit":
+            return None
+        visible, gain = self._line_of_sight(receiver, transmitter)
+        if not visible:
+            return None
+        toward = (transmitter - receiver)[None]
+        return spread(toward, [gain], self.shape, self.beam_sigma_rad, device=self.device)
+
+    def _free_space(self, length_m: float | np.ndarray) -> float | np.ndarray:
+        """Gain of a path of ``length_m`` [m] between isotropic antennas, less what the air absorbs."""
+        with np.errstate(divide="ignore"):
+            gain = (SPEED_OF_LIGHT / self.frequency_hz / (4 * np.pi * length_m)) ** 2
+        return gain if self.air is None else gain * self.air.transmittance(self.frequency_hz, length_m)
 
     def _seen_from(
         self, receivers: np.ndarray, seen: Transport | None, progress: Progress | None
@@ -341,16 +369,15 @@ class HarmonicField(RadioField):
     def _view_from(self, receiver: np.ndarray, source: np.ndarray, seen: Transport | None) -> View:
         """Spectrum at one receiver and what it was made of."""
         seen = self._seen_from(receiver[None], seen, None)
-        law = self.law
-        visible, friis = law.line_of_sight(receiver, source)
-        lengths = law.lengths(seen, source)
-        power = law.factor(lengths)[0] * self.gain_unit * self._blend("gain", seen)
+        visible, friis = self._line_of_sight(receiver, source)
+        lengths = self._lengths(seen, source)
+        power = self._factor(lengths)[0] * self.gain_unit * self._blend("gain", seen)
         point, delay, departure = lengths.point[0], lengths.delay_s[0], lengths.departure[0]
         if self.options.model == "rf3dgs":
             point = np.full_like(point, np.nan)
             delay, departure = self._channels(seen)
         angles = np.stack(angles_from_directions(departure), axis=-1)
-        beam = law.beam(receiver, source)
+        beam = self._beam(receiver, source)
         direct = np.zeros(self.shape, dtype=bool)
         if beam is not None:
             direct, power = beam > power, power + beam
@@ -410,29 +437,42 @@ def _train(
     if options.train_opacity:
         listed = list_responses(gaussians, seen, ds.range_db, device=device, progress=progress)
         seen = listed.transport
-    plan = targets(blank.law, ds, images, seen)
+    factor = blank._factor(blank._lengths(seen, blank.transmitter))
+    beams = [blank._beam(receiver, blank.transmitter) for receiver in seen.receivers]
+    extra = np.stack([np.zeros(blank.shape) if beam is None else beam for beam in beams])
+    plan, gain_unit, delay_unit = targets(options, ds, images, seen, factor, extra)
     problem = Problem(seen, batch=options.batch, seed=options.seed, device=device)
-    channel_steps = min(CHANNEL_STEPS, options.iterations)
-    total = options.iterations + (len(plan.layers) - 1) * channel_steps
-    kept = Checkpoint(checkpoint, digest(options, seen, plan.layers))
-    layers, losses, done = {}, {}, 0
-    for name, target in plan.layers.items():
-        is_gain, state, opacity = name == "gain", kept.states.get(name), None
-        steps = options.iterations if is_gain else channel_steps
+    channel_steps = 100  # of each delay and AoD channel: they start at means that are nearly right
+    steps = {
+        name: options.iterations if name == "gain" else min(channel_steps, options.iterations)
+        for name in plan
+    }
+    identity = digest(options, seen, plan)
+    states, before = load_states(checkpoint, identity), 0
+    layers: dict[str, np.ndarray] = {}
+
+    def each(name: str, done: int, state: Callable[[], State]) -> None:
+        """What follows each step of a layer: progress, and now and then the checkpoint."""
+        if progress is not None:
+            progress("fit", before + done, sum(steps.values()))
+        if checkpoint is not None and (done % 50 == 0 or done == steps[name]):
+            states[name] = state()
+            save_states(checkpoint, identity, states)
+
+    for name, target in plan.items():
+        is_gain, state, opacity = name == "gain", states.get(name), None
         if listed is not None and is_gain:
-            before = None if state is None else state.opacity
-            opacity = OpacityTraining(problem, listed, gaussians.opacities, before)
-        state = fit_layer(
-            problem, target, steps=steps, rates=options.rates if is_gain else CHANNEL_RATES,
-            degree=options.sh_degree, opacity=opacity, state=state,
-            each=_after_step(kept, name, steps, progress, (done, total)),
+            logits = None if state is None else state.opacity
+            opacity = OpacityTraining(problem, listed, gaussians.opacities, logits)
+        states[name] = state = fit_layer(
+            problem, target, steps=steps[name], rates=options.rates if is_gain else CHANNEL_RATES,
+            degree=options.sh_degree, opacity=opacity, state=state, each=partial(each, name),
         )  # fmt: skip
-        done += steps
-        everyone = np.zeros((len(gaussians), _kernels.COEFFICIENTS), np.float32)
-        everyone[:, 0] = plan.unseen[name]
+        before += steps[name]
+        layers[name] = np.zeros((len(gaussians), _kernels.COEFFICIENTS), np.float32)
+        layers[name][:, 0] = target.unseen
         unit = 1.0 if target.unit is None else target.unit[:, None]
-        everyone[problem.seen] = state.coefficients * unit
-        layers[name], losses[name] = everyone, [float(loss) for loss in state.losses]
+        layers[name][problem.seen] = state.coefficients * unit
         if listed is not None and opacity is not None:
             trained = np.array(gaussians.opacities, np.float32)
             trained[problem.seen] = opacity.opacities
@@ -440,35 +480,21 @@ def _train(
             # Channels are blended with the opacities that the gain has found.
             seen_now = listed.with_opacities(trained)
             problem = Problem(seen_now, batch=options.batch, seed=options.seed, device=device)
-    kept.remove()
+    if checkpoint is not None:
+        Path(checkpoint).unlink(missing_ok=True)
     report = {
         "gaussians": len(gaussians),
         "gaussians_seen": len(problem.seen),
         "iterations": options.iterations,
         "seed": options.seed,
         "train_opacity": options.train_opacity,
-        "losses": losses,
+        "losses": {name: states[name].losses.tolist() for name in plan},
     }
     return replace(
         blank,
         gaussians=gaussians,
         layers=layers,
-        gain_unit=plan.gain_unit,
-        delay_unit=plan.delay_unit,
+        gain_unit=gain_unit,
+        delay_unit=delay_unit,
         report=report,
     )
-
-
-def _after_step(
-    kept: Checkpoint, name: str, steps: int, progress: Progress | None, place: tuple[int, int]
-) -> Callable[[int, Callable[[], State]], None]:
-    """What follows each step of layer ``name``: progress, ``place`` being the steps before it and in all, and now and
-    then the checkpoint."""
-
-    def each(done: int, state: Callable[[], State]) -> None:
-        if progress is not None:
-            progress("fit", place[0] + done, place[1])
-        if kept.path is not None and (done % SAVED_EVERY == 0 or done == steps):
-            kept.save(name, state())
-
-    return each

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,19 +24,16 @@ from warprrf.geometry.splats.photo_loss import WRAPPED, PhotoLoss
 from warprrf.kernels.adam import build_adam, corrections
 from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.kernels.raster.sh import COEFFICIENTS as DEGREE_TO_COUNT
-from warprrf.rf.fields.harmonic.opacity import RATE as OPACITY_RATE
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining
-from warprrf.rf.fields.harmonic.options import Rates, SingleBounce
+from warprrf.rf.fields.harmonic.options import FieldOptions, Rates
 from warprrf.rf.fields.harmonic.problem import Problem
 from warprrf.rf.fields.harmonic.transport import Transport
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import directions_from_angles, to_db
 
 KINDS = {"exp": _kernels.EXPONENTIAL, "linear": _kernels.CLAMPED, "signed": _kernels.SIGNED}
-FINAL_RATE = 0.05  # the learning rate falls exponentially to this share of its first value
 SSIM_SHARE = 0.2  # of 1 - SSIM in the loss of a gain, the rest is L1: as RF-3DGS publishes it
-SAVED_EVERY = 50  # steps
-CHECKPOINT = "warprrf field checkpoint 1"
+CHECKPOINT = "warprrf field checkpoint 2"
 
 
 @dataclass(frozen=True)
@@ -46,6 +43,7 @@ class Target:
     Attributes:
         image: values in units of the loss, shape ``(R, H, W)``: the dB image mapped by the range, or a channel.
         initial: degree-0 coefficient that each of the Gaussians seen starts with and is pulled to, shape ``(G,)``.
+        unseen: that of Gaussians that no training receiver sees: the median.
         kind: what a Gaussian's value is of its harmonics' sum: ``"exp"``, ``"linear"`` (clamped at zero), ``"signed"``.
         unit: what each Gaussian's value is multiplied by, shape ``(G,)``; None for one.
         factor: what multiplies a pixel's blended gain (solid angle and spreading loss), shape ``(R, H, W)``; None for
@@ -57,6 +55,7 @@ class Target:
 
     image: np.ndarray
     initial: np.ndarray
+    unseen: float = 0.0
     kind: str = "exp"
     unit: np.ndarray | None = None
     factor: np.ndarray | None = None
@@ -72,62 +71,51 @@ class State:
 
     Attributes:
         coefficients, first, second: coefficients and Adam's moments, shape ``(G, 16)``.
-        losses: loss of each step done.
+        losses: loss of each step done, shape ``(S,)``.
         opacity: logits of the opacities and their moments, shape ``(3, G)``; None where they are not trained.
     """
 
     coefficients: np.ndarray
     first: np.ndarray
     second: np.ndarray
-    losses: list[float] = field(default_factory=list)
+    losses: np.ndarray = field(default_factory=lambda: np.zeros(0))
     opacity: np.ndarray | None = None
 
 
-class Checkpoint:
-    """Progress of a fit's layers in one file; without a path it keeps nothing.
+def load_states(path: str | os.PathLike[str] | None, identity: str) -> dict[str, State]:
+    """States of layers in a checkpoint; none if there is none.
 
     Args:
-        path: of the file; read if it exists.
+        path: of the file.
         identity: digest of all that the fit's result depends on.
 
     Raises:
         ValueError: if the file is corrupt or belongs to another fit.
     """
+    if path is None or not Path(path).exists():
+        return {}
+    tensors, header = tensor_files.read(path, CHECKPOINT)
+    if header.get("identity") != identity:
+        raise ValueError(
+            f"checkpoint: {path} belongs to a fit with other data or options; delete it or name another file"
+        )
+    parts: dict[str, dict[str, np.ndarray]] = {}
+    for key, tensor in tensors.items():
+        layer, _, name = key.partition("/")
+        parts.setdefault(layer, {})[name] = tensor
+    with tensor_files.named(path, "checkpoint: corrupt"):
+        return {layer: State(**own) for layer, own in parts.items()}
 
-    def __init__(self, path: str | os.PathLike[str] | None, identity: str) -> None:
-        self.path = None if path is None else Path(path)
-        self.identity = identity
-        self.states: dict[str, State] = {}
-        if self.path is None or not self.path.exists():
-            return
-        tensors, header = tensor_files.read(self.path, CHECKPOINT)
-        if header.get("identity") != identity:
-            raise ValueError(
-                f"checkpoint: {self.path} belongs to a fit with other data or options; delete it or name another file"
-            )
-        with tensor_files.named(self.path, "checkpoint: corrupt"):
-            for name, losses in header["losses"].items():
-                own = {k.removeprefix(f"{name}/"): t for k, t in tensors.items() if k.startswith(f"{name}/")}
-                self.states[name] = State(**own, losses=losses)
 
-    def save(self, name: str, state: State) -> None:
-        """Keep the state of layer ``name``."""
-        if self.path is None:
-            return
-        self.states[name] = state
-        tensors = {
-            f"{layer}/{key}": value
-            for layer, one in self.states.items()
-            for key, value in vars(one).items()
-            if isinstance(value, np.ndarray)
-        }
-        losses = {layer: one.losses for layer, one in self.states.items()}
-        tensor_files.write(self.path, tensors, {"identity": self.identity, "losses": losses}, CHECKPOINT)
-
-    def remove(self) -> None:
-        """Delete the file."""
-        if self.path is not None:
-            self.path.unlink(missing_ok=True)
+def save_states(path: str | os.PathLike[str], identity: str, states: Mapping[str, State]) -> None:
+    """Write what :func:`load_states` reads."""
+    tensors = {
+        f"{layer}/{name}": value
+        for layer, state in states.items()
+        for name, value in vars(state).items()
+        if value is not None
+    }
+    tensor_files.write(path, tensors, {"identity": identity}, CHECKPOINT)
 
 
 @dataclass(frozen=True)
@@ -279,21 +267,23 @@ def fit_layer(
 
     def snapshot() -> State:
         logits = None if opacity is None else opacity.state
-        return State(coefficients.numpy(), first.numpy(), second.numpy(), losses, logits)
+        return State(coefficients.numpy(), first.numpy(), second.numpy(), np.array(losses), logits)
 
+    final_rate = 0.05  # the learning rate falls exponentially to this share of its first value
     for step in range(len(losses), steps):
         index = p.batch_at(step)
         losses.append(layer.step(index, coefficients))
         # one pixel's L1 pull on a neper of gain, so that the ridge counts in pixels
         pull = np.log10(math.e) * 10 / (target.high - target.low) if target.mask is None else 1.0
         ridge = firm * (pull / layer.data[index].count)
-        falling = FINAL_RATE ** (step / max(steps - 1, 1))
+        falling = final_rate ** (step / max(steps - 1, 1))
         p.launch(
             adam, len(p.seen), width, p.upload(rate * falling), *corrections(step + 1), p.upload(ridge), initial,
             *moved,
         )  # fmt: skip
         if opacity is not None:
-            opacity.step(layer.opacity_gradient, step + 1, OPACITY_RATE * falling)
+            opacity_rate = 0.05  # Adam's, of the logits, as RF-3DGS publishes it
+            opacity.step(layer.opacity_gradient, step + 1, opacity_rate * falling)
         if each is not None:
             each(step + 1, snapshot)
     return snapshot()
@@ -307,39 +297,29 @@ def _numbers(vectors: wp.array) -> wp.array:
     )
 
 
-DARK = 0.1  # a pixel below the floor counts as this share of it where logarithms are averaged
-
-
-@dataclass(frozen=True)
-class Targets:
-    """Layers to fit, in order.
-
-    Attributes:
-        layers: target of each layer: ``gain`` first, then ``delay``, ``aod_x``, ``aod_y``, ``aod_z`` for ``rf3dgs``.
-        unseen: degree-0 coefficient of each layer for Gaussians that no training receiver sees: the median.
-        gain_unit: linear factor of the gain: its median over the pixels above the floor.
-        delay_unit: seconds per unit of the delay layer: the longest delay.
-    """
-
-    layers: dict[str, Target]
-    unseen: dict[str, float]
-    gain_unit: float
-    delay_unit: float
-
-
-def targets(law: SingleBounce, ds: SpectrumDataset, images: np.ndarray, seen: Transport) -> Targets:
+def targets(
+    options: FieldOptions,
+    ds: SpectrumDataset,
+    images: np.ndarray,
+    seen: Transport,
+    factor: np.ndarray,
+    extra: np.ndarray,
+) -> tuple[dict[str, Target], float, float]:
     """What to fit the spectra ``images`` (R, H, W) of ``ds`` with.
+
+    Args:
+        factor: what multiplies a pixel's blended gain, shape ``(R, H, W)``.
+        extra: power of an explicit line of sight, shape ``(R, H, W)``.
+
+    Returns:
+        Targets of the layers in order: ``gain`` first, then ``delay``, ``aod_x``, ``aod_y``, ``aod_z`` for ``rf3dgs``;
+        the linear factor of the gain, its median over the pixels above the floor; seconds per unit of the delay
+        layer, the longest delay.
 
     Raises:
         ValueError: if no pixel above the floor meets a Gaussian.
     """
-    transmitter, floor = np.asarray(ds.transmitter, np.float64), float(ds.floor)
-    lengths = law.lengths(seen, transmitter)
-    factor = law.factor(lengths)
-    extra = np.zeros_like(images)
-    for i, receiver in enumerate(seen.receivers):
-        beam = law.beam(receiver, transmitter)
-        extra[i] = 0.0 if beam is None else beam
+    floor = float(ds.floor)
     blended = factor * seen.pixel_weight
     above = (images - extra > floor) & (blended > 0)
     if not above.any():
@@ -350,16 +330,18 @@ def targets(law: SingleBounce, ds: SpectrumDataset, images: np.ndarray, seen: Tr
     gain_unit = float(np.median((images - extra)[above] / blended[above]))
     # Each Gaussian starts from the mean gain, in dB, of the pixels that see it: shadows lie 14 nepers below the median.
     met = blended > 0
-    floored = np.maximum(images - extra, DARK * floor)
+    dark = 0.1  # a pixel below the floor counts as this share of it where logarithms are averaged
+    floored = np.maximum(images - extra, dark * floor)
     relative = np.log(floored / np.where(met, blended * gain_unit, 1.0))
     start = np.nan_to_num(weighted_means(seen, relative, met)[1])
-    exponential = law.options.gain == "exp"
+    exponential = options.gain == "exp"
     low, high = (float(v) for v in ds.range_db)
     layers = {
         "gain": Target(
             image=np.clip((to_db(images, floor) - low) / (high - low), 0.0, 1.0),
-            kind=law.options.gain,
+            kind=options.gain,
             initial=start / Y00 if exponential else np.full(len(start), 1.0 / Y00),
+            unseen=0.0 if exponential else 1.0 / Y00,
             unit=None if exponential else np.exp(start),
             # in units of the floor, so that float32 works near one
             factor=factor * (gain_unit / floor),
@@ -368,10 +350,9 @@ def targets(law: SingleBounce, ds: SpectrumDataset, images: np.ndarray, seen: Tr
             high=high - 10 * np.log10(floor),
         )
     }
-    unseen = {"gain": 0.0 if exponential else 1.0 / Y00}
     delay_unit = 1.0
     delays = None if ds.delay_s is None else np.asarray(ds.delay_s, np.float64)
-    if law.options.model == "rf3dgs" and delays is not None:
+    if options.model == "rf3dgs" and delays is not None:
         mask = (images > floor) & np.isfinite(delays) & (seen.dominant >= 0)
         if mask.any():
             delay_unit = float(delays[mask].max())
@@ -385,10 +366,10 @@ def targets(law: SingleBounce, ds: SpectrumDataset, images: np.ndarray, seen: Tr
                     kind="signed",
                     image=np.where(mask, image, 0.0),
                     initial=np.where(np.isnan(mean), middle, mean) / Y00,
+                    unseen=middle / Y00,
                     mask=mask,
                 )
-                unseen[name] = middle / Y00
-    return Targets(layers, unseen, gain_unit, delay_unit)
+    return layers, gain_unit, delay_unit
 
 
 def weighted_means(

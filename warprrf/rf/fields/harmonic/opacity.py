@@ -14,20 +14,12 @@ import numpy as np
 import warp as wp
 
 from warprrf.device import DeviceLike, Progress
-from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import Blending
-from warprrf.geometry.splats.render import blend_weights
 from warprrf.kernels.adam import EPSILON, FIRST_DECAY, SECOND_DECAY, corrections
 from warprrf.kernels.radio import opacity as _kernels
 from warprrf.rf.fields.harmonic.problem import Problem
-from warprrf.rf.fields.harmonic.transport import Transport, cutoffs
-
-THINNED = 0.5  # of each opacity, while lists are made
-LISTED = 32  # Gaussians kept per pixel
-THINNED_LEFT = 1e-4  # transmittance at which a thinned list ends: float32 weights give alpha to 0.1 % there
-RATE = 0.05  # Adam rate of the logits, as RF-3DGS publishes it
-LEAST, MOST = 1e-4, 1 - 1e-6  # opacities that logits are made of
+from warprrf.rf.fields.harmonic.transport import Transport, cutoffs, views
 
 
 @dataclass(frozen=True)
@@ -58,7 +50,7 @@ def list_responses(
     seen: Transport,
     range_db: tuple[float, float],
     *,
-    top_k: int = LISTED,
+    top_k: int = 32,
     device: DeviceLike = None,
     progress: Progress | None = None,
 ) -> Listed:
@@ -71,18 +63,12 @@ def list_responses(
         top_k: Gaussians kept per pixel, those of largest thinned weight.
     """
     rules = cutoffs(range_db)
-    thin = replace(gaussians, opacities=(THINNED * gaussians.opacities).astype(np.float32))
-    blending = Blending(THINNED * rules.alpha_min, rules.alpha_max, THINNED_LEFT, "product")
+    share = 0.5  # of each opacity
+    thin = replace(gaussians, opacities=(share * gaussians.opacities).astype(np.float32))
+    # transmittance at which a list ends: float32 weights give alpha to 0.1 % there
+    blending = Blending(share * rules.alpha_min, rules.alpha_max, 1e-4, "product")
     counts, indices, responses = [], [], []
-    rows, columns = seen.shape
-    for k, receiver in enumerate(seen.receivers):
-        view = blend_weights(
-            thin,
-            Camera.spherical(columns, rows, position=receiver),
-            top_k=top_k,
-            blending=blending,
-            device=device,
-        )
+    for view in views(thin, seen.receivers, seen.shape, top_k, blending, device=device, progress=progress):
         weight = np.asarray(view.weight, np.float64)
         listed = (np.asarray(view.index) >= 0) & (weight > 0)
         weight = np.where(listed, weight, 0.0)
@@ -92,8 +78,6 @@ def list_responses(
         counts.append(np.count_nonzero(listed, axis=-1).ravel())
         indices.append(index)
         responses.append(np.minimum(alpha[listed] / thin.opacities[index], 1.0).astype(np.float32))
-        if progress is not None:
-            progress("transport", k + 1, len(seen.receivers))
     start = np.concatenate([[0], np.cumsum(np.concatenate(counts))]).astype(np.int64)
     gaussian = np.concatenate(indices).astype(np.int32)
     response = np.concatenate(responses)
@@ -118,7 +102,9 @@ class OpacityTraining:
     ) -> None:
         self.problem, self.kernels = problem, _kernels.build(problem.real)
         self.alpha_max = problem.real(listed.alpha_max)
-        first = np.clip(np.asarray(opacities, np.float64)[problem.seen], LEAST, MOST)
+        limits = np.array([1e-4, 1 - 1e-6])  # opacities that logits are made of
+        self._limits = np.log(limits / (1 - limits))
+        first = np.clip(np.asarray(opacities, np.float64)[problem.seen], *limits)
         self.state = np.stack([np.log(first / (1 - first)), np.zeros_like(first), np.zeros_like(first)])
         if state is not None:
             self.state = np.array(state, np.float64)
@@ -169,6 +155,5 @@ class OpacityTraining:
         first = FIRST_DECAY * first + (1 - FIRST_DECAY) * slope
         second = SECOND_DECAY * second + (1 - SECOND_DECAY) * slope**2
         logits = logits - rate * unbias1 * first / (np.sqrt(unbias2 * second) + EPSILON)
-        low, high = np.log(LEAST / (1 - LEAST)), np.log(MOST / (1 - MOST))
-        self.state = np.stack([np.clip(logits, low, high), first, second])
+        self.state = np.stack([np.clip(logits, *self._limits), first, second])
         self._opacity = self.problem.upload(self.opacities)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 from warprrf.rf.paths.trace import Paths
 from warprrf.rf.spectra.spectrum import Spectrum, angles_from_directions, pixel_directions, pixel_of
 
@@ -61,21 +62,32 @@ def paths_of(view: View, *, beam_sigma_rad: float, frequency_hz: float, max_path
         line_of_sight = total  # nothing else has power
     delay = np.full(len(diffuse), np.nan) if spectrum.delay_s is None else spectrum.delay_s[row, column]
     aod = np.full((len(diffuse), 2), np.nan) if spectrum.aod is None else spectrum.aod[row, column]
-    parts = [
-        _single(diffuse, delay, toward[row, column], aod, view.points[row, column], "diffuse", frequency_hz)
-    ]
+    kinds = ["diffuse"] * len(diffuse)
+    parts: list[Any] = [diffuse, delay, toward[row, column], aod, view.points[row, column], kinds]
     if line_of_sight > 0:
         departure = np.stack(angles_from_directions(outward[None]), axis=-1)
-        flight = np.array([distance / SPEED_OF_LIGHT])
-        nowhere = np.full((1, 3), np.nan)
-        parts.append(
-            _single(
-                np.array([line_of_sight]), flight, -outward[None], departure, nowhere, "los", frequency_hz
-            )
-        )
-    everything = Paths.concatenate(parts)
-    order = np.argsort(-np.abs(everything.gain), kind="stable")[:max_paths]
-    return replace(everything.select(order), transmitter=view.transmitter, receiver=view.receiver)
+        flight, nowhere = distance / SPEED_OF_LIGHT, np.full((1, 3), np.nan)
+        direct: list[Any] = [[line_of_sight], [flight], -outward[None], departure, nowhere, ["los"]]
+        parts = [np.concatenate(pair) for pair in zip(parts, direct, strict=True)]
+    amplitude = np.sqrt(parts[0])
+    order = np.argsort(-amplitude, kind="stable")[:max_paths]
+    amplitude, delay, arrival, aod, points, kind = (np.asarray(a)[order] for a in (amplitude, *parts[1:]))
+    zenith, azimuth = angles_from_directions(arrival)
+    return Paths(
+        gain=amplitude
+        * carrier_phase(frequency_hz, np.nan_to_num(delay)),  # without a delay the phase is zero
+        tau=np.asarray(delay, np.float64),
+        theta_r=zenith,
+        phi_r=azimuth,
+        theta_t=aod[:, 0],
+        phi_t=aod[:, 1],
+        vertices=points[:, None, :],
+        kind=kind.astype("<U7"),
+        valid=np.ones(len(order), dtype=bool),
+        frequency_hz=float(frequency_hz),
+        transmitter=view.transmitter,
+        receiver=view.receiver,
+    )
 
 
 def near_line_of_sight(
@@ -86,29 +98,3 @@ def near_line_of_sight(
     near = pixel_directions(shape) @ direction >= np.cos(BEAM_REACH * beam_sigma_rad)
     near[pixel_of(direction, shape)] = True
     return near
-
-
-def _single(
-    power: np.ndarray,
-    delay: np.ndarray,
-    arrival: np.ndarray,
-    departure: np.ndarray,
-    points: np.ndarray,
-    kind: str,
-    frequency_hz: float,
-) -> Paths:
-    """Paths of at most one interaction, at ``points`` (L, 3), NaN for none. Without a delay the phase is zero."""
-    turns = np.mod(frequency_hz * np.where(np.isfinite(delay), delay, 0.0), 1.0)
-    zenith, azimuth = angles_from_directions(arrival)
-    return Paths(
-        gain=np.sqrt(power) * np.exp(-2j * np.pi * turns),
-        tau=np.asarray(delay, np.float64),
-        theta_r=zenith,
-        phi_r=azimuth,
-        theta_t=departure[:, 0],
-        phi_t=departure[:, 1],
-        vertices=points[:, None, :],
-        kind=np.full(len(power), kind, dtype="<U7"),
-        valid=np.ones(len(power), dtype=bool),
-        frequency_hz=float(frequency_hz),
-    )

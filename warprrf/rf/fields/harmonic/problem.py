@@ -20,7 +20,7 @@ from warprrf.rf.spectra.spectrum import pixel_directions
 
 
 @dataclass(frozen=True)
-class Batch:
+class Pairs:
     """One batch's pairs on the device, Gaussian by Gaussian; see :mod:`warprrf.kernels.radio.harmonics`."""
 
     receivers: np.ndarray
@@ -83,7 +83,7 @@ class Problem:
         epoch, place = divmod(step, len(self.batches))
         return int(np.random.default_rng([self.seed, 1, epoch]).permutation(len(self.batches))[place])
 
-    def _sorted(self, receivers: np.ndarray) -> Batch:
+    def _sorted(self, receivers: np.ndarray) -> Pairs:
         """The pairs of some receivers, sorted by Gaussian."""
         part = self.transport.subset(receivers)
         order = np.argsort(part.gaussian, kind="stable")
@@ -102,7 +102,7 @@ class Problem:
         on_device = {
             n: wp.array(a.astype(np.int32), dtype=int, device=self.device) for n, a in arrays.items()
         }
-        return Batch(receivers, len(first), pair_weight=self.upload(part.weight[order]), **on_device)
+        return Pairs(receivers, len(first), pair_weight=self.upload(part.weight[order]), **on_device)
 
 
 def harmonics(shape: tuple[int, int], real: type, device: DeviceLike) -> wp.array:

@@ -12,7 +12,7 @@ An interaction point stands for the whole ray, as in the paper: the centre of th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,8 +31,6 @@ from warprrf.rf.spectra.spectrum import check_shape, pixel_directions
 
 TRANSMITTANCE = ("product", "exp")
 TOP_K = 16  # Gaussians kept per pixel
-ALPHA_MIN = 1e-3  # a fainter layer changes what lies behind it by less than 0.005 dB
-MIN_WEIGHT = 1e-4  # smaller shares of a pixel's weight are given to the others: 0.0004 dB
 
 
 @dataclass(frozen=True)
@@ -76,20 +74,6 @@ class Transport:
             expected_range=self.expected_range[chosen],
         )
 
-    def at(self, receiver: ArrayLike) -> Transport:
-        """The part of one receiver (3,) [m].
-
-        Raises:
-            ValueError: if it is none of these receivers.
-        """
-        position = check_array("receiver", receiver, (3,))
-        found = np.flatnonzero((self.receivers == position).all(axis=1))
-        if len(found) == 0:
-            raise ValueError(
-                f"receiver: got {position.tolist()}, which is none of the {len(self.receivers)} here"
-            )
-        return self.subset(found[:1])
-
     @cached_property
     def seen(self) -> np.ndarray:
         """Gaussians that any receiver sees, ascending."""
@@ -111,11 +95,11 @@ def cutoffs(range_db: tuple[float, float], rule: str = "product") -> Blending:
     """How to blend for images that span ``range_db`` (lowest, highest) [dB].
 
     A wall may leak no more than the floor of the range, and blending stops when no more than that is left. An alpha
-    below :data:`ALPHA_MIN` is left out.
+    below 1e-3 is left out: it changes what lies behind it by less than 0.005 dB.
     """
     depth = 10 ** (-(float(range_db[1]) - float(range_db[0])) / 10)
     leak = min(max(depth, 1e-6), 1e-2)
-    return Blending(alpha_min=ALPHA_MIN, alpha_max=1.0 - leak, transmittance_min=leak, rule=rule)
+    return Blending(alpha_min=1e-3, alpha_max=1.0 - leak, transmittance_min=leak, rule=rule)
 
 
 def transport(
@@ -149,13 +133,8 @@ def transport(
         raise ValueError("receivers: got none, expected at least one position")
     rows, columns = check_shape(shape)
     blending = cutoffs(range_db, rule)
-    views = []
-    for i, position in enumerate(positions):
-        camera = Camera.spherical(columns, rows, position=position)
-        views.append(_kept(blend_weights(gaussians, camera, top_k=top_k, blending=blending, device=device)))
-        if progress is not None:
-            progress("transport", i + 1, len(positions))
-    counts, gaussian, weight, dominant, expected = zip(*views, strict=True)
+    seen = views(gaussians, positions, (rows, columns), top_k, blending, device=device, progress=progress)
+    counts, gaussian, weight, dominant, expected = zip(*map(_kept, seen), strict=True)
     return Transport(
         shape=(rows, columns),
         receivers=positions,
@@ -168,16 +147,33 @@ def transport(
     )
 
 
+def views(
+    gaussians: Gaussians,
+    receivers: np.ndarray,
+    shape: tuple[int, int],
+    top_k: int,
+    blending: Blending,
+    *,
+    device: DeviceLike,
+    progress: Progress | None,
+) -> Iterator[BlendWeights]:
+    """What each of ``receivers`` (R, 3) sees on a grid of ``shape``."""
+    for k, position in enumerate(receivers):
+        camera = Camera.spherical(shape[1], shape[0], position=position)
+        yield blend_weights(gaussians, camera, top_k=top_k, blending=blending, device=device)
+        if progress is not None:
+            progress("transport", k + 1, len(receivers))
+
+
 def _kept(seen: BlendWeights) -> tuple[np.ndarray, ...]:
     """Pairs a pixel (H * W,), Gaussians and weights (E,), dominant Gaussian and mean range (H, W) of one receiver."""
     weight, index = np.asarray(seen.weight, dtype=np.float64), np.asarray(seen.index)
     listed = (index >= 0) & (weight > 0)
     total = np.sum(weight, axis=-1, where=listed, initial=0.0)
-    keep = listed & (weight > MIN_WEIGHT * total[..., None])
+    min_weight = 1e-4  # smaller shares of a pixel's weight are given to the others: 0.0004 dB
+    keep = listed & (weight > min_weight * total[..., None])
     kept = np.sum(weight, axis=-1, where=keep, initial=0.0)
-    scale = np.divide(
-        total + np.asarray(seen.dropped, np.float64), kept, out=np.zeros_like(kept), where=kept > 0
-    )
+    scale = np.divide(total + np.asarray(seen.dropped, float), kept, out=np.zeros_like(kept), where=kept > 0)
     expected = np.sum(weight * np.asarray(seen.range), axis=-1, where=keep, initial=0.0)
     expected = np.divide(expected, kept, out=np.full_like(kept, np.nan), where=kept > 0)
     return (

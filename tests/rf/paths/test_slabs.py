@@ -1,0 +1,145 @@
+"""Ways through slabs: sheets and solids, however they are drawn, and what surfaces scatter before and behind them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from radio_scenes import box_mesh, joined
+
+from warprrf.geometry.mesh import Mesh
+from warprrf.rf.em.fresnel import slab_passage, slab_reflection, slab_transmission
+from warprrf.rf.em.materials import Material, itu_material
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.exact import ExactEngine, together
+from warprrf.rf.paths.trace import trace_paths
+from warprrf.rf.scene import Scene
+from warprrf.rf.tracing.model import Effects
+
+F, TX, RX = 28e9, np.array([-2.0, 0.0, 1.5]), np.array([2.0, 0.4, 1.2])
+FLOOR = np.array([[-6, -6, 0], [6, -6, 0], [6, 6, 0], [-6, 6, 0.0]]), np.array([[0, 1, 2], [0, 2, 3]])
+FLOORING = Material.custom("floor", relative_permittivity=3.0, conductivity=0.5, scattering=0.8)
+GLASS = itu_material("glass", thickness_m=0.01)
+
+
+def pane(x: float) -> tuple[np.ndarray, np.ndarray]:
+    corners = [[x, y, z] for y, z in ((-6, 0.001), (6, 0.001), (6, 6), (-6, 6))]
+    return np.array(corners), np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def room(wall: tuple[np.ndarray, np.ndarray], glass: Material = GLASS) -> Scene:
+    """A floor that scatters, and a wall across it."""
+    mesh, part = joined(FLOOR, wall)
+    return Scene(mesh, [FLOORING, glass], part)
+
+
+def paths(scene: Scene, ends: tuple[np.ndarray, np.ndarray] = (TX, RX), most: int = 3, **options):
+    return trace_paths(
+        scene,
+        transmitter=ends[0],
+        receivers=ends[1],
+        frequency_hz=F,
+        mirror_order=1,
+        transmissions=most,
+        **options,
+    )
+
+
+pytestmark = pytest.mark.filterwarnings("ignore:28 GHz")  # that diffraction is not asked for
+
+
+SHEET = room(pane(1.0))
+thick = replace(GLASS, thickness_m=0.3)  # said of a solid, it does not count
+WALLS = {
+    "solid": room(box_mesh([1.0, -6.0, 0.001], [1.01, 6.0, 6.0]), thick),
+    "turned": room((pane(1.0)[0], pane(1.0)[1][:, ::-1])),
+    "doubled": room((pane(1.0)[0], np.concatenate([pane(1.0)[1], pane(1.0)[1][:, ::-1]]))),
+    "cut up": room(
+        (np.vstack([pane(1.0)[0], [[1.0, 0, 3]]]), np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]))
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("how", WALLS)
+def test_one_wall_lets_the_same_through_however_it_is_drawn(how: str) -> None:
+    expected, found = paths(SHEET), paths(WALLS[how])
+    assert found.kind.tolist() == expected.kind.tolist() == ["slab", "slab"]
+    np.testing.assert_allclose(found.gain, expected.gain, rtol=1e-9)
+    np.testing.assert_allclose(found.tau, expected.tau, rtol=1e-12)
+
+
+def test_a_path_through_a_slab_is_what_the_slab_transmits_and_later() -> None:
+    """Amplitude, and the phase of the whole way: that of air but over the slab, and of the slab's transmission."""
+    found = paths(SHEET)
+    way = RX - TX
+    length, cosine = np.linalg.norm(way), way[0] / np.linalg.norm(way)
+    eta, wavelength_m = GLASS.permittivity(F), SPEED_OF_LIGHT / F
+    te, tm = slab_transmission(cosine, eta, 0.01, wavelength_m)
+    k = 2 * np.pi / wavelength_m
+    rest = np.exp(-1j * k * (length - 0.01 * cosine)) * wavelength_m / (4 * np.pi * length)
+    assert found.gain[0] == pytest.approx(
+        rest * te / abs(te) * np.sqrt((abs(te) ** 2 + abs(tm) ** 2) / 2), rel=1e-9
+    )
+    assert found.tau[0] - length / SPEED_OF_LIGHT == pytest.approx(
+        slab_passage(cosine, eta, 0.01, wavelength_m)[2] / SPEED_OF_LIGHT
+    )
+    assert found.tau[0] > length / SPEED_OF_LIGHT
+
+
+def test_ways_through_slabs_are_the_same_both_ways_and_as_many_as_asked_for() -> None:
+    mesh, part = joined(FLOOR, pane(0.5), pane(1.0))
+    scene = Scene(mesh, [FLOORING, GLASS], np.minimum(part, 1))
+    there, back = paths(scene), paths(scene, (RX, TX))
+    np.testing.assert_allclose(there.gain, back.gain, rtol=1e-9)
+    assert (there.interactions == 4).sum(axis=1).tolist() == [2, 2]
+    assert len(paths(scene, most=1).tau) == 0
+    metal = replace(itu_material("metal"), thickness_m=0.001)
+    assert len(paths(room(pane(1.0), metal)).tau) == 0
+
+
+def test_what_scatters_before_and_behind_a_slab_is_the_integral_over_the_floor() -> None:
+    """Lambertian scattering of a floor, lit through the pane or seen through it."""
+    effects = Effects(mirrors=0, scatterings=1, mirror_scatter=False, diffractions=0, residual=False)
+    engine = ExactEngine(SHEET, transmitter=TX, frequency_hz=F, shape=(90, 180), effects=effects)
+    found = {p.sequence: p.power.sum() for p in engine.sequences(RX)}
+    step = 0.02
+    x, y = np.meshgrid(*2 * [np.arange(-6 + step / 2, 6, step)], indexing="ij")
+    point = np.stack([x, y, 0 * x], axis=-1)
+    into, out = TX - point, RX - point
+    d1, d2 = (np.linalg.norm(way, axis=-1) for way in (into, out))
+    table = engine.mirrors.table
+    cos_i, cos_s = into[..., 2] / d1, out[..., 2] / d2
+    eta, thick = table.permittivity[0], table.thickness_m[0]
+    wavelength_m = engine.mirrors.wavelength_m
+    gamma = 0.5 * sum(np.abs(r) ** 2 for r in slab_reflection(cos_i, eta, thick, wavelength_m))
+    passed = []
+    for way, d in ((into, d1), (out, d2)):
+        waves = slab_transmission(np.abs(way[..., 0]) / d, table.permittivity[1], 0.01, wavelength_m)
+        passed.append(0.5 * sum(np.abs(t) ** 2 for t in waves))
+    power = (
+        (wavelength_m / (4 * np.pi)) ** 2 * 0.8**2 / np.pi * gamma * cos_i * cos_s / (d1 * d2) ** 2 * step**2
+    )
+    power = np.where(np.hypot(*np.moveaxis(point[..., :2], -1, 0)) < 9, power, 0.0)
+    assert found["TS"] == pytest.approx((power * passed[0])[x > 1.0].sum(), rel=0.01)
+    assert found["ST"] == pytest.approx((power * passed[1])[x < 1.0].sum(), rel=0.01)
+
+
+def test_spectra_do_not_jump_at_a_shadow_s_boundary() -> None:
+    """The receiver rises past the shadow of a half plane: the total is that of the fields, on both sides."""
+    corners = np.array([[0, -50, -50], [0, -50, 0], [0, 50, 0], [0, 50, -50.0]])
+    scene = Scene(
+        Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]])), [itu_material("metal")], np.zeros(2, np.int32)
+    )
+    start, total = np.array([-10.0, 0, -1]), []
+    for z in (0.9, 0.98, 0.999, 1.001, 1.02, 1.1, 1.3):
+        found = trace_paths(
+            scene,
+            transmitter=start,
+            receivers=[10, 0.1, z],
+            frequency_hz=10e9,
+            diffractions=1,
+            mirror_order=0,
+        )
+        whole = 0.5 * (np.abs(found.jones.sum(axis=0)) ** 2).sum()
+        assert together(found).power.sum() == pytest.approx(whole, rel=0.01)  # other edges are far
+        total.append(10 * np.log10(whole))
+    assert np.abs(np.diff(total)[2]) < 0.05 and np.all(np.diff(total) > 0)

@@ -1,0 +1,232 @@
+"""Edges of a mesh: straight lines about which more than half a turn is air, wedges and borders of sheets, in metres.
+
+An edge is told by what surfaces leave its line, whichever faces these are made of: around the middle of each piece of a
+line, all faces that touch it, sharing vertices with it or not, are sorted by direction, and a gap of more than half a turn
+is a wedge of that exterior angle. So windings, repeated faces, subdivisions and seams that don't match change nothing; there is no
+edge between coplanar faces, in a room's corner, or where a partition stands on a floor. Collinear pieces are one edge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from warprrf.geometry.mesh import Mesh, components, vectors_across
+
+LEAST_BEND_RAD = np.radians(1.0)
+"""Faces that are bent less make no edge."""
+_ALIKE_RAD = (
+    1e-3  # directions of pieces of one edge, and of an edge and the plane that it lies in, differ by no more
+)
+_SIDE = np.array([0.5377, 0.6391, 0.5498])  # edges point to its side: no plane across it is likely in a scene
+
+
+@dataclass(frozen=True)
+class Edges:
+    """E edges of a mesh.
+
+    Attributes:
+        start: One end [m], shape ``(E, 3)``.
+        along: Unit vector to the other, shape ``(E, 3)``.
+        length: Length [m], shape ``(E,)``.
+        inward: Unit vector across the edge into face 0, shape ``(E, 3)``. Turned about ``along`` it goes through the air
+            until, by ``n`` pi, it lies in face n.
+        n: Exterior angle over pi, shape ``(E,)``: 2 where a sheet ends.
+        face: Faces 0 and n of the mesh, one of those at the edge each, shape ``(E, 2)``.
+    """
+
+    start: np.ndarray
+    along: np.ndarray
+    length: np.ndarray
+    inward: np.ndarray
+    n: np.ndarray
+    face: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.length)
+
+    def take(self, rows: np.ndarray) -> Edges:
+        """The edges ``rows``."""
+        return Edges(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    @property
+    def outward(self) -> np.ndarray:
+        """Unit vectors into the air, halfway between the faces, shape ``(E, 3)``."""
+        half = 0.5 * np.pi * self.n[:, None]
+        return np.cos(half) * self.inward + np.sin(half) * np.cross(self.along, self.inward)
+
+
+def mesh_edges(
+    mesh: Mesh,
+    normal: np.ndarray | None = None,
+    groups: np.ndarray | None = None,
+    *,
+    least_bend_rad: float = LEAST_BEND_RAD,
+) -> Edges:
+    """The edges of ``mesh``.
+
+    Args:
+        mesh: Any triangle mesh.
+        normal: Normals that say how faces lie, shape ``(F, 3)``, in place of their own: of the planes that they are part of,
+            say. A face whose normal is zero is left out.
+        groups: Index of what each face is made of, shape ``(F,)``: edges end where it changes.
+        least_bend_rad: Faces that are bent less make no edge [rad].
+    """
+    normal = mesh.face_normals if normal is None else normal
+    reach = max(2.0 * mesh.rounding_m, 0.5e-6 * float(np.linalg.norm(np.ptp(mesh.bounds, axis=0))))
+    sides, place = _candidates(mesh, normal, least_bend_rad), _places(mesh)
+    ends = _split(mesh, sides, place, reach)
+    span = place[ends[:, 1]] - place[ends[:, 0]]
+    span *= np.where(span @ _SIDE < 0, -1.0, 1.0)[:, None]
+    length = np.linalg.norm(span, axis=1)
+    along = span / np.maximum(length, 1e-300)[:, None]
+    middle = 0.5 * (place[ends[:, 0]] + place[ends[:, 1]])
+    piece, inward, n, face = _gaps(mesh, normal, middle, along, length, reach)
+    keep = n > 1.0 + least_bend_rad / np.pi
+    piece, inward, n, face = piece[keep], inward[keep], n[keep], face[keep]
+    pieces = Edges(middle[piece] - 0.5 * span[piece], along[piece], length[piece], inward, n, face)
+    return _merged(pieces, ends[piece], face if groups is None else groups[face], groups is None, reach)
+
+
+def _places(mesh: Mesh) -> np.ndarray:
+    """Position of each index of ``mesh.welded_faces`` [m]."""
+    corner = mesh.welded_faces
+    place = np.zeros((int(corner.max()) + 1, 3))
+    place[corner.reshape(-1)[::-1]] = mesh.triangles.reshape(-1, 3)[::-1]
+    return place
+
+
+def _candidates(mesh: Mesh, normal: np.ndarray, least_bend_rad: float) -> np.ndarray:
+    """Sides of triangles that may be on an edge: all but those of two faces in one plane; pairs of places ``(S, 2)``."""
+    face = mesh.distinct_faces[(normal[mesh.distinct_faces] != 0).any(axis=1)]
+    corner = mesh.welded_faces[face]
+    sides = np.sort(corner[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    owner, third = np.repeat(face, 3), mesh.triangles[face][:, [2, 0, 1]].reshape(-1, 3)
+    start = mesh.triangles[face].reshape(-1, 3)
+    found, index, count = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(index.reshape(-1), kind="stable")
+    first = order[np.cumsum(count)[count == 2] - 2]
+    second = order[np.cumsum(count)[count == 2] - 1]
+    a, b = normal[owner[first]], normal[owner[second]]
+    cosine, sine = np.abs((a * b).sum(axis=1)), np.linalg.norm(np.cross(a, b), axis=1)
+    span = mesh.triangles[face][:, [1, 2, 0]].reshape(-1, 3)[first] - start[first]
+    across = np.cross(a, span)
+    apart = (across * (third[first] - start[first])).sum(axis=1) * (
+        across * (third[second] - start[first])
+    ).sum(axis=1)
+    flat = count == 2
+    flat[flat] = (np.arctan2(sine, cosine) <= least_bend_rad) & (apart < 0)
+    return found[~flat & (found[:, 0] != found[:, 1])]
+
+
+def _split(mesh: Mesh, sides: np.ndarray, place: np.ndarray, reach: float) -> np.ndarray:
+    """The pieces into which ends of other ``sides`` cut them, each once, as pairs of places ``(P, 2)``."""
+    corner, count = mesh.welded_faces, len(place)
+    point = np.unique(sides)
+    row, face = mesh.faces_at(place[point], reach)
+    row, face = np.repeat(point[row], 3), np.repeat(face, 3)
+    beside = np.sort(corner[face[::3]][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    key = sides[:, 0] * count + sides[:, 1]
+    which = np.searchsorted(key, beside[:, 0] * count + beside[:, 1]).clip(max=len(key) - 1)
+    own = (sides[which] == beside).all(axis=1)
+    row, which = row[own], which[own]
+    start, span = place[sides[:, 0]], place[sides[:, 1]] - place[sides[:, 0]]
+    length = np.linalg.norm(span, axis=1)
+    along = span / np.maximum(length, 1e-300)[:, None]
+    way = place[row] - start[which]
+    at = (way * along[which]).sum(axis=1)
+    on = (at > reach) & (at < length[which] - reach)
+    on &= np.linalg.norm(way - at[:, None] * along[which], axis=1) <= reach
+    each = np.arange(len(sides))
+    side = np.concatenate([each, each, which[on]])
+    at = np.concatenate([np.zeros(len(sides)), length, at[on]])
+    name = np.concatenate([sides[:, 0], sides[:, 1], row[on]])
+    order = np.lexsort((at, side))
+    side, name = side[order], name[order]
+    pieces = np.column_stack([name[:-1], name[1:]])[side[:-1] == side[1:]]
+    pieces = np.unique(np.sort(pieces, axis=1), axis=0)
+    return pieces[pieces[:, 0] != pieces[:, 1]]
+
+
+def _gaps(
+    mesh: Mesh, normal: np.ndarray, middle: np.ndarray, along: np.ndarray, length: np.ndarray, reach: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The widest gap between surfaces around each piece: piece, direction that it begins at, width over pi, and faces."""
+    piece, face = mesh.faces_at(middle, reach)
+    lies = np.abs((normal[face] * along[piece]).sum(axis=1)) <= _ALIKE_RAD + 4.0 * reach / length[piece]
+    lies &= (normal[face] != 0).any(axis=1)
+    piece, face = np.repeat(piece[lies], 2), np.repeat(face[lies], 2)
+    toward = np.cross(normal[face], along[piece])
+    toward *= (np.arange(len(toward)) % 2 * 2.0 - 1.0)[:, None]
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    goes_on = _depth(mesh, face, middle[piece], toward) > 4.0 * reach
+    piece, face, toward = piece[goes_on], face[goes_on], toward[goes_on]
+    u, v = vectors_across(along)
+    angle = np.arctan2((toward * v[piece]).sum(axis=1), (toward * u[piece]).sum(axis=1))
+    order = np.lexsort((face, angle, piece))
+    piece, face, toward, angle = piece[order], face[order], toward[order], angle[order]
+    first = np.flatnonzero(np.diff(piece, prepend=-1))
+    last = np.append(first[1:], len(piece)) - 1
+    after = np.arange(1, len(piece) + 1)
+    after[last] = first
+    width = angle[after] - angle if len(piece) else np.zeros(0)
+    width[last] += 2.0 * np.pi
+    order = np.lexsort((width, piece))  # the widest of a piece comes last
+    begin = order[last]
+    return (
+        piece[begin],
+        toward[begin],
+        width[begin] / np.pi,
+        np.column_stack([face[begin], face[after[begin]]]),
+    )
+
+
+def _depth(mesh: Mesh, face: np.ndarray, point: np.ndarray, toward: np.ndarray) -> np.ndarray:
+    """How far each face goes on from ``point``, on it, in the direction ``toward`` [m]."""
+    corner, normal = mesh.triangles[face], mesh.face_normals[face]
+    depth = np.full(len(face), np.inf)
+    for k in range(3):
+        side = np.cross(normal, corner[:, (k + 1) % 3] - corner[:, k])
+        side /= np.linalg.norm(side, axis=1, keepdims=True)
+        left = np.maximum((side * (point - corner[:, k])).sum(axis=1), 0.0)
+        pace = -(side * toward).sum(axis=1)
+        depth = np.where(pace > 1e-9, np.minimum(depth, left / np.maximum(pace, 1e-9)), depth)
+    return depth
+
+
+def _merged(pieces: Edges, ends: np.ndarray, group: np.ndarray, any_group: bool, reach: float) -> Edges:
+    """Collinear ``pieces`` that share an end, between alike faces, as one edge each."""
+    count = len(pieces)
+    owner, name = np.tile(np.arange(count), 2), ends.T.reshape(-1)
+    order = np.argsort(name, kind="stable")
+    owner, name = owner[order], name[order]
+    pairs = [np.zeros((0, 2), int)]
+    step = 1
+    while step < len(name) and (same := name[step:] == name[:-step]).any():
+        pairs.append(np.column_stack([owner[:-step][same], owner[step:][same]]))
+        step += 1
+    a, b = np.concatenate(pairs).T
+    limit = _ALIKE_RAD + 2.0 * reach / np.minimum(pieces.length[a], pieces.length[b])
+    alike = np.abs(pieces.n[a] - pieces.n[b]) <= limit
+    for vector in (pieces.along, pieces.inward):
+        alike &= np.linalg.norm(vector[a] - vector[b], axis=1) <= limit
+    if not any_group:
+        alike &= (group[a] == group[b]).all(axis=1)
+    label = components(count, np.column_stack([a, b])[alike]) if count else np.zeros(0, int)
+    longest = np.lexsort((-pieces.length, label))
+    longest = longest[np.flatnonzero(np.diff(label[longest], prepend=-1))]
+    base, along = pieces.start[longest][label], pieces.along[longest][label]
+    low = ((pieces.start - base) * along).sum(axis=1)
+    high = low + (pieces.length[:, None] * pieces.along * along).sum(axis=1)
+    first, last = (np.lexsort((x, label)) for x in (low, -high))
+    begins = np.flatnonzero(np.diff(label[first], prepend=-1))
+    first, last = first[begins], last[begins]
+    start = pieces.start[first]
+    span = pieces.start[last] + pieces.length[last, None] * pieces.along[last] - start
+    length = np.linalg.norm(span, axis=1)
+    along = span / np.maximum(length, 1e-300)[:, None]
+    inward = pieces.inward[longest]
+    inward = inward - (inward * along).sum(axis=1, keepdims=True) * along
+    inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-300)
+    return Edges(start, along, length, inward, pieces.n[longest], pieces.face[longest])

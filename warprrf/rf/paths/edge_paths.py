@@ -1,0 +1,389 @@
+"""Paths over one edge, and over one edge and one mirror on either side, of many receivers: exact points, in float64.
+
+The point on an edge follows from equal angles (Keller's cone) in closed form; mirrors are images of the transmitter before
+the edge, of the receiver behind it. Of all pairs of an edge and a mirror, those whose ways miss the mirror's box are sorted
+out by cones against balls around edges (:mod:`.images`), those whose power cannot reach a stated level by the size of the
+coefficient's terms, and the rest is tested as mirror paths are. Lengths in metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from warprrf.checks import check_count
+from warprrf.device import Progress
+from warprrf.geometry.edges import Edges, mesh_edges
+from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
+from warprrf.geometry.planar_patches import PlanarPatches
+from warprrf.rf.channel.path_arrays import EDGE, MIRROR
+from warprrf.rf.em.diffraction import EdgeRays, Pair, boundary_fields, diffraction_matrices
+from warprrf.rf.em.fresnel import SurfaceTable, slab_reflection
+from warprrf.rf.paths.images import EdgeLeaves, MirrorImages
+from warprrf.rf.paths.mirror_paths import MirrorPaths, distinct, joined, unobstructed
+from warprrf.rf.spectra.spectrum import transverse_basis
+
+LEAST_DB = -80.0
+"""Paths that are weaker than this, over an unobstructed straight path between the ends, are left out [dB]."""
+
+Through = Callable[[np.ndarray, np.ndarray], Pair]
+"""Transmission (TE, TM) of sheets: of materials ``(L,)`` (indices) at cosines of incidence ``(L,)``."""
+
+
+@dataclass(frozen=True)
+class EdgePaths:
+    """L paths over one edge each, with a mirror before it, behind it, or none.
+
+    Attributes:
+        receiver: Index of the receiver, shape ``(L,)``.
+        edge: Index of the edge, shape ``(L,)``.
+        patch: Patch of the mirror before and of that behind the edge, -1 for none, shape ``(L, 2)``.
+        code: What happens at each point, from the transmitter on: 1 mirror, 8 edge, 0 past the last, shape ``(L, 2)``.
+        point: Where [m], shape ``(L, 2, 3)``; NaN past the last.
+        length_m: Length, shape ``(L,)``.
+        detour_m: What it is longer by than the straight line between the ends, shape ``(L,)``.
+        departure: Unit direction from the transmitter, shape ``(L, 3)``.
+        arrival: Unit direction from the receiver to the last point, shape ``(L, 3)``.
+        matrix: From the field along the zenith and azimuth unit vectors of departure to that along those of arrival, complex,
+            shape ``(L, 2, 2)``: times the wavelength over 4 pi length, and the phase of the length, it is the Jones matrix.
+            Conductors without polarisation (a bare mesh) have one number, the "hard" coefficient, on its diagonal.
+        amplitude: Its modulus squared is the path gain, half the squared Frobenius norm, spreading included; its phase that of
+            the field along the edge, of TE at a mirror, of the one number where there is one. Complex, shape ``(L,)``.
+        wavelength_m: Wavelength [m].
+    """
+
+    receiver: np.ndarray
+    edge: np.ndarray
+    patch: np.ndarray
+    code: np.ndarray
+    point: np.ndarray
+    length_m: np.ndarray
+    detour_m: np.ndarray
+    departure: np.ndarray
+    arrival: np.ndarray
+    matrix: np.ndarray
+    amplitude: np.ndarray
+    wavelength_m: float
+
+    @property
+    def power(self) -> np.ndarray:
+        """Path gain [linear], shape ``(L,)``."""
+        return np.abs(self.amplitude) ** 2
+
+    def __len__(self) -> int:
+        return len(self.receiver)
+
+    def beside(self, found: MirrorPaths) -> MirrorPaths:
+        """``found`` with these paths of the same receivers, whose share is what the edge makes of the field.
+
+        Near a shadow's boundary the share of a Fresnel zone that is free, on which those rest, already tells how the field
+        falls (Kirchhoff's approximation). There, up to a detour of a wavelength, paths over an edge only bring what is
+        left of theirs.
+        """
+        count = found.patch.shape[1]
+        friis = self.wavelength_m / (4.0 * np.pi * self.length_m)
+        share = np.sqrt(self.power) / friis
+        mirror = self.patch.max(axis=1, initial=-1)
+        own = np.where(found.order == 1, found.patch.max(axis=1, initial=-1), -1)
+        parents = (found.order <= 1) & (found.slabs == 0)
+        free = dict(
+            zip(
+                zip(found.receiver[parents].tolist(), own[parents].tolist(), strict=True),
+                found.share[parents],
+                strict=True,
+            )
+        )
+        left = np.array(
+            [1.0 - free.get(key, 0.0) for key in zip(self.receiver.tolist(), mirror.tolist(), strict=True)]
+        )
+        near = self.detour_m < self.wavelength_m
+        share = share * np.where(near & (left < 1.0), left, 1.0)
+
+        def filled(value: float, dtype: Any, *shape: int) -> np.ndarray:
+            return np.full((len(self), count, *shape), value, dtype)
+
+        point = filled(np.nan, float, 3)
+        point[:, : min(count, 2)] = self.point[:, :count]
+        edges = MirrorPaths(
+            self.receiver, filled(-1, np.int32), filled(-1, np.int32), point, share, self.length_m, self.arrival,
+            filled(np.nan, float, 3), filled(0.0, float), filled(0.0, float), filled(np.nan, float), np.ones(len(self), bool),
+        )  # fmt: skip
+        return joined([found, edges.subset(np.flatnonzero(share > 0))])
+
+    def take(self, rows: np.ndarray) -> EdgePaths:
+        """The paths ``rows``."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in _ARRAYS})
+
+
+_ARRAYS = tuple(f.name for f in fields(EdgePaths) if f.name != "wavelength_m")
+
+
+def patch_edges(patches: PlanarPatches, **options: Any) -> Edges:
+    """Edges between planar patches: what is one patch has none, however its faces are bent by errors."""
+    own = patches.face_patch >= 0
+    normal = np.where(own[:, None], patches.normal[np.maximum(patches.face_patch, 0)], 0.0)
+    turned = (normal * patches.mesh.face_normals).sum(axis=1) < 0
+    group = patches.group[np.maximum(patches.face_patch, 0)]
+    return mesh_edges(patches.mesh, np.where(turned[:, None], -normal, normal), group, **options)
+
+
+class EdgeFinder:
+    """Paths of one transmitter over the edges of a mesh.
+
+    Args:
+        images: The transmitter and what mirrors.
+        wavelength_m: Wavelength [m].
+        table: Radio properties of the patches' groups; None for a bare mesh: fields without polarisation, reflected
+            without a sign change.
+        edges: Those of the patches by default.
+        through: What sheets let through, if anything.
+        least_db: See :data:`LEAST_DB`.
+    """
+
+    def __init__(
+        self,
+        images: MirrorImages,
+        wavelength_m: float,
+        table: SurfaceTable | None = None,
+        *,
+        edges: Edges | None = None,
+        through: Through | None = None,
+        least_db: float = LEAST_DB,
+    ) -> None:
+        self.images, self.wavelength_m, self.table = images, wavelength_m, table
+        self.edges = patch_edges(images.patches) if edges is None else edges
+        self.through, self.least_db = through, least_db
+        self._leaves = EdgeLeaves(self.edges, images.device)
+
+    def find(self, receivers: np.ndarray, mirrors: int = 1, progress: Progress | None = None) -> EdgePaths:
+        """All paths to ``receivers`` (R, 3) over one edge and at most ``mirrors`` mirrors, by receiver, then by length.
+
+        Args:
+            receivers: Positions [m].
+            mirrors: Most mirrors on a path, 0 or 1.
+            progress: Called with the stage ``"edges"``.
+        """
+        check_count("mirrors", mirrors, 0, 1)
+        points = np.asarray(receivers, float).reshape(-1, 3)
+        parts = [self._described(_Ways.none(self.images.transmitter), np.zeros(0, int))]
+        for k, receiver in enumerate(points):
+            ways = self._ways(receiver, mirrors)
+            part = self._described(ways, np.full(len(ways.edge), k))
+            parts.append(part.take(np.argsort(part.length_m, kind="stable")))
+            if progress is not None:
+                progress("edges", k + 1, len(points))
+        every = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _ARRAYS}
+        return EdgePaths(**every, wavelength_m=self.wavelength_m)
+
+    def _ways(self, receiver: np.ndarray, mirrors: int) -> _Ways:
+        """What reaches a receiver, unobstructed."""
+        images, patches, parts = self.images, self.images.patches, []
+        for side in range(1 + 2 * mirrors):  # no mirror; one before the edge; one behind it
+            seen, end = (images, receiver) if side < 2 else (images.seen_from(receiver), images.transmitter)
+            edge, chain = seen.over_edges(self._leaves, end, min(side, 1))
+            patch = np.full((len(edge), 2), -1)
+            if side:
+                patch[:, side - 1] = chain[:, 0]
+            parts.append((edge, patch))
+        edge, patch = (np.concatenate(column) for column in zip(*parts, strict=True))
+        ways = _Ways.over(self.edges, edge, patch, patches, images.transmitter, receiver)
+        direct = float(np.linalg.norm(receiver - images.transmitter))
+        for sieve in (self._in_reach, partial(self._strong, direct), self._on_mirrors, self._unobstructed):
+            ways = ways.take(np.flatnonzero(sieve(ways)))
+        return ways.take(ways.distinct(3.0 * patches.tolerance_m))
+
+    def _in_reach(self, ways: _Ways) -> np.ndarray:
+        """Whether the point lies on the edge, both legs in the air and what is mirrored not in the mirror's own plane."""
+        n = self.edges.n[ways.edge] * np.pi
+        found = (ways.at > 0) & (ways.at < self.edges.length[ways.edge])
+        found &= (ways.angle <= n[:, None]).all(axis=1)
+        for j in range(2):
+            plane = self.images.patches.normal[ways.patch[:, j]], self.images.patches.offset[ways.patch[:, j]]
+            height = np.abs((ways.point * plane[0]).sum(axis=1) - plane[1])
+            found &= (ways.patch[:, j] < 0) | (height > 2.0 * self.images.patches.tolerance_m)
+        return found
+
+    def _strong(self, direct: float, ways: _Ways) -> np.ndarray:
+        """Whether paths reach the level even if every face and mirror reflects all."""
+        most = np.abs(boundary_fields(self._rays(ways))).sum(axis=0) * direct / ways.leg.sum(axis=1)
+        return np.asarray(20.0 * np.log10(np.maximum(most, 1e-300)) > self.least_db)
+
+    def _on_mirrors(self, ways: _Ways) -> np.ndarray:
+        found = np.ones(len(ways.edge), bool)
+        for j in range(2):
+            own = np.flatnonzero(ways.patch[:, j] >= 0)
+            found[own] = self.images.patches.contains(ways.patch[own, j], ways.mirror[own, j])
+        return found
+
+    def _unobstructed(self, ways: _Ways) -> np.ndarray:
+        """Whether both legs are free; rays end off the edge, halfway between its faces, so that these are not met."""
+        patches = self.images.patches
+        off = self.edges.outward[ways.edge] * (2.0 * patches.tolerance_m + ENDPOINT_CLEARANCE)
+        found = np.ones(len(ways.edge), bool)
+        for j in range(2):
+            for mirrored in (False, True):
+                own = np.flatnonzero(found & ((ways.patch[:, j] >= 0) == mirrored))
+                edge, end = (ways.point + off)[own], ways.end[own, j]
+                patch, mirror = (a[own, j : j + int(mirrored)] for a in (ways.patch, ways.mirror))
+                if len(own):
+                    found[own] = unobstructed(patches, end[:, None], edge, patch, mirror, self.images.device)
+        return found
+
+    def _rays(self, ways: _Ways) -> EdgeRays:
+        e = ways.edge
+        cosine = (ways.direction[:, 0] * self.edges.along[e]).sum(axis=1)
+        angle, leg = ways.angle.T, ways.leg.T
+        return EdgeRays(self.edges.n[e], angle[0], angle[1], cosine, leg[0], leg[1], self.wavelength_m)
+
+    def _reflection(self, patch: np.ndarray, cosine: np.ndarray) -> Pair:
+        """TE and TM of mirrors and faces of the patches ``(L,)``."""
+        if self.table is None:
+            return -np.ones(len(patch)), np.ones(len(patch))
+        group = self.images.patches.group[patch]
+        te, tm = slab_reflection(
+            cosine, self.table.permittivity[group], self.table.thickness_m[group], self.wavelength_m
+        )
+        smooth = np.sqrt(1.0 - self.table.scattering[group] ** 2)
+        return smooth * te, smooth * tm
+
+    def _described(self, ways: _Ways, receiver: np.ndarray) -> EdgePaths:
+        edges, patches, rays = self.edges.take(ways.edge), self.images.patches, self._rays(ways)
+        faces, cosines = patches.face_patch[edges.face], rays.incidence_cosines()
+        reflected = [self._reflection(faces[:, j], cosines[2 + j]) for j in range(2)]
+        through = None
+        if self.through is not None:
+            ends = edges.n > 1.99  # of sheets
+            passed = [self.through(patches.group[faces[:, j]], cosines[j]) for j in range(2)]
+            through = [(np.where(ends, te, 0.0), np.where(ends, tm, 0.0)) for te, tm in passed]
+        bent = diffraction_matrices(rays, reflected, through)
+        before, behind = (_edge_basis(edges.along, ways.direction[:, j]) for j in range(2))
+        field, sign = np.swapaxes(behind, 1, 2) @ bent @ before, bent[:, 0, 0].copy()
+        outer = ways.direction.copy()
+        for j in range(2):
+            own = np.flatnonzero(ways.patch[:, j] >= 0)
+            normal, inner = patches.normal[ways.patch[own, j]], ways.direction[own, j]
+            cosine = (inner * normal).sum(axis=1)
+            outer[own, j] = inner - 2.0 * cosine[:, None] * normal
+            te, tm = self._reflection(ways.patch[own, j], np.abs(cosine))
+            sign[own] *= te
+            if j == 0:
+                field[own] = field[own] @ _mirror(normal, outer[own, 0], inner, te, tm)
+            else:
+                field[own] = _mirror(normal, inner, outer[own, 1], te, tm) @ field[own]
+        departure, arrival, length = outer[:, 0], -outer[:, 1], ways.leg.sum(axis=1)
+        matrix = transverse_basis(arrival) @ field @ np.swapaxes(transverse_basis(departure), 1, 2)
+        if self.table is None:
+            sign, matrix = bent[:, 1, 1], bent[:, 1, 1, None, None] * np.eye(2)
+        size = (
+            self.wavelength_m / (4.0 * np.pi * length) * np.sqrt(0.5 * (np.abs(matrix) ** 2).sum(axis=(1, 2)))
+        )
+        code, point = ways.stops()
+        return EdgePaths(
+            receiver, ways.edge, ways.patch, code, point, length,
+            length - np.linalg.norm(ways.end[:, 1] - ways.end[:, 0], axis=1), departure, arrival, matrix,
+            size * sign / np.maximum(np.abs(sign), 1e-300), self.wavelength_m,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Ways:
+    """L ways over an edge each: ``patch`` (L, 2) before and behind, -1 for none, and the ``mirror`` points (L, 2, 3); the
+    ``point`` on the edge (L, 3) and ``at`` how far along (L,); and of both legs, unfolded at mirrors, lengths ``leg`` (L, 2),
+    ``angle`` about the edge (L, 2) and ``direction`` of propagation (L, 2, 3); the ``end`` points (L, 2, 3)."""
+
+    edge: np.ndarray
+    patch: np.ndarray
+    mirror: np.ndarray
+    point: np.ndarray
+    at: np.ndarray
+    leg: np.ndarray
+    angle: np.ndarray
+    direction: np.ndarray
+    end: np.ndarray
+
+    @classmethod
+    def over(
+        cls,
+        edges: Edges,
+        edge: np.ndarray,
+        patch: np.ndarray,
+        patches: PlanarPatches,
+        transmitter: np.ndarray,
+        receiver: np.ndarray,
+    ) -> _Ways:
+        """Between two points over the edges ``edge`` (L,), by images of either in ``patch`` (L, 2)."""
+        e = edges.take(edge)
+        end = np.broadcast_to(np.stack([transmitter, receiver]), (len(edge), 2, 3))
+        normal, offset = patches.normal[patch], patches.offset[patch]
+        mirrored = (patch >= 0)[..., None]
+        height = ((end * normal).sum(axis=2) - offset)[..., None]
+        image = np.where(mirrored, end - 2.0 * height * normal, end)
+        way = image - e.start[:, None]
+        along = (way * e.along[:, None]).sum(axis=2)
+        across = way - along[..., None] * e.along[:, None]
+        reach = np.linalg.norm(across, axis=2)
+        at = (along[:, 0] * reach[:, 1] + along[:, 1] * reach[:, 0]) / np.maximum(reach.sum(axis=1), 1e-300)
+        point = e.start + at[:, None] * e.along
+        leg = np.hypot(reach, along - at[:, None])
+        third = np.cross(e.along, e.inward)
+        angle = np.arctan2((across * third[:, None]).sum(axis=2), (across * e.inward[:, None]).sum(axis=2))
+        angle = np.where(angle < -1e-12, angle + 2.0 * np.pi, np.maximum(angle, 0.0))
+        direction = np.array([-1.0, 1.0])[:, None] * (image - point[:, None])
+        direction /= np.maximum(leg, 1e-300)[..., None]
+        depth = ((point[:, None] * normal).sum(axis=2) - offset)[..., None]
+        between = depth + height  # the image is as far behind the plane as the end is before it
+        share = np.divide(depth, between, out=np.zeros_like(depth), where=between != 0)
+        mirror = np.where(mirrored, point[:, None] + share * (image - point[:, None]), np.nan)
+        return cls(edge, patch, mirror, point, at, leg, angle, direction, end)
+
+    @classmethod
+    def none(cls, transmitter: np.ndarray) -> _Ways:
+        """No ways."""
+        shapes = {"edge": (), "patch": (2,), "at": (), "leg": (2,), "angle": (2,), "point": (3,)}
+        found = {f.name: np.zeros((0, *shapes.get(f.name, (2, 3)))) for f in fields(cls)}
+        return cls(**found | {name: found[name].astype(int) for name in ("edge", "patch")})
+
+    def take(self, rows: np.ndarray) -> _Ways:
+        """The ways ``rows``."""
+        return _Ways(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+    def distinct(self, distance_m: float) -> np.ndarray:
+        """Indices of ways that no earlier one repeats: over the same edge, by mirror points within ``distance_m``."""
+        side = (self.patch >= 0) @ np.array([1, 2])
+        stop = np.where(side > 1, 1, 0)
+        point = np.nan_to_num(self.mirror[np.arange(len(side)), stop])
+        return distinct(3 * self.edge + side, point[:, None], distance_m)
+
+    def stops(self) -> tuple[np.ndarray, np.ndarray]:
+        """Codes ``(L, 2)`` and points ``(L, 2, 3)`` of the interactions, from the transmitter on."""
+        all_codes = np.where(self.patch >= 0, MIRROR, 0)
+        code = np.column_stack([all_codes[:, 0], np.full(len(self.edge), EDGE), all_codes[:, 1]])
+        point = np.stack([self.mirror[:, 0], self.point, self.mirror[:, 1]], axis=1)
+        order = np.argsort(code == 0, axis=1, kind="stable")[:, :2]
+        code = np.take_along_axis(code, order, axis=1).astype(np.int8)
+        return code, np.take_along_axis(point, order[..., None], axis=1)
+
+
+def _edge_basis(along: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Rows (b, p) of fields fixed to the edge, shape ``(L, 2, 3)``; see :mod:`warprrf.rf.em.diffraction`."""
+    p = np.cross(along, direction)
+    p /= np.maximum(np.linalg.norm(p, axis=1, keepdims=True), 1e-300)
+    return np.stack([np.cross(direction, p), p], axis=1)
+
+
+def _mirror(
+    normal: np.ndarray, before: np.ndarray, behind: np.ndarray, te: np.ndarray, tm: np.ndarray
+) -> np.ndarray:
+    """What a mirror makes of field vectors, shape ``(L, 3, 3)``."""
+    across = np.cross(before, normal)
+    sine = np.linalg.norm(across, axis=1, keepdims=True)
+    across = np.where(sine > 1e-6, across / np.maximum(sine, 1e-6), vectors_across(before)[0])
+    inwards, outwards = np.cross(across, before), np.cross(across, behind)
+    return np.asarray(
+        te[:, None, None] * across[:, :, None] * across[:, None, :]
+        + tm[:, None, None] * outwards[:, :, None] * inwards[:, None, :]
+    )

@@ -1,0 +1,182 @@
+"""What stands on a straight way and lets a wave through: slabs, found by rays.
+
+Two faces of one closed part, met one after the other and turned against each other, at most :data:`THICKEST_M` apart, are
+one slab of that thickness. Any other face is a sheet: a slab as thick as its material is said to be. So a wall drawn as a
+sheet and the same wall drawn as a closed solid let the same through. The way is not bent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from warprrf.cache import cached_property
+from warprrf.device import DeviceLike
+from warprrf.geometry.mesh import Mesh
+from warprrf.rf.em.fresnel import slab_transmission
+
+THICKEST_M = 1.0
+"""Thicker solids are taken to be hollow, a cabinet's or a room's: two sheets."""
+THIN_M = 0.01  # that a solid is perhaps only as thick as
+LEAST_POWER = 1e-6  # of what lets less through nothing is sought
+
+
+@dataclass(frozen=True)
+class Slabs:
+    """Slabs that N straight ways pass, in the order they are met, up to K each.
+
+    Attributes:
+        face: face by which each is entered, -1 past the last, shape ``(N, K)`` int32.
+        cosine: of incidence, 0 past the last, shape ``(N, K)``.
+        thickness_m: of a solid between two faces, NaN of a sheet and past the last [m], shape ``(N, K)``.
+        range_m: where each is met, from the start [m], infinite past the last, shape ``(N, K)``.
+    """
+
+    face: np.ndarray
+    cosine: np.ndarray
+    thickness_m: np.ndarray
+    range_m: np.ndarray
+
+    @classmethod
+    def none(cls, count: int, most: int) -> Slabs:
+        """No slab on any of ``count`` ways."""
+        size = count, most
+        return cls(np.full(size, -1, np.int32), np.zeros(size), np.full(size, np.nan), np.full(size, np.inf))
+
+    @property
+    def count(self) -> np.ndarray:
+        """Slabs on each way, shape ``(N,)``."""
+        return (self.face >= 0).sum(axis=1)
+
+    @property
+    def reversed(self) -> Slabs:
+        """The same in the other order; what is past the last comes first."""
+        return Slabs(*(getattr(self, f.name)[:, ::-1] for f in fields(self)))
+
+    @property
+    def trimmed(self) -> Slabs:
+        """The same without columns that no way uses; one at least."""
+        used = np.asarray((self.face >= 0).any(axis=0))
+        used[:1] |= ~used.any()
+        return Slabs(*(getattr(self, f.name)[:, used] for f in fields(self)))
+
+    def take(self, rows: np.ndarray) -> Slabs:
+        """Those of the ways ``rows``."""
+        return Slabs(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+
+class Walls:
+    """Faces of a mesh that may be passed.
+
+    Args:
+        mesh: the mesh.
+        passes: which faces let something through, shape ``(F,)`` bool.
+        most: most slabs on one way.
+        clearance_m: ways end so far before what lies at their end, and go on so far behind each face.
+        device: where rays are cast.
+    """
+
+    def __init__(
+        self, mesh: Mesh, passes: np.ndarray, most: int, clearance_m: float, device: DeviceLike = None
+    ) -> None:
+        self.mesh, self.passes, self.most, self.clearance_m, self.device = (
+            mesh,
+            passes,
+            most,
+            clearance_m,
+            device,
+        )
+
+    @classmethod
+    def of_slabs(
+        cls,
+        mesh: Mesh,
+        permittivity: np.ndarray,
+        thickness_m: np.ndarray,
+        wavelength_m: float,
+        most: int,
+        clearance_m: float,
+        device: DeviceLike = None,
+    ) -> Walls:
+        """Those of which slabs of ``permittivity`` (F,) and ``thickness_m`` (F,), if they are sheets, let more than
+        :data:`LEAST_POWER` through."""
+        thickness = np.where(mesh.closed_part_of >= 0, np.minimum(thickness_m, THIN_M), thickness_m)
+        te = slab_transmission(1.0, permittivity, thickness, wavelength_m)[0]
+        return cls(mesh, np.abs(te) ** 2 > LEAST_POWER, most, clearance_m, device)
+
+    @cached_property
+    def _part(self) -> np.ndarray:
+        """Closed part of each face, that of the face at its place for a repeat, -1 for none."""
+        return self.mesh.closed_part_of[self.mesh.first_at_place]
+
+    def between(self, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, Slabs]:
+        """Which of the ways from ``start`` to ``end``, (N, 3) or (3,), arrive, and the slabs that those pass."""
+        start, end = (np.ascontiguousarray(a) for a in np.broadcast_arrays(start, end))
+        way = end - start
+        length = np.linalg.norm(way, axis=-1)
+        arrived = [(np.zeros(0, int), Slabs.none(0, self.most))]
+        toward = way / np.maximum(length, 1e-12)[..., None]
+        for row, face, _, slabs in self._stops(start, toward, length - self.clearance_m):
+            there = face < 0
+            arrived.append((row[there], slabs.take(there)))
+        return _joined(arrived)
+
+    def behind(
+        self, start: np.ndarray, direction: np.ndarray, face: np.ndarray, range_m: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Slabs]:
+        """What rays (N, 3) meet behind the first face that they hit: rows of rays, more than once where they go on, the
+        faces met, their ranges [m], and the slabs passed before."""
+        found = [(np.zeros(0, int), np.zeros(0, int), np.zeros(0), Slabs.none(0, self.most))]
+        endless = np.full(len(start), np.inf)
+        for k, (row, met, t, slabs) in enumerate(self._stops(start, direction, endless, (face, range_m))):
+            own = (met >= 0) & (k > 0)
+            found.append((row[own], met[own], t[own], slabs.take(own)))
+        row, slabs = _joined([(a, d) for a, _, _, d in found])
+        face, range_m = (np.concatenate([part[j] for part in found]) for j in (1, 2))  # type: ignore[misc]
+        return row, face, range_m, slabs
+
+    def _stops(
+        self,
+        start: np.ndarray,
+        direction: np.ndarray,
+        limit: np.ndarray,
+        known: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, Slabs]]:
+        """Where rays stop, one face after another: rows, faces, -1 where nothing is met before ``limit``, ranges, and the
+        slabs passed so far. ``known`` are faces and ranges of what is met first."""
+        row, slabs = np.arange(len(start)), Slabs.none(len(start), self.most)
+        gone, last = np.zeros(len(start)), np.full(len(start), -1)
+        normal = self.mesh.face_normals
+        while len(row):
+            if known is None:
+                hit = self.mesh.cast(
+                    start[row] + gone[row, None] * direction[row], direction[row], device=self.device
+                )
+                face, t = np.asarray(hit.face), gone[row] + hit.t
+            else:
+                (face, t), known = known, None
+            met = (face >= 0) & (t < limit[row])
+            face = np.where(met, face, -1)
+            cosine = np.abs((normal[face] * direction[row]).sum(axis=1))
+            before, place = last[row], slabs.count[row] - 1
+            with np.errstate(invalid="ignore"):
+                apart = (t - slabs.range_m[row, place]) * slabs.cosine[row, place]
+            out = met & (before >= 0) & (self._part[face] >= 0) & (self._part[face] == self._part[before])
+            out &= (apart <= THICKEST_M) & ((normal[face] * normal[before]).sum(axis=1) < 0.0)
+            slabs.thickness_m[row[out], place[out]] = apart[out]
+            yield row[~out], face[~out], t[~out], slabs.take(row[~out])
+            on = met & ~out & self.passes[face] & (place + 1 < self.most)
+            r, k = row[on], place[on] + 1
+            slabs.face[r, k], slabs.cosine[r, k], slabs.range_m[r, k] = face[on], cosine[on], t[on]
+            last[row] = np.where(on, face, -1)
+            gone[row] = np.where(met, t, 0.0) + self.clearance_m
+            row = row[on | out]
+
+
+def _joined(parts: list[tuple[np.ndarray, Slabs]]) -> tuple[np.ndarray, Slabs]:
+    rows, slabs = zip(*parts, strict=True)
+    return np.concatenate(rows), Slabs(
+        *(np.concatenate([getattr(s, f.name) for s in slabs]) for f in fields(Slabs))
+    )
