@@ -51,7 +51,6 @@ FURNITURE: tuple[tuple[str, Corner, Corner], ...] = (
 )  # fmt: skip
 """Desks and cabinets: two corners of each [m]."""
 DRAWN = 400  # places, of which training and test receivers are the first
-AGAIN = 5  # one test receiver in so many is simulated with other rays
 COLUMNS = {
     "rows": (
         ("carrier_ghz", "carrier [GHz]", "{:g}"), ("n_train", "spectra", "{}"), ("room", "room", "{}"), ("test", "receivers", "{}"),
@@ -153,10 +152,9 @@ class Office:
     def perfect_db(self, room: str) -> float:
         """PSNR of a model without error: that of truth to itself with other rays, less the half of it that is theirs."""
         data = self.rooms[room]
-        some = data.subset(np.arange(0, len(data), AGAIN))
-        again = self.truth(f"again-{room.split()[0]}", some.receivers, seed=2)[0].path_gain
+        again = self.truth(f"again-{room.split()[0]}", data.receivers, seed=2)[0].path_gain
         (low, high), found = data.range_db, []
-        for pair in zip(some.path_gain, again, strict=True):
+        for pair in zip(data.path_gain, again, strict=True):
             first, second = (np.clip((to_db(one, data.floor) - low) / (high - low), 0.0, 1.0) for one in pair)
             found.append(-10.0 * np.log10(np.mean((first - second) ** 2) / 2.0))
         return float(np.mean(found))
