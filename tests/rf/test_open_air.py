@@ -170,6 +170,8 @@ def test_every_verb_warns_once_where_it_was_called():
         assert found[0].startswith("3.5 GHz: diffraction and transmission through walls are not modelled")
         assert "below 100 GHz and outdoors (under the sky)" in found[0]
         assert found[1] == __file__
+    whole = wr.Effects(mirrors=1, scatterings=1, transmissions=1)
+    assert unmodelled(lambda: wr.simulate(s, **where, shape=(16, 32), effects=whole)) == []
 
 
 def test_frequency_and_sky_are_reasons_by_themselves():

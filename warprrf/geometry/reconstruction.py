@@ -348,7 +348,7 @@ class Reconstruction:
             mesh = mesh if isinstance(mesh, Mesh) else Mesh.load(mesh)
             patches = planar_patches(mesh)
         elif cameras and gaussians is not None:
-            patches = fuse_gaussians(
+            patches, _ = fuse_gaussians(
                 gaussians, list(cameras.values()), config=config, progress=progress, device=device
             )
             mesh = patches.mesh

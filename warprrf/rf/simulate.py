@@ -103,7 +103,7 @@ def simulate(
         ImportError: if ``engine="sionna"`` and Sionna RT is missing.
 
     Warns:
-        UserWarning: below 100 GHz and outdoors, that diffraction and transmission are not modelled.
+        UserWarning: below 100 GHz and outdoors, of diffraction and transmission if not modelled.
     """
     if not hasattr(scene, "materials"):
         raise TypeError(f"scene: got {type(scene).__name__}, expected a Scene (a mesh and its materials)")
@@ -118,8 +118,12 @@ def simulate(
     mesh, wavelength_m = as_mesh(scene, "scene"), SPEED_OF_LIGHT / frequency
     question_unit(mesh, wavelength_m)
     check_positions(mesh, source, points, wavelength_m, device=device)
-    through = engine == "sionna" and refraction
-    warn_of_unmodelled(mesh, source, points, frequency_hz=frequency, transmission=through, device=device)
+    exact = engine == "exact"
+    modelled = {
+        "transmission": effects.transmissions > 0 if exact else refraction,
+        "diffraction": exact and effects.diffractions > 0,
+    }
+    warn_of_unmodelled(mesh, source, points, frequency_hz=frequency, device=device, **modelled)
 
     common: dict[str, Any] = {"transmitter": source, "frequency_hz": frequency}
     common |= {"shape": check_shape(shape), "beam_sigma_rad": check_beam(beam_sigma_rad)}

@@ -319,3 +319,21 @@ def test_small_blocks_change_nothing(monkeypatch, wave, squint, method):
     np.testing.assert_allclose(
         p.taps(1e9, 0, 20, squint=squint, **ask), taps, atol=1e-12 * np.abs(taps).max()
     )
+
+
+def test_a_slab_does_not_turn_the_array_behind_it_however_its_point_is_rounded():
+    """Spherical waves through a slab are those of the straight way; single precision moves its point off it."""
+    tx, rx = np.array([0.0, 0, 0.4]), np.array([0.31, 0.17, 0.73])
+    straight = Paths.from_points(
+        tx, rx, np.full((1, 1, 3), np.nan), np.ones(1, complex), np.array(["los"]), F
+    )
+    point = (tx + 0.31 * (rx - tx)).astype(np.float32)
+    passed = replace(
+        straight,
+        vertices=point.astype(float)[None, None],
+        kind=np.array(["slab"]),
+        interactions=np.array([[4]]),
+    )
+    arrays = {"tx_array": PlanarArray(8, 8, orientation=(0.3, 0.2, 0.1)), "rx_array": PlanarArray(8, 8)}
+    expected, found = (p.cfr([F], wave="spherical", **arrays) for p in (straight, passed))
+    np.testing.assert_allclose(found, expected, rtol=1e-3)

@@ -1,6 +1,7 @@
 """Scenario folders, loaded by the DeepMIMO package itself."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -81,15 +82,23 @@ def test_folder_without_the_package(tmp_path):
         Paths.concatenate([random_paths(3), random_paths(2, seed=1, kind="diffuse")]),
         random_paths(1, seed=2),
     ]
-    for k, p in enumerate(parts):
-        p.vertices[:] = k
+    unsaid = np.zeros(0, np.int8)
+    parts = [
+        replace(p, vertices=np.full_like(p.vertices, k), interactions=unsaid) for k, p in enumerate(parts)
+    ]
+    far = random_paths(1, seed=3, kind="edge")
+    codes = np.array([[1, 4, 4, 8]], np.int8)  # of a mirror, two slabs and an edge, as Sionna RT has them
+    parts.append(replace(far, vertices=np.full((1, 4, 3), 2.0), interactions=codes))
     paths = Paths.stack(parts)
     with pytest.raises(ValueError, match="diffuse"):
         write_deepmimo(paths, tmp_path / "a")
     folder = write_deepmimo(paths, tmp_path / "a", diffuse="random_phase", max_paths=4)
     power = np.load(folder / "power_t000_tx000_r001.npz")["power"]
-    assert power.shape == (2, 4) and np.isnan(power[1, 1:]).all() and (np.diff(power[0]) <= 0).all()
+    assert power.shape == (3, 4) and np.isnan(power[1, 1:]).all() and (np.diff(power[0]) <= 0).all()
     codes = np.load(folder / "inter_t000_tx000_r001.npz")["inter"]
-    assert set(codes[0]) == {1.0, 3.0}
-    assert json.loads((folder / "params.json").read_text())["txrx_sets"]["txrx_set_1"]["num_points"] == 2
+    assert set(codes[0]) == {1.0, 3.0} and codes[2, 0] == 1442.0
+    said = json.loads((folder / "params.json").read_text())
+    assert said["txrx_sets"]["txrx_set_1"]["num_points"] == 3
+    most = {"path_depth": 4, "reflections": 1, "diffractions": 1, "scattering": 1, "transmissions": 2}
+    assert said["rt_params"] == said["rt_params"] | {f"max_{name}": count for name, count in most.items()}
     assert not [f for f in folder.iterdir() if f.name.startswith(".")]

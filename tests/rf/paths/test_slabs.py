@@ -11,6 +11,8 @@ from warprrf.rf.em.fresnel import slab_passage, slab_reflection, slab_transmissi
 from warprrf.rf.em.materials import Material, itu_material
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine, together
+from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.observations import Frame
 from warprrf.rf.paths.trace import trace_paths
 from warprrf.rf.scene import Scene
 from warprrf.rf.tracing.model import Effects
@@ -143,3 +145,20 @@ def test_spectra_do_not_jump_at_a_shadow_s_boundary() -> None:
         assert together(found).power.sum() == pytest.approx(whole, rel=0.01)  # other edges are far
         total.append(10 * np.log10(whole))
     assert np.abs(np.diff(total)[2]) < 0.05 and np.all(np.diff(total) > 0)
+
+
+@pytest.mark.parametrize(("kind", "most"), [("edge", 0), ("edge", 2), ("slab", 2)])
+def test_a_field_s_paths_through_slabs_and_over_edges_are_those_that_are_traced(kind: str, most: int) -> None:
+    """Points, what happens there, and lengths; a trace in materials adds what slabs delay."""
+    frame = Frame(TX, F, (18, 36), 1e-20, (-200.0, 0.0), 0.1, None)
+    effects = Effects(mirrors=1, transmissions=most, diffractions=1)
+    own = BistaticField.prior(SHEET, frame, effects=effects).paths(RX)
+    mine, known = (
+        p.select(np.flatnonzero(p.kind == kind)) for p in (own, paths(SHEET, most=most, diffractions=1))
+    )
+    assert 0 < len(mine.gain) == len(known.gain)
+    order = np.linalg.norm(mine.departure[:, None] - known.departure, axis=2).argmin(axis=1)
+    deep = known.vertices.shape[1]
+    np.testing.assert_array_equal(mine.interactions[:, :deep], known.interactions[order])
+    np.testing.assert_allclose(mine.vertices[:, :deep], known.vertices[order], atol=1e-6)
+    np.testing.assert_allclose(mine.tau, known.tau[order], rtol=1e-9 if kind == "edge" else 0.01)

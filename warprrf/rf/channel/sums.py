@@ -12,9 +12,9 @@ transform follows, and the window's transform is divided out (Dutt and Rokhlin, 
 window exp(beta sqrt(1 - z^2)) is that of Barnett, Magland and af Klinteberg, SIAM J. Sci. Comput. 41, 2019). It treats
 arrays exactly, whatever their shape, and errs by about 1e-7 of the root of the paths' total power.
 
-Lengths are those of plane waves, or of spherical waves about exact points. For line of sight and mirrors a spherical
-wave comes from the transmitting element's image: the transmitter's lies one path length away along the arrival, and its
-array is turned by the reflections of the way. For diffuse paths it runs from the element to the first interaction
+Lengths are those of plane waves, or of spherical waves about exact points. For line of sight, mirrors, slabs and edges a
+spherical wave comes from the transmitting element's image: the transmitter's lies one path length away along the arrival, and
+its array is turned by the reflections of the way. For diffuse paths it runs from the element to the first interaction
 point, and from the last to the receiving element.
 """
 
@@ -28,7 +28,7 @@ import scipy.fft
 from scipy.sparse import csr_array
 
 from warprrf.device import threads
-from warprrf.rf.channel.path_arrays import PathArrays, points_along
+from warprrf.rf.channel.path_arrays import EDGE, MIRROR, PathArrays, points_along
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 
 TAPS = 8
@@ -266,7 +266,8 @@ def plane_lengths(paths: PathArrays, sending: np.ndarray, receiving: np.ndarray)
 
 
 def spherical_lengths(paths: PathArrays, sending: np.ndarray, receiving: np.ndarray) -> PairLengths:
-    """Line of sight and mirrors: distances from the transmitting elements' images."""
+    """Paths that do not scatter: distances from the transmitting elements' images. An edge counts as the mirror that turns
+    the way as it does: right to first order in the elements' places, but for the waves' bend across the edge."""
     tx, rx, bounces = _ends(paths)
     each, some = np.arange(len(bounces)), bounces > 0
     last = np.where(some[:, None], paths.vertices[each, np.maximum(bounces - 1, 0)], tx)
@@ -274,8 +275,8 @@ def spherical_lengths(paths: PathArrays, sending: np.ndarray, receiving: np.ndar
     points = np.concatenate([np.broadcast_to(tx, (len(each), 1, 3)), paths.vertices], axis=1)
     step = np.linalg.norm(np.diff(points, axis=1), axis=2)
     length = np.where(np.isfinite(step), step, 0.0).sum(axis=1) + np.linalg.norm(rx - last, axis=1)
-    # The image lies ``length`` away along the arrival; its array is mirrored by every bounce.
-    mirrored = np.einsum("pij,nj->npi", _mirrorings(tx, rx, paths.vertices, bounces), sending)
+    # The image lies ``length`` away along the arrival; its array is mirrored at every turn of the way.
+    mirrored = np.einsum("pij,nj->npi", _mirrorings(paths, tx, rx), sending)
     target = length[:, None] * toward + mirrored
     far = np.linalg.norm(target, axis=2)
     return PairLengths(receiving, target, extra=far - length, scale=length / far, spherical=True)
@@ -301,15 +302,16 @@ def _ends(paths: PathArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return paths.transmitter, paths.receiver, bounces
 
 
-def _mirrorings(tx: np.ndarray, rx: np.ndarray, vertices: np.ndarray, bounces: np.ndarray) -> np.ndarray:
-    """What the bounces do to directions, shape ``(P, 3, 3)``: a product of reflections."""
-    count, depth = vertices.shape[:2]
-    legs = np.diff(points_along(tx, vertices, rx), axis=1)
+def _mirrorings(paths: PathArrays, tx: np.ndarray, rx: np.ndarray) -> np.ndarray:
+    """What mirrors and edges do to directions, shape ``(P, 3, 3)``: a product of reflections; slabs do nothing."""
+    count, depth = paths.vertices.shape[:2]
+    legs = np.diff(points_along(tx, paths.vertices, rx), axis=1)
     legs = legs / np.linalg.norm(legs, axis=2, keepdims=True)
     turned = np.broadcast_to(np.eye(3), (count, 3, 3))
+    turns = np.isin(paths.interactions, (MIRROR, EDGE))
     for k in range(depth):
         normal = legs[:, k + 1] - legs[:, k]
-        there = (k < bounces) & (np.linalg.norm(np.nan_to_num(normal), axis=1) > 1e-9)
+        there = turns[:, k] & (np.linalg.norm(np.nan_to_num(normal), axis=1) > 1e-9)
         unit = np.where(there[:, None], normal, 1.0)
         unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
         mirror = np.eye(3) - 2.0 * np.where(there[:, None, None], unit[:, :, None] * unit[:, None, :], 0.0)

@@ -20,10 +20,13 @@ import numpy as np
 
 from warprrf.checks import check_count, checked
 from warprrf.files import write_arrays, write_text
+from warprrf.rf.channel.path_arrays import EDGE, MIRROR, SCATTER, SLAB
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.scene import Scene
 
 _VERSION = "4.0.5"  # of the format
+# of a path's code: a digit for each interaction, from the transmitter on; 0 for line of sight
+_DIGIT = {MIRROR: 1, EDGE: 2, SCATTER: 3, SLAB: 4}
 _FORBIDDEN = set('/\\:*?"<>|\n') | {"'"}
 
 
@@ -74,18 +77,20 @@ def write_deepmimo(
     for key, values in matrices.items():
         write_arrays(folder / f"{key}_t000_tx000_r001.npz", {key: values})
     described = _write_scene(folder, scene, carrier)
-    bounces = np.isfinite(several.vertices[..., 0]).sum(axis=-1)
-    mirrors = np.where(several.kind == "mirror", bounces, 0).max(initial=0)
+    most = {
+        code: int((several.interactions == code).sum(axis=-1).max(initial=0)) for code in (MIRROR, EDGE, SLAB)
+    }
     parameters = {
         "version": _VERSION,
         "rt_params": {
             "raytracer_name": "warprrf",
             "raytracer_version": version("warprrf"),
             "frequency": carrier,
-            "max_path_depth": int(bounces.max(initial=0)),
-            "max_reflections": int(mirrors),
+            "max_path_depth": int((several.interactions > 0).sum(axis=-1).max(initial=0)),
+            "max_reflections": most[MIRROR],
             "max_scattering": int(scattered),
-            **{f"max_{kind}": 0 for kind in ("diffractions", "transmissions")},
+            "max_diffractions": most[EDGE],
+            "max_transmissions": most[SLAB],
             **{f"diffuse_{kind}": 0 for kind in ("reflections", "diffractions", "transmissions")},
             "diffuse_final_interaction_only": True,
             "diffuse_random_phases": diffuse == "random_phase",
@@ -133,11 +138,9 @@ def _matrices(paths: Paths, coefficient: np.ndarray, max_paths: int | None) -> d
 
     deep = max(1, int(bounces.max(initial=0)))
     index = order[:, :, None, None]
-    # A path's code is the string of its interactions' digits, 0 for line of sight, read from the transmitter: a diffuse
-    # path scatters last.
-    reflection, scattering = 1, 3
-    ones = (10.0**bounces - 1.0) / 9.0
-    codes = ones + np.where((paths.kind == "diffuse") & (bounces > 0), scattering - reflection, 0)
+    codes = np.zeros(bounces.shape)
+    for met in np.moveaxis(paths.interactions, -1, 0):
+        codes = np.where(met > 0, 10.0 * codes + np.vectorize(_DIGIT.get, otypes=[float])(met, 0), codes)
     return {
         "rx_pos": np.asarray(paths.receiver, dtype=np.float32).reshape(-1, 3),
         "tx_pos": np.asarray(paths.transmitter, dtype=np.float32).reshape(1, 3),

@@ -84,6 +84,7 @@ class EdgePaths:
         falls (Kirchhoff's approximation). There, up to a detour of a wavelength, paths over an edge only bring what is
         left of theirs.
         """
+        found = found.widened(2)
         count = found.patch.shape[1]
         friis = self.wavelength_m / (4.0 * np.pi * self.length_m)
         share = np.sqrt(self.power) / friis
@@ -106,11 +107,11 @@ class EdgePaths:
         def filled(value: float, dtype: Any, *shape: int) -> np.ndarray:
             return np.full((len(self), count, *shape), value, dtype)
 
-        point = filled(np.nan, float, 3)
-        point[:, : min(count, 2)] = self.point[:, :count]
+        point, code = filled(np.nan, float, 3), filled(0, np.int8)
+        point[:, :2], code[:, :2] = self.point, self.code
         edges = MirrorPaths(
             self.receiver, filled(-1, np.int32), filled(-1, np.int32), point, share, self.length_m, self.arrival,
-            filled(np.nan, float, 3), filled(0.0, float), filled(0.0, float), filled(np.nan, float), np.ones(len(self), bool),
+            filled(np.nan, float, 3), filled(0.0, float), filled(0.0, float), filled(np.nan, float), code,
         )  # fmt: skip
         return joined([found, edges.subset(np.flatnonzero(share > 0))])
 

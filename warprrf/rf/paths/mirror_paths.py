@@ -21,6 +21,7 @@ import numpy as np
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
 from warprrf.geometry.planar_patches import PlanarPatches
+from warprrf.rf.channel.path_arrays import EDGE, MIRROR, SLAB
 from warprrf.rf.paths.images import MirrorImages
 from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.paths.slabs import Slabs, Walls
@@ -46,7 +47,8 @@ class MirrorPaths:
         cosine: Cosine of incidence at each, 0 past the last, shape ``(L, K)``.
         turn: Angle of its plane of incidence to the one before [rad], shape ``(L, K)``; see :mod:`.polarisation`.
         thickness_m: Of a slab that is a solid, else NaN, shape ``(L, K)``.
-        over_edge: Whether the path goes over an edge, and over no mirror but those that ``share`` counts, shape ``(L,)``.
+        code: What happens at each: 1 mirror, 4 slab, 8 edge, 0 past the last, shape ``(L, K)`` int8. The mirror of a path over
+            an edge has no patch: ``share`` counts it.
     """
 
     receiver: np.ndarray
@@ -60,7 +62,7 @@ class MirrorPaths:
     cosine: np.ndarray
     turn: np.ndarray
     thickness_m: np.ndarray
-    over_edge: np.ndarray
+    code: np.ndarray
 
     def __len__(self) -> int:
         return len(self.receiver)
@@ -69,6 +71,11 @@ class MirrorPaths:
     def order(self) -> np.ndarray:
         """Number of reflections, shape ``(L,)``: 0 is line of sight, or a path over an edge."""
         return (self.patch >= 0).sum(axis=1)
+
+    @property
+    def over_edge(self) -> np.ndarray:
+        """Which go over an edge, shape ``(L,)``."""
+        return np.asarray((self.code == EDGE).any(axis=1))
 
     @property
     def in_sight(self) -> np.ndarray:
@@ -90,6 +97,18 @@ class MirrorPaths:
     def subset(self, chosen: np.ndarray) -> MirrorPaths:
         """The rows ``chosen``."""
         return MirrorPaths(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
+
+    def widened(self, most: int) -> MirrorPaths:
+        """The same with ``most`` columns at least, empty ones behind."""
+        more, empty = (
+            max(most - self.patch.shape[1], 0),
+            {"patch": -1, "slab": -1, "cosine": 0, "turn": 0, "code": 0},
+        )
+        wide = {f.name: getattr(self, f.name) for f in fields(self)}
+        for name in (*empty, "point", "normal", "thickness_m"):
+            pad = [(0, 0), (0, more), (0, 0)][: wide[name].ndim]
+            wide[name] = np.pad(wide[name], pad, constant_values=empty.get(name, np.nan))
+        return MirrorPaths(**wide)
 
     def of(self, receivers: np.ndarray) -> MirrorPaths:
         """The rows of ``receivers`` (N,), ascending, which are counted anew."""
@@ -453,10 +472,11 @@ def _described(
         out[:, : min(most, columns_now)] = a[:, :most]
         return out
 
+    code = np.where(slab >= 0, SLAB, np.where(patch >= 0, MIRROR, 0)).astype(np.int8)
     return MirrorPaths(
         receiver=row, patch=filled(patch, -1), slab=filled(slab, -1), point=filled(point, np.nan), share=share,
         length_m=length, arrival=arrival, normal=filled(normal, np.nan), cosine=filled(cosine, 0.0), turn=filled(turn, 0.0),
-        thickness_m=filled(thickness, np.nan), over_edge=np.zeros(len(row), bool),
+        thickness_m=filled(thickness, np.nan), code=filled(code, 0),
     )  # fmt: skip
 
 

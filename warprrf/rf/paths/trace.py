@@ -15,7 +15,6 @@ from warprrf.checks import check_array, check_count, checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, GeometryLike, as_mesh
 from warprrf.geometry.planar_patches import planar_patches
-from warprrf.rf.channel.path_arrays import MIRROR, SLAB
 from warprrf.rf.em.absorption import Gas
 from warprrf.rf.em.fresnel import SurfaceTable, slab_passage, slab_reflection, surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
@@ -182,7 +181,6 @@ class MirrorTracer:
         found = self.find(receivers, mirror_order, progress)
         points = np.asarray(receivers, float)
         jones, amplitude, excess_m = self._passed_on(found, points)
-        codes = np.where(found.slab >= 0, SLAB, np.where(found.patch >= 0, MIRROR, 0)).astype(np.int8)
         over = None if self.edges is None else self.edges.find(points, min(mirror_order, 1), progress)
         ends = np.searchsorted(found.receiver, np.arange(len(points) + 1))
         result = []
@@ -193,7 +191,7 @@ class MirrorTracer:
             result.append(
                 Paths._from_points(
                     self.transmitter, point, found.point[own], amplitude[own], kind.astype("<U7"), self.frequency_hz,
-                    None if jones is None else jones[own], excess_m[own], interactions=codes[own],
+                    None if jones is None else jones[own], excess_m[own], interactions=found.code[own],
                 )
             )  # fmt: skip
             if over is not None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from warprrf.rf.channel.path_arrays import SCATTER
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.path_set import Paths
@@ -47,8 +48,14 @@ def paths_of(
         power = power * max(float(image.sum()) - specular.sum(), 0.0) / power.sum()
     over = np.full((len(power), *vertices.shape[1:]), np.nan)
     over[:, 0] = point[kept]
+    codes = np.zeros(over.shape[:2], np.int8)
+    codes[:, 0] = SCATTER
     whole = np.isfinite(over[:, 0]).all(axis=1)
-    power, over = power[whole] * (power.sum() / max(power[whole].sum(), 1e-300)), over[whole]
+    power, over, codes = (
+        power[whole] * (power.sum() / max(power[whole].sum(), 1e-300)),
+        over[whole],
+        codes[whole],
+    )
     paths = Paths._from_points(
         view.tracer.transmitter,
         view.receivers[0],
@@ -56,6 +63,7 @@ def paths_of(
         np.sqrt(np.concatenate([specular, power])).astype(complex),
         np.concatenate([kinds, np.full(len(power), "diffuse", dtype="<U7")]),
         view.tracer.frequency_hz,
+        interactions=np.concatenate([found.code[exact], codes]),
     )
     order = np.argsort(-np.abs(paths.gain), kind="stable")[:max_paths]
     return replace(paths.select(order), air=air)
