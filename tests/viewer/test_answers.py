@@ -19,8 +19,10 @@ def field():
     return make.bistatic()
 
 
-def asked(source, transmitters=(make.TRANSMITTER,), mirror_order=3, frequency_hz=make.CARRIER_HZ):
-    wish = answers.Asked(frequency_hz, mirror_order)
+def asked(
+    source, transmitters=(make.TRANSMITTER,), mirror_order=3, frequency_hz=make.CARRIER_HZ, walls=3, edges=1
+):
+    wish = answers.Asked(frequency_hz, mirror_order, walls, edges)
     return answers.answer(answers.as_asked(source, wish), RECEIVER, transmitters, wish)
 
 
@@ -56,14 +58,19 @@ def test_fewer_mirrors_on_a_path_mean_fewer_paths(field):
     assert mirrors[0] == 0 and mirrors == sorted(mirrors) and mirrors[-1] > 0
 
 
-def test_a_scene_without_a_field_has_mirror_paths():
+@pytest.mark.parametrize(("walls", "edges"), [(0, 0), (2, 1)])
+def test_paths_through_walls_and_over_edges_are_those_that_are_asked_for(field, walls, edges):
     scene = make.room()
-    found = asked(scene, mirror_order=1)
+    found = asked(scene, mirror_order=1, walls=walls, edges=edges)
     wanted = wr.trace_paths(
-        scene, transmitter=make.TRANSMITTER, receivers=RECEIVER, frequency_hz=make.CARRIER_HZ, mirror_order=1
-    )
+        scene, transmitter=make.TRANSMITTER, receivers=RECEIVER, frequency_hz=make.CARRIER_HZ, mirror_order=1,
+        transmissions=walls, diffractions=edges,
+    )  # fmt: skip
     np.testing.assert_array_equal(found.paths[0].gain, wanted.gain)
     assert found.spectrum is None
+    whole = dataclasses.replace(field, effects=wr.Effects())
+    effects = answers.as_asked(whole, answers.Asked(field.frequency_hz, 1, walls, edges)).effects
+    assert (effects.mirrors, effects.transmissions, effects.diffractions) == (1, walls, edges)
 
 
 def test_legs_of_a_path_are_as_long_as_its_delay_says(field):

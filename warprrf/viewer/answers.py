@@ -65,26 +65,36 @@ class Asked:
     Attributes:
         frequency_hz: carrier [Hz].
         mirror_order: most reflections on a mirror path.
+        transmissions: most slabs on a path.
+        diffractions: most edges on a path.
         uncertainty: also ask how wrong the spectrum may be, where the field knows that.
     """
 
     frequency_hz: float
     mirror_order: int
+    transmissions: int
+    diffractions: int
     uncertainty: bool = False
 
 
 def as_asked(source: Source, asked: Asked) -> Source:
-    """A bistatic field with fewer mirrors or at another carrier; anything else as it is."""
+    """A bistatic field with fewer mirrors, slabs or edges, or at another carrier; anything else as it is."""
     if not isinstance(source, BistaticField):
         return source
     if abs(asked.frequency_hz - source.frequency_hz) > 0.5 * CARRIER_STEP_HZ:
         source = source.at_frequency(asked.frequency_hz)
-    order = min(asked.mirror_order, source.effects.mirrors)
-    return replace(source, effects=replace(source.effects, mirrors=order))
+    e = source.effects
+    fewer = replace(
+        e,
+        mirrors=min(asked.mirror_order, e.mirrors),
+        transmissions=min(asked.transmissions, e.transmissions),
+        diffractions=min(asked.diffractions, e.diffractions),
+    )
+    return replace(source, effects=fewer)
 
 
 def answer(source: Source, receiver: np.ndarray, transmitters: Sequence[np.ndarray], asked: Asked) -> Answer:
-    """Ask a field (:func:`as_asked`) for spectrum and paths, or trace mirror paths of a scene or a mesh.
+    """Ask a field (:func:`as_asked`) for spectrum and paths, or trace the paths of a scene or a mesh that do not scatter.
 
     Raises:
         ValueError: for a place that ``source`` does not hold at.
@@ -104,7 +114,7 @@ def answer(source: Source, receiver: np.ndarray, transmitters: Sequence[np.ndarr
             paths.append(
                 trace_paths(
                     source, transmitter=transmitter, receivers=receiver, frequency_hz=asked.frequency_hz,
-                    mirror_order=asked.mirror_order,
+                    mirror_order=asked.mirror_order, transmissions=asked.transmissions, diffractions=asked.diffractions,
                 )
             )  # fmt: skip
     spectrum = None

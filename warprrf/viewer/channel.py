@@ -8,6 +8,7 @@ import numpy as np
 
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.tracing.model import Effects
 from warprrf.viewer import answers, pictures
 from warprrf.viewer.answers import Answer, Asked
 from warprrf.viewer.page import Page, Setting
@@ -15,7 +16,7 @@ from warprrf.viewer.subject import Subject
 
 CARRIERS_GHZ = (100.0, 1000.0)
 """Over which ITU-R P.2040 has permittivities constant, so that a field carries over."""
-MIRRORS = 2  # of paths traced without a field, at first
+TRACED = Effects(mirrors=2, diffractions=0)  # of paths traced without a field, at first
 LISTED = 8
 MARKED = 60  # paths with a ring in the spectrum, where no stronger one is near
 APART_RAD = np.deg2rad(8.0)
@@ -43,26 +44,37 @@ class Channel:
             axes=({"label": "delay [ns]", "labelSize": 20, "size": 30}, {"label": "path gain [dB]", "labelSize": 20}),
         )  # fmt: skip
         self.table = gui.add_html("")
-        most = field.effects.mirrors if isinstance(field, BistaticField) else 3
+        whole = field is None or not isinstance(field, BistaticField)
+        first, most = (TRACED, Effects()) if whole else (field.effects,) * 2
         carrier, step = subject.carrier_hz / 1e9, answers.CARRIER_STEP_HZ / 1e9
         low, high = min(carrier, 1.0 if field is None else CARRIERS_GHZ[0]), max(carrier, CARRIERS_GHZ[1])
         with gui.add_folder("What is asked", expand_by_default=False):
             range_db = gui.add_slider("dynamic range [dB]", min=10, max=100, step=1, initial_value=60)
             mirrors = gui.add_slider(
-                "mirrors on a path", min=0, max=max(most, 1), step=1, initial_value=most if field else MIRRORS
+                "mirrors on a path", min=0, max=max(most.mirrors, 1), step=1, initial_value=first.mirrors
             )
+            slabs = gui.add_slider(
+                "walls on a path",
+                min=0,
+                max=max(most.transmissions, 1),
+                step=1,
+                initial_value=first.transmissions,
+            )
+            edges = gui.add_checkbox("round edges", first.diffractions > 0)
+            slabs.disabled, edges.disabled = most.transmissions == 0, most.diffractions == 0
             slid = gui.add_slider("carrier [GHz]", min=low, max=high, step=step, initial_value=carrier)
             slid.disabled = isinstance(field, RadioField) and not isinstance(field, BistaticField)
             uncertainty = gui.add_checkbox("expected error", False, visible=hasattr(field, "gain_std_db"))
             uncertainty.disabled = getattr(field, "errors", None) is None
-        self.range_db, self._mirrors, self.carrier, self._uncertainty = (
-            Setting(handle, changed) for handle in (range_db, mirrors, slid, uncertainty)
+        self.range_db, self._mirrors, self._slabs, self._edges, self.carrier, self._uncertainty = (
+            Setting(handle, changed) for handle in (range_db, mirrors, slabs, edges, slid, uncertainty)
         )
 
     @property
     def asked(self) -> Asked:
         """What the settings ask for."""
-        return Asked(float(self.carrier.value) * 1e9, int(self._mirrors.value), bool(self._uncertainty.value))
+        counts = (int(setting.value) for setting in (self._mirrors, self._slabs, self._edges))
+        return Asked(float(self.carrier.value) * 1e9, *counts, uncertainty=bool(self._uncertainty.value))
 
     def show(self, found: Answer) -> None:
         """Show an answer."""

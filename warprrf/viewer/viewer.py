@@ -7,6 +7,7 @@ import os
 import threading
 import time
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -194,7 +195,7 @@ class Viewer:
         source, asked = self.subject.field or self.subject.scene or self.subject.mesh, self._channel.asked
         if source is None:
             return None
-        key = asked.frequency_hz, asked.mirror_order
+        key = replace(asked, uncertainty=False)
         return self._fields.get(key, lambda: answers.as_asked(source, asked))
 
     def _answer_forever(self) -> None:
