@@ -44,8 +44,7 @@ class Channel:
             axes=({"label": "delay [ns]", "labelSize": 20, "size": 30}, {"label": "path gain [dB]", "labelSize": 20}),
         )  # fmt: skip
         self.table = gui.add_html("")
-        whole = field is None or not isinstance(field, BistaticField)
-        first, most = (TRACED, Effects()) if whole else (field.effects,) * 2
+        first, most = (field.effects,) * 2 if isinstance(field, BistaticField) else (TRACED, Effects())
         carrier, step = subject.carrier_hz / 1e9, answers.CARRIER_STEP_HZ / 1e9
         low, high = min(carrier, 1.0 if field is None else CARRIERS_GHZ[0]), max(carrier, CARRIERS_GHZ[1])
         with gui.add_folder("What is asked", expand_by_default=False):
@@ -73,8 +72,10 @@ class Channel:
     @property
     def asked(self) -> Asked:
         """What the settings ask for."""
-        counts = (int(setting.value) for setting in (self._mirrors, self._slabs, self._edges))
-        return Asked(float(self.carrier.value) * 1e9, *counts, uncertainty=bool(self._uncertainty.value))
+        mirrors, slabs, edges = (int(setting.value) for setting in (self._mirrors, self._slabs, self._edges))
+        return Asked(
+            float(self.carrier.value) * 1e9, mirrors, slabs, edges, uncertainty=bool(self._uncertainty.value)
+        )
 
     def show(self, found: Answer) -> None:
         """Show an answer."""
