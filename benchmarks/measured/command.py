@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ examples:
 PLACES = {"flat": flat}
 VERSION = 1
 """Counted up by hand when a field's predictions come out differently."""
+DARK_DB = -300.0  # path gain of what no path reaches
 Predict = Callable[[Links, Links], np.ndarray]
 COLUMNS = (
     ("held_out", "held out", "{}"), ("model", "model", "{}"), ("rms_db", "rms [dB]", "{:.2f}"), ("seen_db", "in sight", "{:.2f}"),
@@ -67,14 +68,8 @@ def field(place: Any, effects: wr.Effects, job: Job, train: Links, test: Links) 
         10.0 ** (place.FLOOR_DBM / 10.0), chain=["chain"] * len(train), samples=place.FEWEST,
     )  # fmt: skip
     fitted = wr.RadioField.fit(
-        place.scene(),
-        readings,
-        model="bistatic",
-        quick=True,
-        effects=effects,
-        device=job.device,
-        progress=job.progress,
-    )
+        place.scene(), readings, model="bistatic", quick=True, effects=effects, device=job.device, progress=job.progress,
+    )  # fmt: skip
     gain = np.zeros(len(test))
     for anchor in np.unique(test.anchor):
         own = test.anchor == anchor
@@ -82,16 +77,12 @@ def field(place: Any, effects: wr.Effects, job: Job, train: Links, test: Links) 
     return fitted.report["chains"]["chain"]["gain_db"] + _db(gain)
 
 
-def traced(place: Any, options: Mapping[str, Any], job: Job, train: Links, test: Links) -> np.ndarray:
+def traced(place: Any, options: Mapping[str, Any], train: Links, test: Links) -> np.ndarray:
     """Sharp paths through the scene as it was guessed, nothing fitted but one gain [dB]."""
 
     def power(links: Links) -> np.ndarray:
-        ends = {
-            "transmitter": links.senders,
-            "receivers": links.receivers,
-            "frequency_hz": place.FREQUENCY_HZ,
-        }
-        paths = wr.trace_paths(place.scene(), **ends, **options, device=job.device)
+        ends: dict[str, Any] = {"transmitter": links.senders, "receivers": links.receivers}
+        paths = wr.trace_paths(place.scene(), **ends, frequency_hz=place.FREQUENCY_HZ, **options)
         return _db(np.where(paths.valid, paths.power, 0.0).sum(axis=-1))
 
     known = power(train)
@@ -99,16 +90,19 @@ def traced(place: Any, options: Mapping[str, Any], job: Job, train: Links, test:
     return power(test) + np.median(train.level_db[lit] - known[lit])
 
 
-DARK_DB = -300.0
-
-
 def _db(gain: np.ndarray) -> np.ndarray:
     return np.asarray(10.0 * np.log10(np.maximum(gain, 10.0 ** (DARK_DB / 10.0))))
 
 
-FIELDS = {"field, without": wr.Effects(mirrors=2, scatter_mirror=False)}
+BARE = wr.Effects(mirrors=2, scatter_mirror=False, transmissions=0, diffractions=0)
+FIELDS = {
+    "field": replace(BARE, transmissions=3, diffractions=1),
+    "field, without diffraction": replace(BARE, transmissions=3), "field, without either": BARE,
+}  # fmt: skip
 """Rows of fields by their effects."""
-TRACED = {"traced, without": {"mirror_order": 2}}
+TRACED = {
+    "traced": {"mirror_order": 2, "transmissions": 3, "diffractions": 1}, "traced, without either": {"mirror_order": 2}
+}  # fmt: skip
 """Rows of sharp paths by the options of their tracing."""
 
 
@@ -128,19 +122,13 @@ def run(options: Options, job: Job) -> Report:
     name = f"measured_{options.place}"
     if options.noise_alone:
         return Report(f"{name}_noise", noise, _said(noise))
-    models: dict[str, Predict] = dict(RIVALS)
-    models |= {key: partial(traced, place, given, job) for key, given in TRACED.items()}
-    models |= {key: partial(field, place, effects, job) for key, effects in FIELDS.items()}
+    models: dict[str, tuple[Predict, str]] = {key: (predict, "") for key, predict in RIVALS.items()}
+    models |= {key: (partial(traced, place, given), repr(given)) for key, given in TRACED.items()}
+    models |= {key: (partial(field, place, given, job), repr(given)) for key, given in FIELDS.items()}
     rows: list[Row] = []
-    inputs = [
-        folder,
-        place.scene().mesh.triangles,
-        *map(repr, place.scene().materials),
-        repr(FIELDS),
-        repr(TRACED),
-    ]
+    known = digest(folder, place.scene().mesh.triangles, *map(repr, place.scene().materials))
     with Steps(job.out, fresh=job.fresh, progress=job.progress) as steps:
-        for model, predict in models.items():
+        for model, (predict, given) in models.items():
             error: dict[str, np.ndarray] = {}
             for kind, which, out in links.held_out(options.hold_out):
                 step = f"{model} {kind} {which}"
@@ -149,9 +137,10 @@ def run(options: Options, job: Job) -> Report:
                 def make(predict: Predict = predict, out: np.ndarray = out) -> dict[str, np.ndarray]:
                     return {"level_db": predict(links.subset(~out), links.subset(out))}
 
-                found = steps.arrays(file, make, version=VERSION, inputs=[digest(*inputs), out])["level_db"]
+                found = steps.arrays(file, make, version=VERSION, inputs=[known, given, out])["level_db"]
                 error.setdefault(kind, np.zeros(len(links)))[out] = found - links.level_db[out]
             rows += [_row(links, kind, model, errors, place.FLOOR_DBM) for kind, errors in error.items()]
+    rows.sort(key=lambda row: str(row["held_out"]))
     text = "\n\n".join([str(place.__doc__).split("\n")[0], _said(noise), columns_table(COLUMNS, rows)])
     return Report(
         name, {"machine": machine(job.device), "seed": job.seed, "noise": noise, "rows": rows}, text

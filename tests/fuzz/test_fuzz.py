@@ -115,7 +115,7 @@ metrics.psnr: truth=empty, prediction=no list; metrics.unit_image: floor=minus o
 Spectrum.stack: spectra=nested; Paths.stack: length=2^31; em.Band.widened: low_hz=numpy integer
 lookups.Lookup.spectrum: receivers=no rows; lookups.mean: train=readings
 em.slab_transmission: cos_incidence=zeros, thickness_m=tiny; em.slab_transmission: cos_incidence=zero, permittivity=list
-channel.coherence_bandwidth: tau=no list, power=no rows
+channel.coherence_bandwidth: tau=no list, power=no rows; Paths.from_points: kind=texts
 """
 """Findings of earlier hours, one of each cause."""
 

@@ -56,7 +56,7 @@ from warprrf.geometry.reconstruction import (
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.steps import Attempt, Steps
 
-VERSIONS = {**sfm.VERSIONS, "initial": 2, "refined": 2, "surface": 3}
+VERSIONS = {**sfm.VERSIONS, "initial": 2, "refined": 2, "surface": 4}
 """Of all steps: counted up by whoever changes what a step computes."""
 
 MUCH_UNKNOWN = 0.25  # share of a surface that is worth a warning
@@ -271,13 +271,14 @@ def _steps(
         if measured:
             maps = range_maps(sparse, measured).values()
             views, ranges = (list(part) for part in zip(*maps, strict=True))
-            patches = fuse_maps(views, ranges, planes=planes, config=config, progress=attempt.progress)
+            patches, whole = fuse_maps(views, ranges, planes=planes, config=config, progress=attempt.progress)
         else:
-            patches = fuse_gaussians(
+            patches, whole = fuse_gaussians(
                 gaussians, list(cameras.values()), photos=photos(), planes=planes, config=config,
                 progress=attempt.progress, device=device,
             )  # fmt: skip
-        shares = np.array(surface_shares(patches.mesh, planes, everywhere))
+        skipped = float(config.completion and not whole)
+        shares = np.array([*surface_shares(patches.mesh, planes, everywhere), skipped])
         return of_patches(patches) | {"shares": shares}
 
     settings = [
@@ -297,10 +298,15 @@ def _steps(
     return gaussians, to_patches(kept), _said_of_surface(*kept["shares"])
 
 
-def _said_of_surface(unseen: float, plain: float) -> tuple[str, ...]:
-    """What no photo shows of the surface, as a sentence; a warning where it is much."""
+def _said_of_surface(unseen: float, plain: float, skipped: float) -> tuple[str, ...]:
+    """What no photo shows of the surface, a sentence each; a warning where it is much."""
+    holes = (
+        "holes: they stay open; closing them wants half of the surface on planes along three perpendicular directions, and "
+        "most of it in photos"
+    )
+    open_ones = (holes,) if skipped else ()
     if max(unseen, plain) < 0.005:
-        return ()
+        return open_ones
     said = (
         f"surface: {plain:.0%} of it carries no feature and was found from its edges; {unseen:.0%} is seen by no photo "
         "and closes what is seen"
@@ -309,7 +315,7 @@ def _said_of_surface(unseen: float, plain: float) -> tuple[str, ...]:
         warnings.warn(
             f"{said}; look at the mesh there, and take more photos of what is missing", stacklevel=3
         )
-    return (said,)
+    return (said, *open_ones)
 
 
 def _kept(steps: Steps, name: str, make: Callable[[Attempt], Arrays], inputs: Sequence[Any]) -> Arrays:

@@ -10,7 +10,7 @@ own. Lengths in metres.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -18,7 +18,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.cache import cached_property
+from warprrf.cache import Cache, cached_property
 from warprrf.checks import check_similarity
 from warprrf.geometry.mesh import Mesh, components, edge_pairs, vectors_across
 from warprrf.kernels.rays.mesh import OverlapFaces, find_overlaps
@@ -64,6 +64,7 @@ class PlanarPatches:
     first: np.ndarray
     tolerance_m: float
     two_sided: bool = True
+    _grown: Cache = field(init=False, repr=False, compare=False, default_factory=lambda: Cache(4))
 
     def __len__(self) -> int:
         return len(self.offset)
@@ -156,6 +157,27 @@ class PlanarPatches:
         np.maximum.at(boxes[:, 1], self.face_patch[own], corners.max(axis=1))
         return boxes
 
+    def _face_boxes(self, slack_m: float) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corner of what lies no further than ``slack_m`` from each side of a face, shape ``(F, 3)`` each: a
+        triangle grown about the centre of its inscribed circle."""
+
+        def make() -> tuple[np.ndarray, np.ndarray]:
+            corner = self.mesh.triangles
+            side = np.linalg.norm(np.roll(corner, -1, axis=1) - np.roll(corner, 1, axis=1), axis=2)
+            around = np.maximum(side.sum(axis=1), 1e-300)
+            middle = (side[..., None] * corner).sum(axis=1, keepdims=True) / around[:, None, None]
+            radius = 2.0 * self.mesh.areas / around
+            with np.errstate(divide="ignore", invalid="ignore"):
+                grown = np.nan_to_num(
+                    middle + (corner - middle) * (1.0 + slack_m / radius)[:, None, None], nan=np.inf
+                )
+            reach, flat = self.tolerance_m + 1e-9, ~np.isfinite(grown).all(axis=(1, 2))
+            low, high = grown.min(axis=1) - reach, grown.max(axis=1) + reach
+            low[flat], high[flat] = -np.inf, np.inf
+            return low, high
+
+        return self._grown.get(slack_m, make)
+
     def contains(self, patch: np.ndarray, points: np.ndarray, slack_m: float = 1e-9) -> np.ndarray:
         """Whether point k, on the plane of ``patch[k]``, lies in that patch or ``slack_m`` beside it, shape ``(N,)``.
 
@@ -172,6 +194,11 @@ class PlanarPatches:
         first, count = ends[patch[near]], np.diff(ends)[patch[near]]
         row = np.repeat(np.arange(len(near)), count)
         face = order[np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count) + first[row]]
+        low, high = self._face_boxes(slack_m)
+        for axis in range(3):  # most faces are far away, which costs little to see
+            at = points[near, axis][row]
+            close = np.flatnonzero((at >= low[face, axis]) & (at <= high[face, axis]))
+            row, face = row[close], face[close]
         met = _in_triangles(
             points[near][row], self.mesh.triangles[face], self.normal[patch[near]][row], slack_m
         )

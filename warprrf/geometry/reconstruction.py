@@ -40,7 +40,7 @@ from warprrf.tensor_files import named
 
 GAUSSIANS = tuple(f.name for f in fields(Gaussians))
 MESH = ("vertices", "faces", "face_colours", "face_label")
-PATCHES = tuple(f.name for f in fields(PlanarPatches) if f.name != "mesh")
+PATCHES = tuple(f.name for f in fields(PlanarPatches) if f.init and f.name != "mesh")
 PATCH_ARRAYS = {
     "patch_face_patch": index_to("P", "F", -1),
     "patch_normal": Expected("P 3", -1.001, 1.001),
@@ -348,7 +348,7 @@ class Reconstruction:
             mesh = mesh if isinstance(mesh, Mesh) else Mesh.load(mesh)
             patches = planar_patches(mesh)
         elif cameras and gaussians is not None:
-            patches = fuse_gaussians(
+            patches, _ = fuse_gaussians(
                 gaussians, list(cameras.values()), config=config, progress=progress, device=device
             )
             mesh = patches.mesh

@@ -5,9 +5,10 @@ import pytest
 from radio_scenes import box_mesh
 from trimesh.remesh import subdivide_to_size
 
+from warprrf.geometry import pipeline
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.cells import occupancy
-from warprrf.geometry.photos.fusion import fuse_depth
+from warprrf.geometry.photos.fusion import fuse_depth, fuse_maps
 from warprrf.geometry.planes import Plane, detect_planes, plane_axes
 from warprrf.geometry.scans import find_patches
 from warprrf.geometry.splats.camera import Camera
@@ -125,3 +126,13 @@ def test_a_depth_map_with_few_known_pixels_does_not_end_the_fusion():
     few[8, 8] = 100.0  # beyond the largest range
     mesh = fuse_depth([wall, few, wall], [camera] * 3)
     assert np.abs(mesh.vertices[:, 2] - 2).max() < 0.01
+
+
+def test_holes_that_stay_open_are_said_to():
+    camera = Camera.pinhole(64, 48, fx=50, fy=50, cx=32, cy=24, world_to_camera=np.eye(4))
+    wall = 2.0 / camera.directions()[..., 2]
+    patches, whole = fuse_maps([camera] * 2, [wall] * 2)
+    assert len(patches.mesh.faces) and not whole  # one plane is no room
+    said = pipeline._said_of_surface(0.1, 0.0, True)
+    assert [text.split(":")[0] for text in said] == ["surface", "holes"]
+    assert pipeline._said_of_surface(0.0, 0.0, False) == ()

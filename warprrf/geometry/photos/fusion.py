@@ -59,8 +59,9 @@ def fuse_gaussians(
     config: ReconstructionConfig | None = None,
     progress: Progress | None = None,
     device: DeviceLike = None,
-) -> PlanarPatches:
-    """Mesh of Gaussians from depth maps rendered at ``cameras``, with its planar patches, the largest first.
+) -> tuple[PlanarPatches, bool]:
+    """Mesh of Gaussians from depth maps rendered at ``cameras``, with its planar patches, the largest first; and whether
+    its holes were closed.
 
     Args:
         photos: what these cameras saw, in the same order; the depth maps are mended by them.
@@ -85,7 +86,7 @@ def fuse_maps(
     planes: Sequence[Plane] = (),
     config: ReconstructionConfig | None = None,
     progress: Progress | None = None,
-) -> PlanarPatches:
+) -> tuple[PlanarPatches, bool]:
     """As :func:`fuse_gaussians`, from ranges [m], 0 where unknown, that are there already, each of one of ``views``."""
     config = config or ReconstructionConfig()
     report = progress or (lambda stage, done, total: None)
@@ -94,12 +95,11 @@ def fuse_maps(
     report("surface", 1, 4)
     patches = flattened(find_patches(mesh, planes, config.surface))
     report("surface", 2, 4)
-    if config.completion:
-        patches = complete(patches, views, depths, planes=planes)
+    whole = complete(patches, views, depths, planes=planes) if config.completion else patches
     report("surface", 3, 4)
-    patches = simplified(patches)
+    result = largest_first(simplified(whole), MIN_PATCH_M2)
     report("surface", 4, 4)
-    return largest_first(patches, MIN_PATCH_M2)
+    return result, whole is not patches
 
 
 def depth_maps(

@@ -82,6 +82,13 @@ class PathArrays:
     interactions: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))
 
     def __post_init__(self) -> None:
+        """Refuse arrays that are not of the same paths; ValueError names the field."""
+        for name in PADDING:
+            array = getattr(self, name) if name != "interactions" else None  # those are looked at below
+            if array is not None and array.shape[: self.gain.ndim] != self.gain.shape:
+                raise ValueError(
+                    f"{name}: got shape {array.shape}, expected that of gain first, {self.gain.shape}"
+                )
         if self.interactions.size == 0:
             there = np.isfinite(self.vertices[..., 0])
             codes, last = (

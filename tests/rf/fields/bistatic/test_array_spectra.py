@@ -72,7 +72,7 @@ def test_mirrors_and_line_of_sight_add_up_as_complex_paths_do(
 
 
 def test_one_path_alone_peaks_at_its_path_gain(field: BistaticField) -> None:
-    alone = replace(field, effects=Effects(mirrors=0, scatterings=0))
+    alone = replace(field, effects=Effects(mirrors=0, scatterings=0, transmissions=0, diffractions=0))
     place = RECEIVERS[1]
     toward = (TX - place) / np.linalg.norm(TX - place)
     found = alone.array_spectrum(place, ARRAY, toward[None])

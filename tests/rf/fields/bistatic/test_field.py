@@ -110,7 +110,7 @@ def test_before_any_spectrum_the_field_is_that_of_the_prior(scene: RadioScene, d
     assert np.allclose(image, unfitted.spectrum(RECEIVERS[4]).path_gain, rtol=1e-6)
     dark = replace(data, path_gain=np.zeros_like(data.path_gain))
     assert np.array_equal(image, BistaticField.prior(scene, dark).spectrum(RECEIVERS[4]).path_gain)
-    bare = BistaticField.prior(scene, data, effects=Effects(line_of_sight=False, mirrors=0, scatterings=0))
+    bare = BistaticField.prior(scene, data, effects=Effects(False, 0, 0, transmissions=0, diffractions=0))
     assert bare.spectrum(RECEIVERS[4]).path_gain.max() == 0
 
 

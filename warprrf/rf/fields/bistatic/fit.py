@@ -23,7 +23,14 @@ from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import Data, Measured
-from warprrf.rf.fields.bistatic.gauss_newton import THROUGH, Fitted, Problem, gauss_newton, layout_of
+from warprrf.rf.fields.bistatic.gauss_newton import (
+    KNOWN_THROUGH,
+    THROUGH,
+    Fitted,
+    Problem,
+    gauss_newton,
+    layout_of,
+)
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, WeighedPaths, read
 from warprrf.rf.fields.bistatic.merging import BY_SHAPE, Merging, merge
 from warprrf.rf.fields.bistatic.needs import MOST_BLOCKED, RARE, RAYS, evenly, needed, total
@@ -450,8 +457,13 @@ class Training:
     def start(self, material: np.ndarray) -> Parameters:
         """Parameters of materials before any measurement."""
         prior = Parameters.prior(int(material.max()) + 1, self.lobes, reciprocal=self.options.reciprocal)
-        through = self.surface.slabs(frame_of(self.data).frequency_hz)[2]
-        return replace(prior, log_through=np.bincount(material, through) / np.bincount(material))
+        return replace(prior, log_through=self.passage(material)[0])
+
+    def passage(self, material: np.ndarray) -> np.ndarray:
+        """ln of the share that materials let through before any measurement, and its standard deviation, shape ``(2, M)``."""
+        eta, _, through = self.surface.slabs(frame_of(self.data).frequency_hz)
+        std = np.where(np.abs(eta) > 0, KNOWN_THROUGH, THROUGH)
+        return np.stack([np.bincount(material, own) for own in (through, std)]) / np.bincount(material)
 
     def few(self, times: int) -> np.ndarray:
         """Places that fits which only decide about something learn from, those of every chain among them."""
@@ -466,7 +478,8 @@ class Training:
         """What is fitted to readings of ``places``, lit as under parameters ``p`` of materials."""
         return Problem.of(
             [self.parts[k] for k in places], effects, material, p, chains=len(self.chains),
-            gain_offset=self.options.gain_offset, **({"energy": 1.0} if self.totals else {}),
+            gain_offset=self.options.gain_offset, passage=self.passage(material),
+            **({"energy": 1.0} if self.totals else {}),
         )  # fmt: skip
 
     def model(self, choice: Choice, *, residual: bool = False) -> Model:
@@ -616,7 +629,7 @@ def merged(t: Training, best: Choice, least: float) -> Choice:
     for _ in range(MERGES):
         material, start = merge(problem, trial.parameters, t.surface.appearance, t.area, options)
         # What surfaces get of each other changes little with who is of which material: it is held.
-        problem = replace(problem, material=material)
+        problem = replace(problem, material=material, passage=t.passage(material))
         trial = Choice(best.effects, material, gauss_newton(problem, start, SHORT_STEPS))
         t.step()
     loss = t.held_loss(trial)
@@ -766,16 +779,21 @@ def left_out(t: Training, model: Model) -> dict[str, Any]:
     blocked = list({o.place.seen_from: k for k, o in enumerate(t.observations) if _is_dark(o.view)}.values())
     seen = list(t.evaluated(model, evenly(np.array(blocked, int), MOST_BLOCKED)))
     lacking = {name: on for name, on in RARE.items() if not any(getattr(model.effects, key) for key in on)}
-    change, over = {name: np.zeros(len(seen)) for name in RARE}, np.zeros(len(seen))
+    change, by_tracer = {name: np.zeros(len(seen)) for name in RARE}, dict[int, list[int]]()
+    whole, over = np.zeros(len(seen)), np.zeros(len(seen))
     for k, (o, here, materials) in enumerate(seen):
-        gains, tracer = path_gains(o.view, here, materials), o.view.tracer.on_grid(*RAYS)
-        whole = gains.specular.sum() + gains.by_ray().sum() + o.floor
+        gains = path_gains(o.view, here, materials)
+        whole[k] = gains.specular.sum() + gains.by_ray().sum() + o.floor
         read_sum, predicted = o.target.sums(o.predicted(here, materials))
         over[k] = NEPER * max(np.log1p(predicted) - np.log1p(read_sum), 0.0)
-        few = total(tracer, o.place.receiver, here, {}) if lacking else 0.0
+        by_tracer.setdefault(id(o.view.tracer), []).append(k)
+    for own in by_tracer.values() if lacking else ():
+        tracer, here = seen[own[0]][0].view.tracer.on_grid(*RAYS), seen[own[0]][1]
+        receivers = np.stack([seen[k][0].place.receiver for k in own])
+        few = total(tracer, receivers, here, {})
         for name, on in lacking.items():
-            more = total(tracer, o.place.receiver, here, on) - few
-            change[name][k] = NEPER * np.log1p(max(more, 0.0) / whole)
+            more = np.maximum(total(tracer, receivers, here, on) - few, 0.0)
+            change[name][own] = NEPER * np.log1p(more / whole[own])
     error_db = float(np.sqrt(np.mean(over**2))) if len(seen) else 0.0
     found: dict[str, Any] = {"receivers": [o.place.receiver.tolist() for o, *_ in seen], "error_db": error_db}
     return found | {name: own.tolist() for name, own in change.items()}

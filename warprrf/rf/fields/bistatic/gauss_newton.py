@@ -32,9 +32,11 @@ from warprrf.rf.tracing.records import Evaluation, Records
 from warprrf.rf.tracing.render import evaluation
 from warprrf.rf.tracing.tracer import SPECULAR
 
-WEIGHT, EXCESS, MIRROR, THROUGH = 2.0, 0.8, 1.5, 1.5
-"""Standard deviations a priori of lobe weights, permittivity less one, mirrored share and share let through from where a fit
-starts [nepers]."""
+WEIGHT, EXCESS, MIRROR = 2.0, 0.8, 1.5
+"""Standard deviations a priori of lobe weights, permittivity less one and mirrored share from where a fit starts [nepers]."""
+THROUGH, KNOWN_THROUGH = 1.5, 0.02
+"""Those of the share let through from what it is before any measurement: where that is assumed, and of a slab of known thickness
+and permittivity. The latter is small because hundreds of pixels hold one path and err together."""
 ENERGY = 0.25
 """That of scattered and mirrored shares from a sum of one."""
 GAIN, CHAIN = 1.0, 10.0
@@ -57,6 +59,8 @@ class Problem:
         chains: measuring chains whose gain is unknown.
         gain_offset: whether a gain common to all paths is free.
         energy: deviation of scattered and mirrored shares from a sum of one.
+        passage: ln of the share that materials let through before any measurement, and its deviation, shape ``(2, M)``; None
+            for that of the start.
     """
 
     observations: Sequence[Observation]
@@ -66,6 +70,7 @@ class Problem:
     chains: int = 0
     gain_offset: bool = False
     energy: float = ENERGY
+    passage: np.ndarray | None = None
 
     @classmethod
     def of(
@@ -203,7 +208,9 @@ def layout_of(problem: Problem, start: Parameters) -> Layout:
     )  # fmt: skip
 
 
-def priors(p: Parameters, start: Parameters, layout: Layout, energy: float) -> tuple[np.ndarray, np.ndarray]:
+def priors(
+    p: Parameters, start: Parameters, layout: Layout, energy: float, passage: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Residuals of the priors ``(K,)`` and their Jacobian ``(K, F)``: distance to the start, energy kept."""
     own = np.arange(layout.groups)
     residuals, rows = [], []
@@ -219,7 +226,8 @@ def priors(p: Parameters, start: Parameters, layout: Layout, energy: float) -> t
     add((p.log_excess - start.log_excess) / EXCESS, layout.excess(own), 1.0 / EXCESS)
     add((p.log_mirror - start.log_mirror) / MIRROR, layout.mirror(own), 1.0 / MIRROR)
     if layout.through:
-        add((p.log_through - start.log_through) / THROUGH, layout.passage(own), 1.0 / THROUGH)
+        centre, std = (start.log_through, np.full(layout.groups, THROUGH)) if passage is None else passage
+        add((p.log_through - centre) / std, layout.passage(own), 1.0 / std[:, None])
     if layout.gain:
         add(np.array([p.log_gain / GAIN]), np.array([layout.common_gain]), 1.0 / GAIN)
     if layout.roughness:
@@ -250,12 +258,12 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Fitted:
     hessian, losses = np.eye(layout.size), []
     if steps == 0:
         hessian = _normal_equations(problem, start, layout)[0]
-        slopes = priors(start, start, layout, problem.energy)[1]
+        slopes = priors(start, start, layout, problem.energy, problem.passage)[1]
         hessian += slopes.T @ slopes
 
     def total(x: np.ndarray) -> float:
         p = layout.unpack(x, start)
-        prior = priors(p, start, layout, problem.energy)[0]
+        prior = priors(p, start, layout, problem.energy, problem.passage)[0]
         own = zip(problem.observations, problem.errors_db(p), strict=True)
         return weight * sum(float(huber(e, o.huber_db)[0].sum()) for o, e in own) + float((prior**2).sum())
 
@@ -263,7 +271,7 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Fitted:
     for _ in range(steps):
         p = layout.unpack(vector, start)
         hessian, gradient = _normal_equations(problem, p, layout)
-        r, j = priors(p, start, layout, problem.energy)
+        r, j = priors(p, start, layout, problem.energy, problem.passage)
         hessian += j.T @ j
         gradient += j.T @ r
         improved = False

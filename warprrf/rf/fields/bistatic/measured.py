@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
-from scipy.sparse import csr_matrix
 
-from warprrf.cache import cached_property
+from warprrf.kernels.radio.records import MIRROR, SLAB
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.mirror_paths import stops_of
@@ -21,7 +21,7 @@ from warprrf.rf.paths.polarisation import chain_amplitude, vertical_ends
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.tracing.model import Parameters
 from warprrf.rf.tracing.rays import RayGrid
-from warprrf.rf.tracing.records import Records
+from warprrf.rf.tracing.records import Evaluation, Records
 from warprrf.rf.tracing.render import PathGains
 from warprrf.rf.tracing.tracer import SPECULAR, View
 
@@ -77,7 +77,13 @@ class ByPixels:
     def bins(self, view: View) -> tuple[np.ndarray, int]:
         """A bin for each pixel."""
         grid = view.tracer.grid
-        return np.arange(len(view.hits.face)) // grid.sub_pixels**2, grid.shape[0] * grid.shape[1]
+        return _pixel_of(len(view.hits.face), grid.per_pixel), grid.shape[0] * grid.shape[1]
+
+
+@lru_cache(maxsize=4)
+def _pixel_of(rays: int, per_pixel: int) -> np.ndarray:
+    """Pixel of each ray: one array for all receivers."""
+    return np.arange(rays) // per_pixel
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,11 +99,6 @@ class SpectrumPixels(ByPixels):
     pixels: np.ndarray | None = None
     together: None = None
 
-    @cached_property
-    def _matrix(self) -> csr_matrix | None:
-        """The beam at the pixels."""
-        return None if self.pixels is None else self.beam.at(self.pixels)
-
     @property
     def alike(self) -> object:
         """Itself: receivers of one data set have one."""
@@ -105,8 +106,8 @@ class SpectrumPixels(ByPixels):
 
     def of_bins(self, power: np.ndarray, *, quick: bool = False) -> np.ndarray:
         """Seen through the beam."""
-        if self._matrix is not None:
-            return np.asarray(self._matrix @ power.astype(np.float32, copy=False))
+        if self.pixels is not None:
+            return np.asarray(self.beam.at(self.pixels) @ power.astype(np.float32, copy=False))
         return self.beam(power.reshape(*self.beam.shape, -1), quick=quick).reshape(power.shape)
 
     def to_bins(self, readings: np.ndarray) -> np.ndarray:
@@ -137,7 +138,8 @@ each, shape ``(N, K)``."""
 def direct_paths(view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Directions of arrival and departure (L, 3) and delays (L,) [s] of one receiver's line of sight and mirror paths."""
     paths, transmitter = view.paths, view.tracer.transmitter
-    toward = np.where((paths.order > 0)[:, None], paths.point[:, 0], view.receivers[0]) - transmitter
+    first = paths.point[:, 0]
+    toward = np.where(np.isnan(first), view.receivers[0], first) - transmitter
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     return paths.arrival, toward, paths.length_m / SPEED_OF_LIGHT
 
@@ -267,7 +269,8 @@ class Superposition:
     """How L line-of-sight and mirror paths add up in N readings of an array, between vertical antennas.
 
     Attributes:
-        field: amplitude of each reading for a path of amplitude 1, phase of its length included, shape ``(L, N)``.
+        field: amplitude of each reading for a path of amplitude 1, phase of its length included, and what slabs let through
+            before any measurement, shape ``(L, N)``.
         power: what adds in power beside, because lengths are not known so well, shape ``(L, N)`` float32.
         ends: fields of the antennas at both ends of each path; see :func:`vertical_ends`.
     """
@@ -280,16 +283,20 @@ class Superposition:
         self, specular: Records, p: Parameters, material: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Of each path ``(L,)``, real because half-spaces have no phase but their sign, and its derivatives to
-        ``log_excess`` of each mirror met ``(L, K)``; those to ``log_mirror`` are half of it. The common gain apart.
+        ``log_excess`` of each mirror met ``(L, K)``; those to ``log_mirror`` and ``log_through`` are half of it. The common gain
+        apart.
 
         Args:
             specular: the paths.
             p: parameters of materials.
             material: of each group; by default groups are rows of ``p``.
         """
-        reflects, own = specular.index >= 0, np.maximum(specular.index, 0)
+        reflects, own = (specular.index >= 0) & (specular.kind == MIRROR), np.maximum(specular.index, 0)
         own = own if material is None else material[own]
-        size = np.sqrt(specular.power) * np.exp(0.5 * np.where(reflects, p.log_mirror[own], 0.0).sum(axis=1))
+        share = np.where(
+            reflects, p.log_mirror[own], np.where(specular.kind == SLAB, p.log_through[own], 0.0)
+        )
+        size = np.sqrt(specular.power) * np.exp(0.5 * share.sum(axis=1))
         cosine, turn = specular.angle[..., 0], specular.angle[..., 1]
         polarised, slope = chain_amplitude(p.log_excess[own], cosine, turn, reflects, self.ends)
         return size * polarised, size[:, None] * slope
@@ -349,6 +356,7 @@ class ArrayImage(ByPixels):
         wavelength = view.tracer.wavelength_m
         kept = np.exp(-0.5 * (2.0 * np.pi * length_std_m / wavelength) ** 2)
         phase = np.exp(-2j * np.pi * np.mod(paths.length_m / wavelength, 1.0))
+        heard *= _passage(view)[:, None]
         together = Superposition(
             (kept * phase[:, None] * heard).astype(np.complex64),
             ((1.0 - kept**2) * np.abs(heard) ** 2).astype(np.float32),
@@ -379,11 +387,19 @@ class ArrayImage(ByPixels):
 
 def _vertical(view: View) -> tuple[np.ndarray, np.ndarray]:
     """Fields of vertical antennas at both ends of each path of one receiver, shape ``(L, 2)`` each."""
-    paths, surface = view.paths, view.tracer.surface
+    paths = view.paths
     sent, received = np.zeros((len(paths), 2)), np.zeros((len(paths), 2))
-    for order in np.unique(paths.order):
-        own = np.flatnonzero(paths.order == order)
+    for count, own in paths.by_interactions:
         ends = np.broadcast_to(view.receivers[0], (len(own), 3))
-        stops = stops_of(view.tracer.transmitter, paths.point[own, :order], ends)
-        sent[own], received[own] = vertical_ends(stops, surface.plane_normal[paths.patch[own, :order]])
+        stops = stops_of(view.tracer.transmitter, paths.point[own, :count], ends)
+        sent[own], received[own] = vertical_ends(stops, paths.normal[own, :count])
     return sent, received
+
+
+def _passage(view: View) -> np.ndarray:
+    """Amplitude that the slabs on each path let through before any measurement, shape ``(L,)``."""
+    tracer, specular = view.tracer, view.records[SPECULAR]
+    index = np.where(specular.kind == SLAB, specular.index, -1)
+    alone = replace(specular, index=index, power=np.ones(len(specular)))
+    prior = replace(Parameters.prior(tracer.surface.groups), log_mirror=np.zeros(tracer.surface.groups))
+    return np.sqrt(alone.powers(Evaluation(prior, slabs=tracer.slabs(1), device=tracer.grid.device)))

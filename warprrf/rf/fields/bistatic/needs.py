@@ -54,11 +54,10 @@ def needed(effects: Effects, surface: Surface, places: Sequence[Place], device: 
         blocked = evenly(np.setdiff1d(np.arange(len(receivers)), sight.receiver), MOST_BLOCKED)
         p, none = assumed(surface, first.frequency_hz), np.zeros((2, surface.cells))
         model = Model(FEW, p, none, tracer.transmitter)
-        for receiver in receivers[blocked]:
-            before = total(tracer, receiver, model, {})
-            for name, on in RARE.items():
-                after = total(tracer, receiver, model, on)
-                changes[name].append(float(NEPER * np.log(max(after, 1e-300) / max(before, 1e-300))))
+        before = total(tracer, receivers[blocked], model, {})
+        for name, on in RARE.items():
+            after = total(tracer, receivers[blocked], model, on)
+            changes[name] += (NEPER * np.log(np.maximum(after, 1e-300) / np.maximum(before, 1e-300))).tolist()
     off: dict[str, Any] = {key: 0 for on in RARE.values() for key in on}
     for name, found in changes.items():
         if found and np.sqrt(np.mean(np.square(found))) > NEEDED_DB:
@@ -66,11 +65,14 @@ def needed(effects: Effects, surface: Surface, places: Sequence[Place], device: 
     return replace(effects, **off)
 
 
-def total(tracer: Tracer, receiver: np.ndarray, model: Model, on: dict[str, Any]) -> float:
-    """Total path gain of a receiver (3,) under the parameters of ``model``, with :data:`FEW` effects and those that are ``on``."""
+def total(tracer: Tracer, receivers: np.ndarray, model: Model, on: dict[str, Any]) -> np.ndarray:
+    """Total path gain of receivers (R, 3) under the parameters of ``model``, with :data:`FEW` effects and those that are ``on``."""
+    if len(receivers) == 0:
+        return np.zeros(0)
     here = replace(model, effects=replace(FEW, **on))
-    gains = path_gains(tracer.view(receiver, here.effects), here, evaluation(tracer, here))
-    return sum(float(power.sum()) for power in gains.tables.values())
+    gains = path_gains(tracer.view(receivers, here.effects), here, evaluation(tracer, here))
+    direct = np.bincount(gains.view.paths.receiver, gains.specular, len(receivers))
+    return np.asarray(direct + gains.by_ray().reshape(len(receivers), -1).sum(axis=1))
 
 
 def evenly(index: np.ndarray, most: int) -> np.ndarray:

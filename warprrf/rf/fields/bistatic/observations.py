@@ -18,6 +18,7 @@ import numpy as np
 from warprrf.cache import cached_property
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
+from warprrf.kernels.radio.records import MIRROR
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.fresnel import fresnel_curves
@@ -307,7 +308,10 @@ class Observation:
             )
             for path, mirror in zip(*np.nonzero(specular.index >= 0), strict=True):
                 at = place[materials.material[specular.index[path, mirror]]] + len(p.lobes)
-                rise[path, at : at + 2] += slope[path, mirror], 0.5 * amplitude[path]
+                if specular.kind[path, mirror] == MIRROR:
+                    rise[path, at : at + 2] += slope[path, mirror], 0.5 * amplitude[path]
+                else:
+                    rise[path, at + 2] += 0.5 * amplitude[path]
         return np.asarray((rise * kept[:, None]).T.astype(np.float32) @ columns)
 
     @cached_property
