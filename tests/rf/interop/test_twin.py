@@ -185,6 +185,12 @@ def test_what_no_material_can_hold_is_said(field, tmp_path):
     assert "1.00 dB" in elements
     about = json.loads((tmp_path / "rich" / "materials.json").read_text())["about"]
     assert gain in about
+    through = replace(field.parameters, log_through=np.full(3, np.log(0.1)))
+    passing = replace(
+        field, parameters=through, effects=replace(field.effects, transmissions=1, diffractions=1)
+    )
+    slabs, edges = wr.interop.write_twin(passing, tmp_path / "passing").left_out
+    assert "10.00 dB" in slabs and "edges" in edges
     alike = replace(field, parameters=replace(field.parameters, reciprocal=True))
     assert "reciprocity" in wr.interop.write_twin(alike, tmp_path / "alike").left_out[0]
 

@@ -358,6 +358,13 @@ def _left_out(field: BistaticField, half_spaces: Sequence[str]) -> tuple[str, ..
         )
     if p.log_gain != 0.0:
         found.append(f"common gain of {NEPER * p.log_gain:.2f} dB: multiply the twin's path gain by it")
+    if field.effects.transmissions and p.log_through.any():
+        share = NEPER * np.sqrt(np.mean(p.log_through**2))
+        found.append(
+            f"what slabs absorb as it was fitted, {share:.2f} dB rms over groups: losses are assumed"
+        )
+    if field.effects.diffractions:
+        found.append("paths over edges: simulate has Sionna RT find none")
     if field.effects.residual:
         squares = np.average(field.residual[0] ** 2, weights=np.bincount(s.cell, s.mesh.areas))
         found.append(f"residuals within groups, {NEPER * np.sqrt(squares):.2f} dB rms over area")
