@@ -148,7 +148,7 @@ def check_dataset(
     """Receivers (R, 3) and transmitter (3,) of ``ds`` [m], if a field of this mesh can be fitted to what they measured.
 
     Raises, warns: as :func:`check_positions`, :func:`question_unit` and
-    :func:`~warprrf.rf.spectra.dataset.question_spectra`; and of what fields do not model.
+    :func:`~warprrf.rf.spectra.dataset.question_spectra`.
     """
     receivers, transmitter, wavelength_m = ds.receivers, ds.transmitter, SPEED_OF_LIGHT / ds.frequency_hz
     question_spectra(ds)
@@ -157,7 +157,6 @@ def check_dataset(
     check_positions(
         mesh, transmitter, receivers, wavelength_m, names=("ds.transmitter", "ds.receivers"), device=device
     )
-    warn_of_unmodelled(mesh, transmitter, receivers, frequency_hz=ds.frequency_hz, device=device)
     return receivers, transmitter
 
 

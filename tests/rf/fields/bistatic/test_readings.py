@@ -256,7 +256,7 @@ def test_directions_that_nobody_measured_do_not_count(scene: RadioScene, test: S
     found, other = (evaluate(test, f.spectrum)["psnr_db"] for f in (field, worse))
     assert found > evaluate(test, RadioField.fit(scene, whole, quick=True).spectrum)["psnr_db"] - 3.0
     assert found > other
-    with pytest.raises(ValueError, match="test.path_gain: .* not measured"):
+    with pytest.raises(ValueError, match="test.path_gain: 1440 of 5760 pixels are NaN"):
         evaluate(part, field.spectrum)
     with pytest.raises(ValueError, match="path_gain"):
         RadioField.fit(scene, part, "rf3dgs+")

@@ -47,6 +47,7 @@ from warprrf.rf.fields.bistatic.observations import (
 from warprrf.rf.fields.bistatic.placing import moved, position_offset, with_azimuths
 from warprrf.rf.fields.bistatic.residual import fit_residual, shares_of
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
+from warprrf.rf.positions import warn_of_unmodelled
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.tracing.model import LOBES, SETS, Effects, Layout, Model, Parameters
@@ -323,6 +324,14 @@ def fit(
             views, places=places
         )  # of a part of what was traced they say where in the whole readings are
     seen = views or trace(geometry, data, **where)
+    if options.effects != "auto":  # else these are decided on by what they are worth
+        rare = {name: any(getattr(candidates[0], key) for key in on) for name, on in RARE.items()}
+        first = seen.places[0]
+        receivers = np.array(
+            [p.receiver for p in seen.places if np.array_equal(p.transmitter, first.transmitter)]
+        )
+        link = as_mesh(geometry, "geometry"), first.transmitter, receivers
+        warn_of_unmodelled(*link, frequency_hz=frequency_hz, device=device, **rare)
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
     with threadpool_limits(1, user_api="blas"):
         data, zeros = with_azimuths(data, seen.places, seen.views)

@@ -32,7 +32,7 @@ from warprrf.rf.fields.bistatic.measured import (
     pixel_means,
     read,
 )
-from warprrf.rf.positions import check_dataset, check_positions, question_unit, warn_of_unmodelled
+from warprrf.rf.positions import check_dataset, check_positions, question_unit
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings, fading_db, path_weights, question_readings
@@ -632,7 +632,6 @@ def _check_places(mesh: Mesh | None, one: Readings | ArraySpectra, device: Devic
         receivers = np.unique(one.receivers[under.reshape(-1) == k], axis=0)
         names = "ds.transmitters", "ds.receivers"
         check_positions(mesh, transmitter, receivers, wavelength_m, names=names, device=device)
-        warn_of_unmodelled(mesh, transmitter, receivers, frequency_hz=one.frequency_hz, device=device)
 
 
 @dataclass(frozen=True)

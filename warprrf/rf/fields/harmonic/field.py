@@ -176,6 +176,7 @@ class HarmonicField(RadioField):
         started = time.perf_counter()
         gaussians, mesh = _geometry(geometry)
         receivers, transmitter = check_dataset(mesh, ds, device=device)
+        warn_of_unmodelled(mesh, transmitter, receivers, frequency_hz=ds.frequency_hz, device=device)
         if mesh is None and (chosen.line_of_sight == "explicit" or chosen.interaction_point == "mesh"):
             raise ValueError('line_of_sight="explicit" and interaction_point="mesh" need a mesh; got none')
         images = check_array("ds.path_gain", ds.path_gain, (len(receivers), None, None), np.float64)
