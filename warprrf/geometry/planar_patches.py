@@ -10,7 +10,7 @@ own. Lengths in metres.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -64,7 +64,6 @@ class PlanarPatches:
     first: np.ndarray
     tolerance_m: float
     two_sided: bool = True
-    _grown: Cache = field(init=False, repr=False, compare=False, default_factory=lambda: Cache(4))
 
     def __len__(self) -> int:
         return len(self.offset)
@@ -156,6 +155,10 @@ class PlanarPatches:
         np.minimum.at(boxes[:, 0], self.face_patch[own], corners.min(axis=1))
         np.maximum.at(boxes[:, 1], self.face_patch[own], corners.max(axis=1))
         return boxes
+
+    @cached_property
+    def _grown(self) -> Cache:
+        return Cache(4)
 
     def _face_boxes(self, slack_m: float) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest corner of what lies no further than ``slack_m`` from each side of a face, shape ``(F, 3)`` each: a

@@ -18,6 +18,7 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -506,6 +507,10 @@ def assumed_permittivity(name: str, frequency_hz: float) -> float:
     """Magnitude of the relative permittivity that a surface called ``name`` is taken for before any measurement: that of
     P.2040's material of this name, else the geometric mean of those that rooms are made of, less one."""
     known = itu_name(name)
-    names = BUILDING if known is None else (known,)
+    return _mean_permittivity(BUILDING if known is None else (known,), frequency_hz)
+
+
+@lru_cache(maxsize=64)
+def _mean_permittivity(names: tuple[str, ...], frequency_hz: float) -> float:
     found = [abs(itu_material(one).extrapolated().permittivity(frequency_hz)) for one in names]
     return 1.0 + float(np.exp(np.mean(np.log(np.maximum(np.array(found) - 1.0, 1e-3)))))
