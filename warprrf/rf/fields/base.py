@@ -119,7 +119,7 @@ class RadioField(ABC):
             ValueError, TypeError: for an unknown model or bad arguments.
 
         Warns:
-            UserWarning: below 100 GHz and outdoors, that diffraction and transmission are not modelled.
+            UserWarning: below 100 GHz and outdoors, of diffraction and transmission where they are not modelled.
         """
         if not isinstance(model, str) or model not in cls.models:
             raise ValueError(f"model: got {model!r}, expected one of {', '.join(cls.models)}")

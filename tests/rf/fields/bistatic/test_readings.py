@@ -340,7 +340,7 @@ def test_a_table_s_file_is_read_as_it_is_meant(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("frequency_hz", "floor", "told"),
-    [(28, 1e-15, "carrier in hertz"), (F, 1e-9, "no value above the floor")],
+    [(28, 1e-15, "expected hertz"), (F, 1e-9, "no value above the floor")],
 )
 def test_a_carrier_in_gigahertz_and_powers_all_at_the_floor_are_questioned(
     frequency_hz: float, floor: float, told: str

@@ -325,7 +325,9 @@ def fit(
         )  # of a part of what was traced they say where in the whole readings are
     seen = views or trace(geometry, data, **where)
     if options.effects != "auto":  # else these are decided on by what they are worth
-        rare = {name: any(getattr(candidates[0], key) for key in on) for name, on in RARE.items()}
+        rare: dict[str, Any] = {
+            name: any(getattr(candidates[0], key) for key in on) for name, on in RARE.items()
+        }
         first = seen.places[0]
         receivers = np.array(
             [p.receiver for p in seen.places if np.array_equal(p.transmitter, first.transmitter)]

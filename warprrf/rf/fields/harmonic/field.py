@@ -66,7 +66,7 @@ from warprrf.rf.fields.harmonic.transport import (
     transport,
 )
 from warprrf.rf.paths.trace import Paths
-from warprrf.rf.positions import Ends, check_dataset
+from warprrf.rf.positions import Ends, check_dataset, warn_of_unmodelled
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import Spectrum, angles_from_directions, pixel_solid_angles, spread
 from warprrf.steps import digest
