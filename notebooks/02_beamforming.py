@@ -179,7 +179,7 @@ def true_paths(index):
         specular, gain=np.sqrt(power) * turns, tau=tau, theta_r=theta[above], phi_r=phi[above],
         theta_t=spectrum.aod[above][:, 0], phi_t=spectrum.aod[above][:, 1],
         vertices=np.full((above.sum(), *specular.vertices.shape[1:]), np.nan),
-        kind=np.full(above.sum(), "diffuse"), valid=np.ones(above.sum(), bool), jones=None,
+        kind=np.full(above.sum(), "diffuse"), valid=np.ones(above.sum(), bool), jones=None, interactions=np.zeros(0, np.int8),
     )  # fmt: skip
     return specular, scattered
 

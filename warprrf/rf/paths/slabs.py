@@ -171,7 +171,8 @@ class Walls:
             r, k = row[on], place[on] + 1
             slabs.face[r, k], slabs.cosine[r, k], slabs.range_m[r, k] = face[on], cosine[on], t[on]
             last[row] = np.where(on, face, -1)
-            gone[row] = np.where(met, t, 0.0) + self.clearance_m
+            # Sheets closer than the clearance, seen at a slant, are one.
+            gone[row] = np.where(met, t + 3.0 * self.clearance_m / np.maximum(cosine, 0.1), 0.0)
             row = row[on | out]
 
 
