@@ -41,13 +41,7 @@ def found(figure, law=None):
         return FIGURES[figure](room(law))
 
 
-TWICE = ("bistatic", "in two sheets 1e-5 m apart"), ("bistatic", "in two sheets 1e-4 m apart")
-"""Edges and slabs of sheets that close together still count more than once: 0.13 and 0.44 dB."""
-CASES = [
-    pytest.param(figure, law, marks=[pytest.mark.xfail(strict=True)] if (figure, law) in TWICE else [])
-    for figure in FIGURES
-    for law in (FEW if figure in FITTED else EVERY)
-]
+CASES = [(figure, law) for figure in FIGURES for law in (FEW if figure in FITTED else EVERY)]
 
 
 @pytest.mark.parametrize(("figure", "law"), CASES)

@@ -195,6 +195,7 @@ class EdgeFinder:
         direct = float(np.linalg.norm(receiver - images.transmitter))
         for sieve in (self._in_reach, partial(self._strong, direct), self._on_mirrors, self._unobstructed):
             ways = ways.take(np.flatnonzero(sieve(ways)))
+        ways = ways.take(np.argsort(self.edges.n[ways.edge], kind="stable"))  # wedges before the borders of their faces
         return ways.take(ways.distinct(3.0 * patches.tolerance_m))
 
     def _in_reach(self, ways: _Ways) -> np.ndarray:
@@ -353,11 +354,11 @@ class _Ways:
         return _Ways(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def distinct(self, distance_m: float) -> np.ndarray:
-        """Indices of ways that no earlier one repeats: over the same edge, by mirror points within ``distance_m``."""
+        """Indices of ways that no earlier one repeats, with mirrors on the same sides and all points within ``distance_m``: edges
+        that lie so close are one."""
         side = (self.patch >= 0) @ np.array([1, 2])
-        stop = np.where(side > 1, 1, 0)
-        point = np.nan_to_num(self.mirror[np.arange(len(side)), stop])
-        return distinct(3 * self.edge + side, point[:, None], distance_m)
+        points = np.stack([self.mirror[:, 0], self.point, self.mirror[:, 1]], axis=1)
+        return distinct(side, np.nan_to_num(points), distance_m)
 
     def stops(self) -> tuple[np.ndarray, np.ndarray]:
         """Codes ``(L, 2)`` and points ``(L, 2, 3)`` of the interactions, from the transmitter on."""

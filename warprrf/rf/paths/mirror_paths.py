@@ -387,12 +387,13 @@ def _legs(
 
 
 def _passed(walls: Walls, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, list[Slabs]]:
-    """Which paths arrive through at most as many slabs as ``walls`` allow, and what each leg passes on those."""
+    """Which paths arrive through slabs, at most as many as ``walls`` allow, and what each leg passes on those."""
     rows, slabs = np.arange(len(begin)), list[Slabs]()
     for k in range(begin.shape[1]):
         arrived, found = walls.between(begin[rows, k], end[rows, k])
         rows, slabs = rows[arrived], [*(s.take(arrived) for s in slabs), found]
-    few = np.flatnonzero(sum((s.count for s in slabs), np.zeros(len(rows), int)) <= walls.most)
+    count = sum((s.count for s in slabs), np.zeros(len(rows), int))
+    few = np.flatnonzero((count > 0) & (count <= walls.most))
     return rows[few], [s.take(few) for s in slabs]
 
 
