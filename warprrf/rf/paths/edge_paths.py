@@ -195,7 +195,9 @@ class EdgeFinder:
         direct = float(np.linalg.norm(receiver - images.transmitter))
         for sieve in (self._in_reach, partial(self._strong, direct), self._on_mirrors, self._unobstructed):
             ways = ways.take(np.flatnonzero(sieve(ways)))
-        ways = ways.take(np.argsort(self.edges.n[ways.edge], kind="stable"))  # wedges before the borders of their faces
+        ways = ways.take(
+            np.argsort(self.edges.n[ways.edge], kind="stable")
+        )  # wedges before the borders of their faces
         return ways.take(ways.distinct(3.0 * patches.tolerance_m))
 
     def _in_reach(self, ways: _Ways) -> np.ndarray:
