@@ -280,9 +280,10 @@ class ExactEngine:
         """What the transmitter lights where rays hit, and what it lights through slabs."""
         tracer = self._tracers[min(sub_pixels, self.sub_pixels)]
         seen = Rays(rays.hits, np.arange(len(rays.ray)))
-        lit = {"S": tracer.lit(seen)}
+        light = tracer.light(seen)
+        lit = {"S": tracer.lit(seen, light)}
         if self.mirrors.walls is not None:
-            lit["TS"] = tracer.lit_through(seen, self.effects.transmissions)
+            lit["TS"] = tracer.lit_through(seen, light, self.effects.transmissions)
         for name, records in lit.items():
             out = rays.hits.points(records.ray) - tracer.transmitter
             yield self._paths(rays, records, np.linalg.norm(out, axis=1), out, name, tracer)

@@ -119,8 +119,8 @@ class Walls:
         arrived = [(np.zeros(0, int), Slabs.none(0, self.most))]
         toward = way / np.maximum(length, 1e-12)[..., None]
         for row, face, _, slabs in self._stops(start, toward, length - self.clearance_m):
-            there = face < 0
-            arrived.append((row[there], slabs.take(there)))
+            there = row[face < 0]
+            arrived.append((there, slabs.take(there)))
         return _joined(arrived)
 
     def behind(
@@ -132,7 +132,7 @@ class Walls:
         endless = np.full(len(start), np.inf)
         for k, (row, met, t, slabs) in enumerate(self._stops(start, direction, endless, (face, range_m))):
             own = (met >= 0) & (k > 0)
-            found.append((row[own], met[own], t[own], slabs.take(own)))
+            found.append((row[own], met[own], t[own], slabs.take(row[own])))
         row, slabs = _joined([(a, d) for a, _, _, d in found])
         face, range_m = (np.concatenate([part[j] for part in found]) for j in (1, 2))  # type: ignore[misc]
         return row, face, range_m, slabs
@@ -145,9 +145,9 @@ class Walls:
         known: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, Slabs]]:
         """Where rays stop, one face after another: rows, faces, -1 where nothing is met before ``limit``, ranges, and the
-        slabs passed so far. ``known`` are faces and ranges of what is met first."""
+        slabs of all rays so far. ``known`` are faces and ranges of what is met first."""
         row, slabs = np.arange(len(start)), Slabs.none(len(start), self.most)
-        gone, last = np.zeros(len(start)), np.full(len(start), -1)
+        gone, last, count = np.zeros(len(start)), np.full(len(start), -1), np.zeros(len(start), int)
         normal = self.mesh.face_normals
         while len(row):
             if known is None:
@@ -159,21 +159,29 @@ class Walls:
                 (face, t), known = known, None
             met = (face >= 0) & (t < limit[row])
             face = np.where(met, face, -1)
-            cosine = np.abs((normal[face] * direction[row]).sum(axis=1))
-            before, place = last[row], slabs.count[row] - 1
-            with np.errstate(invalid="ignore"):
-                apart = (t - slabs.range_m[row, place]) * slabs.cosine[row, place]
-            out = met & (before >= 0) & (self._part[face] >= 0) & (self._part[face] == self._part[before])
-            out &= (apart <= THICKEST_M) & ((normal[face] * normal[before]).sum(axis=1) < 0.0)
-            slabs.thickness_m[row[out], place[out]] = apart[out]
-            yield row[~out], face[~out], t[~out], slabs.take(row[~out])
+            cosine = np.abs(_dot(normal[face], direction[row]))
+            before, place = last[row], count[row] - 1
+            again = np.flatnonzero(met & (before >= 0) & (self._part[face] >= 0))
+            again = again[self._part[face[again]] == self._part[before[again]]]
+            r, k = row[again], place[again]
+            apart = (t[again] - slabs.range_m[r, k]) * slabs.cosine[r, k]
+            back = (apart <= THICKEST_M) & (_dot(normal[face[again]], normal[before[again]]) < 0.0)
+            slabs.thickness_m[r[back], k[back]] = apart[back]
+            out = np.zeros(len(row), bool)
+            out[again[back]] = True
+            yield row[~out], face[~out], t[~out], slabs
             on = met & ~out & self.passes[face] & (place + 1 < self.most)
             r, k = row[on], place[on] + 1
             slabs.face[r, k], slabs.cosine[r, k], slabs.range_m[r, k] = face[on], cosine[on], t[on]
             last[row] = np.where(on, face, -1)
+            count[r] += 1
             # Sheets closer than the clearance, seen at a slant, are one.
             gone[row] = np.where(met, t + 3.0 * self.clearance_m / np.maximum(cosine, 0.1), 0.0)
             row = row[on | out]
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.asarray(np.einsum("ni,ni->n", a, b))
 
 
 def _joined(parts: list[tuple[np.ndarray, Slabs]]) -> tuple[np.ndarray, Slabs]:

@@ -55,10 +55,14 @@ class Interreflection:
             hit = np.flatnonzero(hits.face >= 0)
             side, met = np.repeat(new, RAYS), surface.side_met(hits.face[hit], directions[hit])
             rays = Rays(hits, side)
-            tables = [(self.lit, tracer.lit(rays))]
+            light = tracer.light(rays)
+            tables = [(self.lit, tracer.lit(rays, light))]
             if most:
                 onward = tracer.behind(rays, most)
-                tables += [(self.through, tracer.lit_through(rays, most)), (self.behind, tracer.lit(onward))]
+                tables += [
+                    (self.through, tracer.lit_through(rays, light, most)),
+                    (self.behind, tracer.lit(onward, tracer.light(onward))),
+                ]
             for table, found in tables:
                 table.append(replace(found, power=scale * found.power))
             rows.append(side[hit])

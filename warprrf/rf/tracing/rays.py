@@ -6,7 +6,7 @@ transmitter besides.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -58,14 +58,23 @@ class Light:
     """How a source illuminates what rays hit.
 
     Attributes:
-        strength: Omega cos(theta_i) / (4 pi d1)^2 [sr/m^2], 0 where it is dark; less what the air absorbs, shape ``(K,)``.
+        strength: Omega cos(theta_i) / (4 pi d1)^2 [sr/m^2] if nothing throws a shadow; less what the air absorbs, shape ``(K,)``.
         angle: cosines of incidence, of scattering, and of the angle to the mirror direction, shape ``(K, 3)``.
         point: where the rays hit [m], known where there is light, shape ``(K, 3)``.
+        lit: rows that no shadow falls on, if shadows were cast.
     """
 
     strength: np.ndarray
     angle: np.ndarray
     point: np.ndarray
+    lit: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+
+    @property
+    def shaded(self) -> np.ndarray:
+        """Rows in the shadow of something."""
+        bright = self.strength > 0
+        bright[self.lit] = False
+        return np.flatnonzero(bright)
 
 
 class RayGrid:
@@ -137,15 +146,14 @@ class RayGrid:
         return "embree" if usable and count >= mesh_rays.EMBREE_RAYS else "warp"
 
     def light(self, hits: Hits, source: np.ndarray) -> Light:
-        """How a transmitter at ``source`` (3,) [m] illuminates what was hit; shadows included."""
+        """How a transmitter at ``source`` (3,) [m] illuminates what was hit, and where shadows fall."""
         found = self.light_through(hits, source)
         ray = np.flatnonzero(found.strength > 0)
         free = self.surface.mesh.visible(
             np.asarray(source, float), found.point.take(ray, axis=0), clearance=self.surface.position_error_m, device=self.device,
             backend=self._backend(len(ray)),
         )  # fmt: skip
-        found.strength[ray[~free]] = 0.0
-        return found
+        return replace(found, lit=ray[free])
 
     def light_through(self, hits: Hits, sources: np.ndarray, ray: np.ndarray | None = None) -> Light:
         """How transmitters at ``sources`` (3,) or (K, 3) [m] would illuminate what rays of index ``ray`` (K,), by default

@@ -30,7 +30,7 @@ from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.paths.slabs import Slabs, Walls
 from warprrf.rf.spectra.spectrum import unit_beams
 from warprrf.rf.tracing.model import Effects
-from warprrf.rf.tracing.rays import NEAREST_M, Hits, RayGrid
+from warprrf.rf.tracing.rays import NEAREST_M, Hits, Light, RayGrid
 from warprrf.rf.tracing.records import Records
 from warprrf.rf.tracing.surface import Surface
 
@@ -308,6 +308,7 @@ class Tracer:
         """Tables of sequences that a receiver sees, by name."""
         first = Rays(view.hits, np.arange(len(view.hits.face)))
         seen: dict[str, Rays] = {}
+        lights: dict[str, Light] = {}
         made = {}
         for name in names:
             sequence, most = name.rstrip("0123456789"), int(name[-1]) if name[-1].isdigit() else 0
@@ -317,18 +318,22 @@ class Tracer:
                     self._turned(view) if last == "M" else self.behind(first, most) if last == "T" else first
                 )
             if name == "S" and view.lit:
-                made[name] = self.lit(first, np.flatnonzero(np.unpackbits(view.lit[0], count=len(first.ray))))
+                row = np.flatnonzero(np.unpackbits(view.lit[0], count=len(first.ray)))
+                known = self.grid.light_through(first.hits, self.transmitter, row)
+                made[name] = self.scattered(first, row, known.strength, known.angle)
+            elif sequence[0] == "E":
+                made[name] = self.seen(seen[last])
+            elif sequence[0] == "M":
+                made[name] = self.lit_by_mirrors(seen[last])
             else:
-                made[name] = self._trace(sequence, seen[last], most)
+                if last not in lights:
+                    lights[last] = self.light(seen[last])
+                made[name] = (
+                    self.lit_through(seen[last], lights[last], most)
+                    if sequence[0] == "T"
+                    else self.lit(seen[last], lights[last])
+                )
         return made
-
-    def _trace(self, sequence: str, rays: Rays, most: int) -> Records:
-        """Records of one sequence, over at most so many slabs."""
-        if sequence[0] == "E":
-            return self.seen(rays)
-        if sequence[0] == "M":
-            return self.lit_by_mirrors(rays)
-        return self.lit_through(rays, most) if sequence[0] == "T" else self.lit(rays)
 
     def _specular(self, p: MirrorPaths) -> Records:
         """Line of sight and mirror paths as records, in double precision."""
@@ -343,19 +348,17 @@ class Tracer:
         row = np.arange(len(p), dtype=np.int32)
         return Records(power, row, group.astype(np.int32), angle, kind.astype(np.int32))
 
-    def lit(self, rays: Rays, row: np.ndarray | None = None) -> Records:
-        """What rays see of surfaces that the transmitter lights: the rays ``row``, if that is known."""
-        if row is not None:
-            light = self.grid.light_through(rays.hits, self.transmitter, row)
-            return self.scattered(rays, row, light.strength, light.angle)
-        light = self.grid.light(rays.hits, self.transmitter)
-        row = np.flatnonzero(light.strength > 0)
-        return self.scattered(rays, row, light.strength[row], light.angle[row])
+    def light(self, rays: Rays) -> Light:
+        """How the transmitter illuminates what rays hit."""
+        return self.grid.light(rays.hits, self.transmitter)
 
-    def lit_through(self, rays: Rays, most: int) -> Records:
+    def lit(self, rays: Rays, light: Light) -> Records:
+        """What rays see of surfaces that the transmitter lights."""
+        return self.scattered(rays, light.lit, light.strength[light.lit], light.angle[light.lit])
+
+    def lit_through(self, rays: Rays, light: Light, most: int) -> Records:
         """What rays see of surfaces that the transmitter lights through slabs, up to ``most``."""
-        light, walls = self.grid.light_through(rays.hits, self.transmitter), self.walls(most)
-        row = np.flatnonzero(light.strength > 0)
+        row, walls = light.shaded, self.walls(most)
         if walls is None:
             raise ValueError("most: got 0, expected slabs")
         arrived, slabs = walls.between(self.transmitter, light.point[row])
@@ -439,9 +442,10 @@ class Tracer:
         """Slabs that are passed along ``way`` (N, 3), not of unit length, in this order."""
         slabs = slabs.trimmed
         met, s = slabs.face >= 0, self.surface
-        normal = np.where(met[..., None], s.mesh.face_normals[slabs.face], way[:, None])
-        stops = np.arange(slabs.face.shape[1] + 2)[:, None] * way[:, None]
-        turn = np.where(met, turns(stops, normal), 0.0)
+        turn, more = np.zeros(met.shape), np.flatnonzero(met.sum(axis=1) > 1)
+        normal = np.where(met[more, :, None], s.mesh.face_normals[slabs.face[more]], way[more, None])
+        stops = np.arange(met.shape[1] + 2)[:, None] * way[more, None]
+        turn[more] = np.where(met[more], turns(stops, normal), 0.0)
         thickness = np.nan_to_num(slabs.thickness_m) / self.wavelength_m
         return Interactions(
             np.where(met, s.group[slabs.face], -1), np.stack([slabs.cosine, turn, thickness], axis=2), SLAB
