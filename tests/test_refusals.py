@@ -1,5 +1,7 @@
 """What would give a wrong answer without a word is refused by name. The fuzz suite tries what would fail loudly."""
 
+from decimal import Decimal
+
 import numpy as np
 import pytest
 from furnished import RECEIVERS, TX, F, furnished
@@ -7,6 +9,7 @@ from path_makers import random_paths
 
 import warprrf as wr
 from warprrf.rf.channel.dispersion import coherence_bandwidth, delay_spread
+from warprrf.rf.spectra.antenna import Scan
 
 ENDS = {"transmitter": TX, "receivers": RECEIVERS[:1], "frequency_hz": F}
 
@@ -32,6 +35,7 @@ def readings(**changes):
         ("faces", lambda: wr.Mesh(np.eye(3), [[0, 2**40, 1]])),
         ("length", lambda: wr.Paths.stack([random_paths(3)], length=3.5)),
         ("mirrors", lambda: wr.Effects(mirrors=2.5)),
+        ("tolerance", lambda: Scan(tolerance=Decimal("0.1"))),  # floats do not go together with it
         ("spacing", lambda: wr.PlanarArray(1, 1, spacing=-1.0)),
         ("power", lambda: delay_spread([1.0, -1.0], [0.0, 1e-9])),
         ("level", lambda: coherence_bandwidth([1.0, 1.0], [0.0, 1e-9], level=1.5)),

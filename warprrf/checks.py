@@ -179,10 +179,11 @@ def check_type(name: str, value: object, kind: type, hint: str = "") -> None:
 
 
 def _number(value: object) -> float:
-    """A real number as a float, NaN for what is none."""
+    """A real number as a float, NaN for what is none; a decimal one is none: it does not go together with floats."""
     try:
         array = np.asarray(value)
-        return float(value) if array.ndim == 0 and array.dtype.kind in "iufO" else np.nan  # type: ignore[arg-type]
+        real = array.dtype.kind in "iuf" or isinstance(value, numbers.Real)
+        return float(value) if array.ndim == 0 and real else np.nan  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
         return np.nan
 

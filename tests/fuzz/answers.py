@@ -90,7 +90,7 @@ def wrong(answer: Leaves, usual: Leaves, unknown: tuple[str, ...] = ()) -> str:
 
     NaN is right where names end in one of ``unknown``. Attributes of a data set are the caller's own.
     A pixel of a spectrum from which nothing comes has no delay and no direction: these are NaN there. So is a thickness that
-    nobody knows.
+    nobody knows, and a path has no points past its last interaction.
     """
     for where, array in answer.items():
         if not _holds_nan(array) or ".attributes." in where or where.endswith((".thickness_m", *unknown)):
@@ -102,6 +102,9 @@ def wrong(answer: Leaves, usual: Leaves, unknown: tuple[str, ...] = ()) -> str:
             and gain.shape == array.shape[: gain.ndim]
             and not _holds_nan(array[gain > 0])
         ):
+            continue
+        codes = answer.get(where.rpartition(".")[0] + ".interactions")
+        if codes is not None and where.endswith(".vertices") and not _holds_nan(array[codes > 0]):
             continue
         if where not in usual or not _holds_nan(usual[where]):
             return f"NaN in answer{where}"

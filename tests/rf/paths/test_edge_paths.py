@@ -7,6 +7,9 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, square
 import warprrf as wr
 from warprrf.geometry.edges import mesh_edges
 from warprrf.geometry.mesh import Mesh
+from warprrf.rf.em.fresnel import slab_passage
+from warprrf.rf.em.materials import itu_material
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.path_set import Paths
 
 FENCE = np.array([[5.0, -6, 0], [5, 1, 0], [9, 1, 0], [5, -6, 2], [5, 1, 2], [9, 1, 2]])  # a bent sheet
@@ -92,3 +95,35 @@ def test_what_a_path_over_an_edge_says_of_itself(tmp_path):
         assert slopes.min() < 1e-12
     p.save(tmp_path / "paths.nc")
     np.testing.assert_array_equal(Paths.load(tmp_path / "paths.nc").interactions, p.interactions)
+
+
+def test_a_slab_before_or_behind_an_edge_acts_as_on_any_way():
+    """A metal half plane in the way, and a pane far from it: the path over the edge, through the pane, from both sides."""
+    screen = np.array([[0.0, -9, -9], [0, 9, -9], [0, 9, 0], [0, -9, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    pane = screen[0] * [1, 3, 3] + [4.0, 0, 20], screen[1]
+    mesh, own = joined(screen, pane)
+    metal, glass = (itu_material(n, thickness_m=0.01) for n in ("metal", "glass"))
+    ends, link = (
+        ([-5.0, 0.5, -1], [8.0, -1, -2]),
+        {"frequency_hz": 28e9, "mirror_order": 0, "diffractions": 1},
+    )
+    scene = wr.Scene(mesh, [metal, glass], own)
+    open_air = wr.Scene(Mesh(*screen), [metal], np.zeros(2, np.int32))
+    top = [
+        p.select(np.flatnonzero((p.kind == "edge") & (np.abs(p.vertices[..., 2]) < 1e-9).any(axis=1)))
+        for p in (
+            wr.trace_paths(scene, transmitter=a, receivers=b, transmissions=1, **link)
+            for a, b in (ends, ends[::-1])
+        )
+    ]
+    free = wr.trace_paths(open_air, transmitter=ends[0], receivers=ends[1], **link)
+    free = free.select(np.flatnonzero((free.kind == "edge") & (np.abs(free.vertices[:, 0, 2]) < 1e-9)))
+    assert [p.interactions.tolist() for p in top] == [[[8, 4]], [[4, 8]]]
+    np.testing.assert_allclose(top[0].jones[0], top[1].jones[0].T, rtol=1e-9, atol=1e-18)
+    leg = ends[1] - free.vertices[0, 0]
+    te, tm, longer = slab_passage(
+        abs(leg[0]) / np.linalg.norm(leg), glass.permittivity(28e9), 0.01, SPEED_OF_LIGHT / 28e9
+    )
+    np.testing.assert_allclose((top[0].tau - free.tau) * SPEED_OF_LIGHT, longer, rtol=1e-9)
+    ratio = np.linalg.norm(top[0].jones) / np.linalg.norm(free.jones)
+    assert min(abs(te), abs(tm)) - 1e-9 <= ratio <= max(abs(te), abs(tm)) + 1e-9

@@ -1,14 +1,13 @@
-"""Paths over one edge, and over one edge and one mirror on either side, of many receivers: exact points, in float64.
+"""Paths over one edge, and over one edge and one mirror or slab on either side, of many receivers: exact points, in float64.
 
 The point on an edge follows from equal angles (Keller's cone) in closed form; mirrors are images of the transmitter before
 the edge, of the receiver behind it. Of all pairs of an edge and a mirror, those whose ways miss the mirror's box are sorted
 out by cones against balls around edges (:mod:`.images`), those whose power cannot reach a stated level by the size of the
-coefficient's terms, and the rest is tested as mirror paths are. Lengths in metres.
+coefficient's terms, and the rest is tested as mirror paths are. Slabs do not bend a way. Lengths in metres.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any
@@ -20,31 +19,30 @@ from warprrf.device import Progress
 from warprrf.geometry.edges import Edges, mesh_edges
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
 from warprrf.geometry.planar_patches import PlanarPatches
-from warprrf.rf.channel.path_arrays import EDGE, MIRROR
+from warprrf.rf.channel.path_arrays import EDGE, MIRROR, SLAB
 from warprrf.rf.em.diffraction import EdgeRays, Pair, boundary_fields, diffraction_matrices
-from warprrf.rf.em.fresnel import SurfaceTable, slab_reflection
+from warprrf.rf.em.fresnel import SurfaceTable, slab_passage, slab_reflection
 from warprrf.rf.paths.images import EdgeLeaves, MirrorImages
-from warprrf.rf.paths.mirror_paths import MirrorPaths, distinct, joined, unobstructed
+from warprrf.rf.paths.mirror_paths import MirrorPaths, distinct, joined, passed, unobstructed
+from warprrf.rf.paths.slabs import Walls
 from warprrf.rf.spectra.spectrum import transverse_basis
 
 LEAST_DB = -80.0
 """Paths that are weaker than this, over an unobstructed straight path between the ends, are left out [dB]."""
 
-Through = Callable[[np.ndarray, np.ndarray], Pair]
-"""Transmission (TE, TM) of sheets: of materials ``(L,)`` (indices) at cosines of incidence ``(L,)``."""
-
 
 @dataclass(frozen=True)
 class EdgePaths:
-    """L paths over one edge each, with a mirror before it, behind it, or none.
+    """L paths over one edge each, with a mirror or a slab before it, behind it, or none.
 
     Attributes:
         receiver: Index of the receiver, shape ``(L,)``.
         edge: Index of the edge, shape ``(L,)``.
         patch: Patch of the mirror before and of that behind the edge, -1 for none, shape ``(L, 2)``.
-        code: What happens at each point, from the transmitter on: 1 mirror, 8 edge, 0 past the last, shape ``(L, 2)``.
+        code: What happens at each point, from the transmitter on: 1 mirror, 4 slab, 8 edge, 0 past the last, shape ``(L, 2)``.
         point: Where [m], shape ``(L, 2, 3)``; NaN past the last.
         length_m: Length, shape ``(L,)``.
+        excess_m: What a slab makes it longer by for a wave, shape ``(L,)``.
         detour_m: What it is longer by than the straight line between the ends, shape ``(L,)``.
         departure: Unit direction from the transmitter, shape ``(L, 3)``.
         arrival: Unit direction from the receiver to the last point, shape ``(L, 3)``.
@@ -62,6 +60,7 @@ class EdgePaths:
     code: np.ndarray
     point: np.ndarray
     length_m: np.ndarray
+    excess_m: np.ndarray
     detour_m: np.ndarray
     departure: np.ndarray
     arrival: np.ndarray
@@ -90,17 +89,13 @@ class EdgePaths:
         share = np.sqrt(self.power) / friis
         mirror = self.patch.max(axis=1, initial=-1)
         own = np.where(found.order == 1, found.patch.max(axis=1, initial=-1), -1)
-        parents = (found.order <= 1) & (found.slabs == 0)
+        parents = found.order + found.slabs <= 1
+        keys = found.receiver, own, found.slabs
         free = dict(
-            zip(
-                zip(found.receiver[parents].tolist(), own[parents].tolist(), strict=True),
-                found.share[parents],
-                strict=True,
-            )
+            zip(zip(*(k[parents].tolist() for k in keys), strict=True), found.share[parents], strict=True)
         )
-        left = np.array(
-            [1.0 - free.get(key, 0.0) for key in zip(self.receiver.tolist(), mirror.tolist(), strict=True)]
-        )
+        keys = self.receiver, mirror, (self.code == SLAB).sum(axis=1)
+        left = np.array([1.0 - free.get(key, 0.0) for key in zip(*(k.tolist() for k in keys), strict=True)])
         near = self.detour_m < self.wavelength_m
         share = share * np.where(near & (left < 1.0), left, 1.0)
 
@@ -110,7 +105,7 @@ class EdgePaths:
         point, code = filled(np.nan, float, 3), filled(0, np.int8)
         point[:, :2], code[:, :2] = self.point, self.code
         edges = MirrorPaths(
-            self.receiver, filled(-1, np.int32), filled(-1, np.int32), point, share, self.length_m, self.arrival,
+            self.receiver, filled(-1, np.int32), filled(-1, np.int32), point, share, self.length_m, self.excess_m, self.arrival,
             filled(np.nan, float, 3), filled(0.0, float), filled(0.0, float), filled(np.nan, float), code,
         )  # fmt: skip
         return joined([found, edges.subset(np.flatnonzero(share > 0))])
@@ -141,7 +136,8 @@ class EdgeFinder:
         table: Radio properties of the patches' groups; None for a bare mesh: fields without polarisation, reflected
             without a sign change.
         edges: Those of the patches by default.
-        through: What sheets let through, if anything.
+        walls: What may be passed, if anything.
+        group: Row of ``table`` of each face, if there are walls.
         least_db: See :data:`LEAST_DB`.
     """
 
@@ -152,16 +148,17 @@ class EdgeFinder:
         table: SurfaceTable | None = None,
         *,
         edges: Edges | None = None,
-        through: Through | None = None,
+        walls: Walls | None = None,
+        group: np.ndarray | None = None,
         least_db: float = LEAST_DB,
     ) -> None:
         self.images, self.wavelength_m, self.table = images, wavelength_m, table
         self.edges = patch_edges(images.patches) if edges is None else edges
-        self.through, self.least_db = through, least_db
+        self.walls, self.group, self.least_db = walls, group, least_db
         self._leaves = EdgeLeaves(self.edges, images.device)
 
     def find(self, receivers: np.ndarray, mirrors: int = 1, progress: Progress | None = None) -> EdgePaths:
-        """All paths to ``receivers`` (R, 3) over one edge and at most ``mirrors`` mirrors, by receiver, then by length.
+        """All paths to ``receivers`` (R, 3) over one edge and at most ``mirrors`` mirrors, or a slab, by receiver, then by length.
 
         Args:
             receivers: Positions [m].
@@ -193,11 +190,12 @@ class EdgeFinder:
         edge, patch = (np.concatenate(column) for column in zip(*parts, strict=True))
         ways = _Ways.over(self.edges, edge, patch, patches, images.transmitter, receiver)
         direct = float(np.linalg.norm(receiver - images.transmitter))
-        for sieve in (self._in_reach, partial(self._strong, direct), self._on_mirrors, self._unobstructed):
+        for sieve in (self._in_reach, partial(self._strong, direct), self._on_mirrors):
             ways = ways.take(np.flatnonzero(sieve(ways)))
-        ways = ways.take(
-            np.argsort(self.edges.n[ways.edge], kind="stable")
-        )  # wedges before the borders of their faces
+        free = self._unobstructed(ways)
+        ways = ways.take(np.flatnonzero(free)).and_(self._passing(ways.take(np.flatnonzero(~free))))
+        # Wedges before the borders of their faces.
+        ways = ways.take(np.argsort(self.edges.n[ways.edge], kind="stable"))
         return ways.take(ways.distinct(3.0 * patches.tolerance_m))
 
     def _in_reach(self, ways: _Ways) -> np.ndarray:
@@ -220,19 +218,43 @@ class EdgeFinder:
         found = np.ones(len(ways.edge), bool)
         for j in range(2):
             own = np.flatnonzero(ways.patch[:, j] >= 0)
-            found[own] = self.images.patches.contains(ways.patch[own, j], ways.mirror[own, j])
+            found[own] = self.images.patches.contains(ways.patch[own, j], ways.stop[own, j])
         return found
 
+    def _beside(self, ways: _Ways) -> np.ndarray:
+        """Points off the edges, halfway between their faces, so that rays to them do not meet these, shape ``(L, 3)``."""
+        off = 2.0 * self.images.patches.tolerance_m + ENDPOINT_CLEARANCE
+        return np.asarray(ways.point + off * self.edges.outward[ways.edge])
+
+    def _passing(self, ways: _Ways) -> _Ways:
+        """Those without a mirror that pass one slab."""
+        if self.walls is None:
+            return ways.take(np.zeros(0, int))
+        ways = ways.take(np.flatnonzero((ways.patch < 0).all(axis=1)))
+        start = np.repeat(self._beside(ways)[:, None], 2, axis=1)
+        rows, legs = passed(self.walls, start, ways.end)
+        one = np.flatnonzero(sum(s.count for s in legs) == 1)
+        ways, legs = ways.take(rows[one]), [s.take(one) for s in legs]
+        face, thickness = (
+            np.stack([getattr(s, name)[:, 0] for s in legs], axis=1) for name in ("face", "thickness_m")
+        )
+        mesh, way = self.walls.mesh, ways.end - ways.point[:, None]
+        normal, met = mesh.face_normals[face], face >= 0
+        depth = ((mesh.triangles[face, 0] - ways.point[:, None]) * normal).sum(axis=2)
+        part = np.divide(depth, (way * normal).sum(axis=2), out=np.full(met.shape, np.nan), where=met)
+        stop = ways.point[:, None] + part[..., None] * way
+        return replace(ways, slab=face, thickness_m=thickness, stop=stop)
+
     def _unobstructed(self, ways: _Ways) -> np.ndarray:
-        """Whether both legs are free; rays end off the edge, halfway between its faces, so that these are not met."""
+        """Whether both legs are free."""
         patches = self.images.patches
-        off = self.edges.outward[ways.edge] * (2.0 * patches.tolerance_m + ENDPOINT_CLEARANCE)
+        beside = self._beside(ways)
         found = np.ones(len(ways.edge), bool)
         for j in range(2):
             for mirrored in (False, True):
                 own = np.flatnonzero(found & ((ways.patch[:, j] >= 0) == mirrored))
-                edge, end = (ways.point + off)[own], ways.end[own, j]
-                patch, mirror = (a[own, j : j + int(mirrored)] for a in (ways.patch, ways.mirror))
+                edge, end = beside[own], ways.end[own, j]
+                patch, mirror = (a[own, j : j + int(mirrored)] for a in (ways.patch, ways.stop))
                 if len(own):
                     found[own] = unobstructed(patches, end[:, None], edge, patch, mirror, self.images.device)
         return found
@@ -254,20 +276,43 @@ class EdgeFinder:
         smooth = np.sqrt(1.0 - self.table.scattering[group] ** 2)
         return smooth * te, smooth * tm
 
+    def _passage(
+        self, group: np.ndarray, cosine: np.ndarray, thickness_m: np.ndarray | float = np.nan
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """TE and TM of slabs of ``group`` (L,), and by how much they make a path longer [m]; ``thickness_m`` of solids."""
+        if self.table is None:
+            raise ValueError("table: got None, expected materials beside walls")
+        solid = np.where(np.isnan(thickness_m), self.table.thickness_m[group], thickness_m)
+        return slab_passage(cosine, self.table.permittivity[group], solid, self.wavelength_m)
+
+    def _sheet(self, group: np.ndarray, cosine: np.ndarray, sheet: np.ndarray) -> Pair:
+        """TE and TM of a field behind a sheet over that of the way in air, 0 of what is no ``sheet``."""
+        te, tm, longer = self._passage(group, cosine)
+        late = np.where(sheet, np.exp(-2j * np.pi / self.wavelength_m * longer), 0.0)
+        return te * late, tm * late
+
     def _described(self, ways: _Ways, receiver: np.ndarray) -> EdgePaths:
         edges, patches, rays = self.edges.take(ways.edge), self.images.patches, self._rays(ways)
         faces, cosines = patches.face_patch[edges.face], rays.incidence_cosines()
         reflected = [self._reflection(faces[:, j], cosines[2 + j]) for j in range(2)]
         through = None
-        if self.through is not None:
-            ends = edges.n > 1.99  # of sheets
-            passed = [self.through(patches.group[faces[:, j]], cosines[j]) for j in range(2)]
-            through = [(np.where(ends, te, 0.0), np.where(ends, tm, 0.0)) for te, tm in passed]
+        if self.walls is not None:
+            through = [self._sheet(patches.group[faces[:, j]], cosines[j], edges.n > 1.99) for j in range(2)]
         bent = diffraction_matrices(rays, reflected, through)
         before, behind = (_edge_basis(edges.along, ways.direction[:, j]) for j in range(2))
         field, sign = np.swapaxes(behind, 1, 2) @ bent @ before, bent[:, 0, 0].copy()
-        outer = ways.direction.copy()
+        outer, excess = ways.direction.copy(), np.zeros(len(ways.edge))
         for j in range(2):
+            own = np.flatnonzero(ways.slab[:, j] >= 0)
+            if len(own) and self.walls is not None and self.group is not None:
+                normal, way = self.walls.mesh.face_normals[ways.slab[own, j]], ways.direction[own, j]
+                cosine = np.abs((way * normal).sum(axis=1))
+                te, tm, excess[own] = self._passage(
+                    self.group[ways.slab[own, j]], cosine, ways.thickness_m[own, j]
+                )
+                slab = _at_plane(normal, way, way, te, tm)
+                field[own] = field[own] @ slab if j == 0 else slab @ field[own]
+                sign[own] *= te
             own = np.flatnonzero(ways.patch[:, j] >= 0)
             normal, inner = patches.normal[ways.patch[own, j]], ways.direction[own, j]
             cosine = (inner * normal).sum(axis=1)
@@ -275,9 +320,9 @@ class EdgeFinder:
             te, tm = self._reflection(ways.patch[own, j], np.abs(cosine))
             sign[own] *= te
             if j == 0:
-                field[own] = field[own] @ _mirror(normal, outer[own, 0], inner, te, tm)
+                field[own] = field[own] @ _at_plane(normal, outer[own, 0], inner, te, tm)
             else:
-                field[own] = _mirror(normal, inner, outer[own, 1], te, tm) @ field[own]
+                field[own] = _at_plane(normal, inner, outer[own, 1], te, tm) @ field[own]
         departure, arrival, length = outer[:, 0], -outer[:, 1], ways.leg.sum(axis=1)
         matrix = transverse_basis(arrival) @ field @ np.swapaxes(transverse_basis(departure), 1, 2)
         if self.table is None:
@@ -287,7 +332,7 @@ class EdgeFinder:
         )
         code, point = ways.stops()
         return EdgePaths(
-            receiver, ways.edge, ways.patch, code, point, length,
+            receiver, ways.edge, ways.patch, code, point, length, excess,
             length - np.linalg.norm(ways.end[:, 1] - ways.end[:, 0], axis=1), departure, arrival, matrix,
             size * sign / np.maximum(np.abs(sign), 1e-300), self.wavelength_m,
         )  # fmt: skip
@@ -295,13 +340,16 @@ class EdgeFinder:
 
 @dataclass(frozen=True)
 class _Ways:
-    """L ways over an edge each: ``patch`` (L, 2) before and behind, -1 for none, and the ``mirror`` points (L, 2, 3); the
-    ``point`` on the edge (L, 3) and ``at`` how far along (L,); and of both legs, unfolded at mirrors, lengths ``leg`` (L, 2),
-    ``angle`` about the edge (L, 2) and ``direction`` of propagation (L, 2, 3); the ``end`` points (L, 2, 3)."""
+    """L ways over an edge each: the ``patch`` that mirrors or the face of the ``slab`` (L, 2) before and behind, -1 for none, where
+    that ``stop`` is (L, 2, 3), and the ``thickness_m`` of a solid (L, 2); the ``point`` on the edge (L, 3) and ``at`` how far along
+    (L,); and of both legs, unfolded at mirrors, lengths ``leg`` (L, 2), ``angle`` about the edge (L, 2) and ``direction`` of
+    propagation (L, 2, 3); the ``end`` points (L, 2, 3)."""
 
     edge: np.ndarray
     patch: np.ndarray
-    mirror: np.ndarray
+    slab: np.ndarray
+    stop: np.ndarray
+    thickness_m: np.ndarray
     point: np.ndarray
     at: np.ndarray
     leg: np.ndarray
@@ -341,32 +389,39 @@ class _Ways:
         depth = ((point[:, None] * normal).sum(axis=2) - offset)[..., None]
         between = depth + height  # the image is as far behind the plane as the end is before it
         share = np.divide(depth, between, out=np.zeros_like(depth), where=between != 0)
-        mirror = np.where(mirrored, point[:, None] + share * (image - point[:, None]), np.nan)
-        return cls(edge, patch, mirror, point, at, leg, angle, direction, end)
+        stop = np.where(mirrored, point[:, None] + share * (image - point[:, None]), np.nan)
+        slab, solid = np.full(patch.shape, -1), np.full(patch.shape, np.nan)
+        return cls(edge, patch, slab, stop, solid, point, at, leg, angle, direction, end)
 
     @classmethod
     def none(cls, transmitter: np.ndarray) -> _Ways:
         """No ways."""
-        shapes = {"edge": (), "patch": (2,), "at": (), "leg": (2,), "angle": (2,), "point": (3,)}
-        found = {f.name: np.zeros((0, *shapes.get(f.name, (2, 3)))) for f in fields(cls)}
-        return cls(**found | {name: found[name].astype(int) for name in ("edge", "patch")})
+        shapes = {"edge": (), "at": (), "point": (3,), "stop": (2, 3), "direction": (2, 3), "end": (2, 3)}
+        found = {f.name: np.zeros((0, *shapes.get(f.name, (2,)))) for f in fields(cls)}
+        return cls(**found | {name: found[name].astype(int) for name in ("edge", "patch", "slab")})
 
     def take(self, rows: np.ndarray) -> _Ways:
         """The ways ``rows``."""
         return _Ways(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
+    def and_(self, more: _Ways) -> _Ways:
+        """These ways, then ``more``."""
+        return _Ways(
+            **{f.name: np.concatenate([getattr(self, f.name), getattr(more, f.name)]) for f in fields(self)}
+        )
+
     def distinct(self, distance_m: float) -> np.ndarray:
         """Indices of ways that no earlier one repeats, with mirrors on the same sides and all points within ``distance_m``: edges
         that lie so close are one."""
-        side = (self.patch >= 0) @ np.array([1, 2])
-        points = np.stack([self.mirror[:, 0], self.point, self.mirror[:, 1]], axis=1)
+        side = (self.patch >= 0) @ np.array([1, 2]) + (self.slab >= 0) @ np.array([4, 8])
+        points = np.stack([self.stop[:, 0], self.point, self.stop[:, 1]], axis=1)
         return distinct(side, np.nan_to_num(points), distance_m)
 
     def stops(self) -> tuple[np.ndarray, np.ndarray]:
         """Codes ``(L, 2)`` and points ``(L, 2, 3)`` of the interactions, from the transmitter on."""
-        all_codes = np.where(self.patch >= 0, MIRROR, 0)
+        all_codes = np.where(self.patch >= 0, MIRROR, np.where(self.slab >= 0, SLAB, 0))
         code = np.column_stack([all_codes[:, 0], np.full(len(self.edge), EDGE), all_codes[:, 1]])
-        point = np.stack([self.mirror[:, 0], self.point, self.mirror[:, 1]], axis=1)
+        point = np.stack([self.stop[:, 0], self.point, self.stop[:, 1]], axis=1)
         order = np.argsort(code == 0, axis=1, kind="stable")[:, :2]
         code = np.take_along_axis(code, order, axis=1).astype(np.int8)
         return code, np.take_along_axis(point, order[..., None], axis=1)
@@ -379,10 +434,10 @@ def _edge_basis(along: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return np.stack([np.cross(direction, p), p], axis=1)
 
 
-def _mirror(
+def _at_plane(
     normal: np.ndarray, before: np.ndarray, behind: np.ndarray, te: np.ndarray, tm: np.ndarray
 ) -> np.ndarray:
-    """What a mirror makes of field vectors, shape ``(L, 3, 3)``."""
+    """What a mirror or a slab makes of field vectors, shape ``(L, 3, 3)``."""
     across = np.cross(before, normal)
     sine = np.linalg.norm(across, axis=1, keepdims=True)
     across = np.where(sine > 1e-6, across / np.maximum(sine, 1e-6), vectors_across(before)[0])

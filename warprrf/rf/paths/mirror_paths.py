@@ -42,6 +42,7 @@ class MirrorPaths:
         point: Points where either is met [m], shape ``(L, K, 3)``; NaN past the last.
         share: Part of the field that is not blocked, shape ``(L,)``, in (0, 1].
         length_m: Unfolded length, shape ``(L,)``.
+        excess_m: What slabs make it longer by for a wave, shape ``(L,)``; 0 where their materials were not asked.
         arrival: Unit direction from the receiver to what it sees last, shape ``(L, 3)``.
         normal: Unit normal of each, either way, shape ``(L, K, 3)``; NaN past the last.
         cosine: Cosine of incidence at each, 0 past the last, shape ``(L, K)``.
@@ -57,6 +58,7 @@ class MirrorPaths:
     point: np.ndarray
     share: np.ndarray
     length_m: np.ndarray
+    excess_m: np.ndarray
     arrival: np.ndarray
     normal: np.ndarray
     cosine: np.ndarray
@@ -66,6 +68,11 @@ class MirrorPaths:
 
     def __len__(self) -> int:
         return len(self.receiver)
+
+    @property
+    def delay_m(self) -> np.ndarray:
+        """How far light goes in air in the time that each takes [m], shape ``(L,)``."""
+        return self.length_m + self.excess_m
 
     @property
     def order(self) -> np.ndarray:
@@ -148,7 +155,7 @@ def exact_paths(
         if walls is not None:
             dark = np.flatnonzero(~free)
             legs = _legs(patches, source, receivers[row[dark]], patch[dark], point[dark], patches.tolerance_m)
-            through, slabs = _passed(walls, *legs)
+            through, slabs = passed(walls, *legs)
             through = dark[through]
             own = distinct(row[through], point[through], 3.0 * patches.tolerance_m)
             own, slabs = through[own], [s.take(own) for s in slabs]
@@ -202,11 +209,11 @@ def zone_paths(
         if walls is not None:
             dark = np.flatnonzero(~free)
             dark = dark[through.reached(receivers[row[dark]], patch[dark], point[dark])]
-            passed, slabs = _passed(
+            own, slabs = passed(
                 walls,
                 *_legs(patches, source, receivers[row[dark]], patch[dark], point[dark], position_error_m),
             )
-            dark = dark[passed]
+            dark = dark[own]
             kept[dark] = False
             found = (
                 row[dark],
@@ -386,7 +393,7 @@ def _legs(
     return begin, end
 
 
-def _passed(walls: Walls, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, list[Slabs]]:
+def passed(walls: Walls, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, list[Slabs]]:
     """Which paths arrive through slabs, at most as many as ``walls`` allow, and what each leg passes on those."""
     rows, slabs = np.arange(len(begin)), list[Slabs]()
     for k in range(begin.shape[1]):
@@ -476,8 +483,8 @@ def _described(
     code = np.where(slab >= 0, SLAB, np.where(patch >= 0, MIRROR, 0)).astype(np.int8)
     return MirrorPaths(
         receiver=row, patch=filled(patch, -1), slab=filled(slab, -1), point=filled(point, np.nan), share=share,
-        length_m=length, arrival=arrival, normal=filled(normal, np.nan), cosine=filled(cosine, 0.0), turn=filled(turn, 0.0),
-        thickness_m=filled(thickness, np.nan), code=filled(code, 0),
+        length_m=length, excess_m=0.0 * length, arrival=arrival,
+        normal=filled(normal, np.nan), cosine=filled(cosine, 0.0), turn=filled(turn, 0.0), thickness_m=filled(thickness, np.nan), code=filled(code, 0),
     )  # fmt: skip
 
 

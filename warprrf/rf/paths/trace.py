@@ -6,8 +6,6 @@ Angles: arrival points from the receiver to the last interaction, departure from
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -160,10 +158,9 @@ class MirrorTracer:
         self.images = MirrorImages(self.patches, self.transmitter, max_chains=max_chains, device=device)
         self.edges: EdgeFinder | None = None
         if diffractions:
-            through = None
-            if self.walls is not None and self.table is not None:
-                through = partial(self._through_sheets, self.table)
-            self.edges = EdgeFinder(self.images, self.wavelength_m, self.table, through=through)
+            self.edges = EdgeFinder(
+                self.images, self.wavelength_m, self.table, walls=self.walls, group=self._face_material
+            )
 
     @property
     def wavelength_m(self) -> float:
@@ -205,17 +202,8 @@ class MirrorTracer:
         kind = np.full(len(own), "edge", "<U7")
         return Paths._from_points(
             self.transmitter, point, own.point, own.amplitude, kind, self.frequency_hz,
-            None if self.table is None else jones, interactions=own.code,
+            None if self.table is None else jones, own.excess_m, interactions=own.code,
         )  # fmt: skip
-
-    def _through_sheets(
-        self, table: SurfaceTable, material: np.ndarray, cosine: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """What a sheet makes of a field that passes it, over that of the way in air."""
-        eta, thickness = table.permittivity[material], table.thickness_m[material]
-        te, tm, longer = slab_passage(cosine, eta, thickness, self.wavelength_m)
-        late = np.exp(-2j * np.pi / self.wavelength_m * longer)
-        return te * late, tm * late
 
     def find(
         self, receivers: ArrayLike, mirror_order: int = 1, progress: Progress | None = None

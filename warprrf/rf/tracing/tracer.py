@@ -22,6 +22,7 @@ import numpy as np
 from warprrf.cache import Cache, making
 from warprrf.device import DeviceLike, Progress, resolve
 from warprrf.kernels.radio.records import MIRROR, SCATTER, SLAB, SOURCE
+from warprrf.rf.em.fresnel import slab_passage
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.edge_paths import EdgeFinder
 from warprrf.rf.paths.images import MirrorImages
@@ -133,7 +134,7 @@ class View:
 
     def kept_paths(self, effects: Effects) -> np.ndarray:
         """Which line of sight and mirror paths count, shape ``(L,)`` bool."""
-        order, slabs = self.paths.order, self.paths.slabs
+        order, slabs = self.paths.order, (self.paths.code == SLAB).sum(axis=1)
         few = (order <= effects.mirrors) & (slabs <= effects.transmissions)
         few &= ~self.paths.over_edge | (effects.diffractions > 0)
         return np.asarray(few & (~self.paths.in_sight | effects.line_of_sight))
@@ -279,15 +280,31 @@ class Tracer:
             self.images, receivers, effects.mirrors, self.wavelength_m, self.surface.position_error_m, progress,
             self.walls(effects.transmissions),
         )  # fmt: skip
+        found = self._delayed(found)
         if not effects.diffractions:
             return found
-        edges = self.kept.get("edges", self._edges)
+        most = effects.transmissions
+        edges = self.kept.get(("edges", most), lambda: self._edges(most))
         return edges.find(receivers, min(effects.mirrors, 1), progress).beside(found)
 
-    def _edges(self) -> EdgeFinder:
-        """Paths over edges, between surfaces as they are taken to be before any measurement."""
-        images = MirrorImages(self.surface.patches, self.transmitter, device=self.grid.device)
-        return EdgeFinder(images, self.wavelength_m, self.surface.table(self.frequency_hz))
+    def _delayed(self, found: MirrorPaths) -> MirrorPaths:
+        """``found`` with what slabs of known materials make them longer by."""
+        table, (row, k) = self.surface.table(self.frequency_hz), np.nonzero(found.slab >= 0)
+        group, solid = self.surface.group[found.slab[row, k]], found.thickness_m[row, k]
+        thickness = np.where(np.isnan(solid), table.thickness_m[group], solid)
+        longer = slab_passage(found.cosine[row, k], table.permittivity[group], thickness, self.wavelength_m)[
+            2
+        ]
+        return replace(found, excess_m=np.bincount(row, longer, minlength=len(found)))
+
+    def _edges(self, most: int) -> EdgeFinder:
+        """Paths over edges and a slab, if ``most`` is not 0, between surfaces as they are taken to be before any measurement."""
+        images, s = (
+            MirrorImages(self.surface.patches, self.transmitter, device=self.grid.device),
+            self.surface,
+        )
+        table = s.table(self.frequency_hz)
+        return EdgeFinder(images, self.wavelength_m, table, walls=self.walls(most), group=s.group)
 
     def view(
         self, receivers: np.ndarray, effects: Effects, *, paths: MirrorPaths | None = None, keeps: bool = True

@@ -71,7 +71,7 @@ class LinkTracer:
         gains = path_gains(view, self._model, self._materials)
         paths, specular = view.paths, gains.specular
         total, moment, square = (
-            np.bincount(paths.receiver, specular * (paths.length_m / SPEED_OF_LIGHT) ** k, minlength=count)
+            np.bincount(paths.receiver, specular * (paths.delay_m / SPEED_OF_LIGHT) ** k, minlength=count)
             for k in range(3)
         )
         best = np.zeros(count)

@@ -141,7 +141,7 @@ def direct_paths(view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     first = paths.point[:, 0]
     toward = np.where(np.isnan(first), view.receivers[0], first) - transmitter
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-    return paths.arrival, toward, paths.length_m / SPEED_OF_LIGHT
+    return paths.arrival, toward, paths.delay_m / SPEED_OF_LIGHT
 
 
 @dataclass(frozen=True, eq=False)
@@ -355,7 +355,7 @@ class ArrayImage(ByPixels):
         heard *= np.sqrt(array.gain(paths.arrival))[:, None]
         wavelength = view.tracer.wavelength_m
         kept = np.exp(-0.5 * (2.0 * np.pi * length_std_m / wavelength) ** 2)
-        phase = np.exp(-2j * np.pi * np.mod(paths.length_m / wavelength, 1.0))
+        phase = np.exp(-2j * np.pi * np.mod(paths.delay_m / wavelength, 1.0))
         heard *= _passage(view)[:, None]
         together = Superposition(
             (kept * phase[:, None] * heard).astype(np.complex64),

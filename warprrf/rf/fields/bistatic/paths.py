@@ -63,6 +63,7 @@ def paths_of(
         np.sqrt(np.concatenate([specular, power])).astype(complex),
         np.concatenate([kinds, np.full(len(power), "diffuse", dtype="<U7")]),
         view.tracer.frequency_hz,
+        excess_m=np.concatenate([found.excess_m[exact], np.zeros(len(power))]),
         interactions=np.concatenate([found.code[exact], codes]),
     )
     order = np.argsort(-np.abs(paths.gain), kind="stable")[:max_paths]
@@ -89,7 +90,7 @@ def strongest(gains: PathGains, image: np.ndarray, beam_sigma_rad: float) -> tup
         first = view.paths.point[:, 0]
         first = np.where(np.isnan(first), receiver, first) - transmitter
         outward = np.where(direct[..., None], first[which], outward)
-        length = np.where(direct, view.paths.length_m[which], length)
+        length = np.where(direct, view.paths.delay_m[which], length)
     length = np.where(np.isfinite(length), length, np.nan)
     outward = np.where(np.isnan(length)[..., None], 1.0, outward)
     aod = np.stack(angles_from_directions(outward), axis=-1)
