@@ -484,7 +484,8 @@ def _described(
     return MirrorPaths(
         receiver=row, patch=filled(patch, -1), slab=filled(slab, -1), point=filled(point, np.nan), share=share,
         length_m=length, excess_m=0.0 * length, arrival=arrival,
-        normal=filled(normal, np.nan), cosine=filled(cosine, 0.0), turn=filled(turn, 0.0), thickness_m=filled(thickness, np.nan), code=filled(code, 0),
+        normal=filled(normal, np.nan), cosine=filled(cosine, 0.0), turn=filled(turn, 0.0),
+        thickness_m=filled(thickness, np.nan), code=filled(code, 0),
     )  # fmt: skip
 
 
