@@ -1,4 +1,4 @@
-"""What a field is fitted to: readings, arrays, meshes without names; which effects a scene needs."""
+"""What a field is fitted to: readings, arrays, meshes without names, links of a flat; walls; which effects a scene needs."""
 
 from __future__ import annotations
 
@@ -30,6 +30,49 @@ def _suggest() -> str:
     ]  # fmt: skip
     wanted = "blocked: within 3 degrees", "beam loss [dB]", "total power, rms [dB]"
     return markdown(("spectra of", "draws", "PSNR [dB]", "spread", *wanted), lines)
+
+
+@entry("flat")
+def _flat() -> str:
+    found = read("measured_flat")
+    head = ("held out", "model", "rms [dB]", "in sight", "behind walls", "worst held out")
+    keys = ("rms_db", "seen_db", "behind_db", "worst_db")
+    lines = [
+        [f"one {r['held_out']}", r["model"], *(show(r[key], "{:.2f}") for key in keys)] for r in found["rows"]
+    ]
+    return markdown(head, lines)
+
+
+@entry("flat-noise")
+def _flat_noise() -> str:
+    found = read("measured_flat_noise")
+    lines = [
+        [
+            name,
+            str(r["links"]),
+            *(f"{r[k]:.2f}" for k in ("halves_by_time", "halves_by_chance", "single_reading")),
+        ]
+        for name, r in ((n, found[n]) for n in ("all", "in sight", "behind walls"))
+    ]
+    return markdown(("links", "means", "noise of a mean [dB]", "without drift", "of a single reading"), lines)
+
+
+@entry("office")
+def _office() -> str:
+    columns = (
+        ("psnr_db", "PSNR [dB]", "{:.1f}"), ("perfect_db", "of a model without error", "{:.1f}"),
+        ("total_rms_db", "total power, rms [dB]", "{:.2f}"), ("direction_within_3deg", "within 3 degrees", "{:.0%}"),
+    )  # fmt: skip
+    lines = [
+        [
+            f"{r['carrier_ghz']:g}",
+            str(r["n_train"]),
+            r["room"],
+            *(show(r[key], form) for key, _, form in columns),
+        ]
+        for r in read("office")["rows"]
+    ]
+    return markdown(("carrier [GHz]", "spectra", "receivers", *(title for _, title, _ in columns)), lines)
 
 
 @entry("arrays")
@@ -71,7 +114,7 @@ EFFECTS = {
     "lobe_4": "scattering lobe of exponent 4",
     "lobe_10": "scattering lobe of exponent 10",
     "gas": "absorption by the air (ITU-R P.676)",
-    "diffraction": "diffraction (knife edge, ITU-R P.526)",
+    "diffraction": "diffraction over one edge",
     "transmission": "transmission through walls (ITU-R P.2040)",
 }
 
