@@ -32,6 +32,7 @@ def readings(**changes):
         ("faces.*0 to 2", lambda: wr.Mesh(np.eye(3), [[0, 1, 3]])),
         ("faces.*0 to 2", lambda: wr.Mesh(np.eye(3), [[0, 1, -1]])),
         ("faces.*int32", lambda: wr.Mesh(np.eye(3), [[0, 1.5, 2.0]])),  # neither rounded nor wrapped
+        ("pieces", lambda: wr.Reconstruction(None, furnished().mesh, pieces=["a.png"])),
         ("faces", lambda: wr.Mesh(np.eye(3), [[0, 2**40, 1]])),
         ("length", lambda: wr.Paths.stack([random_paths(3)], length=3.5)),
         ("mirrors", lambda: wr.Effects(mirrors=2.5)),

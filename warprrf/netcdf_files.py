@@ -457,6 +457,8 @@ class _Found:
         held, expected = self.array, axis.expected(self.array.size)
         if expected.dtype.kind == "U":
             held = np.array([str(_plain(word)) for word in held.ravel()], dtype=str)
+        elif held.dtype.kind not in "iuf":
+            raise ValueError(f"{self.name}: got values of type {held.dtype}, expected numbers")
         elif axis.period is not None:
             low = expected.mean() - 0.5 * axis.period
             held = (held - low) % axis.period + low

@@ -114,6 +114,11 @@ class Reconstruction:
         self.guessed = tuple(guessed)
         self.lenses = dict(lenses or {})
         self.causes = dict(causes or {})
+        for piece in pieces:
+            if isinstance(piece, str) or not isinstance(piece, Sequence):
+                raise TypeError(
+                    f"pieces: got {piece!r} among them, expected each to be a sequence of photos' names"
+                )
         self.pieces = tuple(map(tuple, pieces))
         for name, file in (photos or {}).items():
             if not isinstance(file, str | os.PathLike):

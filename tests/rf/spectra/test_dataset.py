@@ -148,6 +148,7 @@ REFUSED = {
     "azimuth: got the unit 'degrees'": lambda data: data.assign_coords(
         azimuth=("azimuth", np.rad2deg(data.azimuth.values), {"units": "degrees"})
     ),
+    "azimuth: got values of type": lambda data: data.assign_coords(azimuth=data.azimuth.astype(str)),
     "xyz: got the places": lambda data: data.assign_coords(xyz=["x", "y", "t"]),
     "delay: got the unit 'ns'": lambda data: data.assign(delay=(data.delay * 1e9).assign_attrs(units="ns")),
     "delay: got values packed by scale_factor": lambda data: data.assign(
