@@ -14,16 +14,37 @@ HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "helpers"), str(HERE), str(HERE.parent)]
 
 
+def pytest_addoption(parser):
+    parser.addoption("--on", default="cpu", help="the device of tests that name none (default: %(default)s)")
+
+
 def pytest_runtest_setup(item):
     if item.get_closest_marker("cuda") and not wp.is_cuda_available():
         pytest.skip("needs a CUDA device: none here")
 
 
+@pytest.fixture(autouse=True)
+def _default_device(request):
+    """Tests that name no device run on the CPU, where a GPU is at hand too."""
+    with wp.ScopedDevice(request.config.getoption("--on")):
+        yield
+
+
 @pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
-def device(request):
-    """Warp's default device while a test runs: the CPU, and again a GPU where there is one."""
+def device(request, monkeypatch, _default_device):
+    """Warp's default device while a test runs: the CPU, and again a GPU where there is one. Kernels must run there."""
+    launched, launch = [], wp.launch
+
+    def counted(kernel, *args, **kwargs):
+        launched.append(wp.get_device(kwargs.get("device")).alias)
+        return launch(kernel, *args, **kwargs)
+
+    monkeypatch.setattr(wp, "launch", counted)
     with wp.ScopedDevice(request.param):
         yield request.param
+    assert request.param in launched, (
+        f"nothing was launched on {request.param}: this test says nothing about it"
+    )
 
 
 @pytest.fixture(params=["blocks", "reference"])

@@ -23,7 +23,7 @@ def test_it_says_how_much_there_is(place):
         (place.spectra, f"({len(place.spectra)} receivers: "),
         (place.scene, f"({len(place.mesh.faces)} faces, "),
         (place.gaussians, f"means ({len(place.gaussians)}, 3)"),
-        (wr.render(place.gaussians, place.camera, device="cpu"), "alpha (12, 16)"),
+        (wr.render(place.gaussians, place.camera), "alpha (12, 16)"),
         (many, f"gain (40, {many.gain.shape[1]})"),
         (wr.Spectrum(np.zeros((90, 180))), "path_gain (90, 180)"),
         (place.mesh.closest([[0, 0, 1.0]] * 2), "point (2, 3)"),

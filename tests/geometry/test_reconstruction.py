@@ -89,7 +89,7 @@ def test_ten_photos_become_gaussians_mesh_and_patches(whole):
     assert np.abs(rec.patches.offset[level]).min() < 0.02
     truth = wr.Scene.load(LOBBY / "scene.xml").mesh
     centres = rec.mesh.triangles.mean(axis=1)
-    assert np.median(truth.distance(centres, device="cpu")) < 0.03
+    assert np.median(truth.distance(centres)) < 0.03
     assert rec.patches.area.sum() > 0.5 * rec.mesh.areas.sum()
     for k in range(5):
         corners = rec.mesh.triangles[rec.patches.faces(k)]

@@ -38,13 +38,13 @@ def alpha_of_one(g, cam, blending):
 
 def ours64(g, cam, blending=SMOOTH):
     """Alpha of the float64 rasteriser."""
-    raster = Rasterizer(device="cpu", blending=blending, real=wp.float64)
-    table = wp.ones((len(g), 1), dtype=wp.float64, device="cpu")
+    raster = Rasterizer(blending=blending, real=wp.float64)
+    table = wp.ones((len(g), 1), dtype=wp.float64)
     return raster.rasterize(*raster.upload(g), table, cam).alpha.numpy()
 
 
 def ours32(g, cam, blending=SMOOTH):
-    return render(g, cam, np.ones((len(g), 1)), device="cpu", blending=blending).alpha
+    return render(g, cam, np.ones((len(g), 1)), blending=blending).alpha
 
 
 @pytest.mark.parametrize(
@@ -73,12 +73,12 @@ def test_the_length_of_a_quaternion_changes_no_pixel(length):
     q = np.array([0.4, -0.2, 0.7, 0.3])
     q /= np.linalg.norm(q)
     g = gaussians([0, 0, 5.0], [0.5, 0.1, 1.0], quaternions=q)
-    raster = Rasterizer(device="cpu", blending=SMOOTH, real=wp.float64)
+    raster = Rasterizer(blending=SMOOTH, real=wp.float64)
     inputs = raster.upload(g)
-    table = wp.ones((1, 1), dtype=wp.float64, device="cpu")
+    table = wp.ones((1, 1), dtype=wp.float64)
     unit, scaled = (
         raster.rasterize(
-            inputs[0], wp.array([q * s], dtype=wp.vec4d, device="cpu"), *inputs[2:], table, pinhole()
+            inputs[0], wp.array([q * s], dtype=wp.vec4d), *inputs[2:], table, pinhole()
         ).alpha.numpy()
         for s in (1.0, length)
     )
@@ -127,7 +127,7 @@ def test_one_gaussian_of_any_size_is_what_its_definition_says(mean, scales, came
     expected = alpha_of_one(g, camera, SMOOTH)
     assert expected.max() > 0.1
     assert np.abs(ours64(g, camera) - expected).max() < most64
-    found = render(g, camera, np.ones((1, 1)), device="cpu", blending=SMOOTH)
+    found = render(g, camera, np.ones((1, 1)), blending=SMOOTH)
     assert np.abs(found.alpha - expected).max() < most32
     peak = np.unravel_index(expected.argmax(), expected.shape)
     reach, _, _ = met(g, camera.position, camera.directions()[peak])
@@ -181,24 +181,24 @@ def test_equal_ranges_are_blended_in_the_order_given():
     for order in ([0, 1, 2], [2, 1, 0], [1, 2, 0]):
         chosen = g[np.array(order)]
         a, b, c = chosen.opacities
-        out = render(chosen, pinhole(), np.eye(3), device="cpu", blending=SMOOTH)
+        out = render(chosen, pinhole(), np.eye(3), blending=SMOOTH)
         expected = [a, (1 - a) * b, (1 - a) * (1 - b) * c]
         assert out.features[16, 16] == pytest.approx(expected, abs=1e-6)
         assert out.dominant[16, 16] == int(np.argmax(expected))
     # Also where ranges are equal and places are not: mirror images about the axis.
     pair = gaussians([[0.1, 0, 2.0], [-0.1, 0, 2.0]], [0.3] * 3, opacities=0.5)
     response = 0.5 * np.exp(-0.5 * (2.0 * 0.1 / np.hypot(2.0, 0.1) / 0.3) ** 2 * (1 + 0.1**2 / 4))
-    out = render(pair, pinhole(), np.eye(2), device="cpu", blending=SMOOTH)
+    out = render(pair, pinhole(), np.eye(2), blending=SMOOTH)
     assert out.features[16, 16] == pytest.approx([response, (1 - response) * response], abs=1e-6)
 
 
 def test_opacity_zero_contributes_nothing_and_opacity_one_hides_what_is_behind():
     g = gaussians([[0, 0, 2.0], [0, 0, 3.0], [0, 0, 4.0]], [0.3] * 3, opacities=(0.0, 1.0, 0.5))
-    out = render(g, pinhole(), np.eye(3), device="cpu", blending=SMOOTH)
+    out = render(g, pinhole(), np.eye(3), blending=SMOOTH)
     assert out.features[16, 16] == pytest.approx([0, 1, 0], abs=0)
     assert out.depth[16, 16] == pytest.approx(3.0) and out.dominant[16, 16] == 1
     assert (out.features[..., 0] == 0).all()
-    photo = render(g, pinhole(), np.eye(3), device="cpu")  # clamped at 0.99, so that a hundredth passes
+    photo = render(g, pinhole(), np.eye(3))  # clamped at 0.99, so that a hundredth passes
     assert photo.features[16, 16] == pytest.approx([0, 0.99, 0.01 * 0.5], abs=1e-6)
 
 
@@ -208,12 +208,12 @@ def test_gradients_at_opacity_zero_and_one_are_those_of_the_blend(rule):
     """On the axis the image is a1 + T(a1) a2 with features one and two behind: derivatives in closed form."""
     for first, blending in ((1.0, SMOOTH), (0.0, SMOOTH), (1.0, Blending())):
         blending = Blending(blending.alpha_min, blending.alpha_max, blending.transmittance_min, rule)
-        raster = Rasterizer(device="cpu", blending=blending, real=wp.float64)
+        raster = Rasterizer(blending=blending, real=wp.float64)
         g = gaussians([[0, 0, 2.0], [0, 0, 3.0]], [0.3] * 3, opacities=(first, 0.5))
         inputs = raster.upload(g)
         for array in inputs:
             array.requires_grad = True
-        table = wp.array([[1.0], [2.0]], dtype=wp.float64, device="cpu")
+        table = wp.array([[1.0], [2.0]], dtype=wp.float64)
         with wp.Tape() as tape:
             out = raster.rasterize(*inputs, table, pinhole(1, 1))
         tape.backward(grads={out.features: wp.ones_like(out.features)})
@@ -232,12 +232,12 @@ def test_gradients_at_opacity_zero_and_one_are_those_of_the_blend(rule):
 @pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("count", [0, 3])
 def test_none_visible_is_the_background_and_has_no_gradient_but_the_backgrounds(count):
-    raster = Rasterizer(device="cpu", real=wp.float64)
+    raster = Rasterizer(real=wp.float64)
     inputs = raster.upload(gaussians(np.full((count, 3), -50.0), [0.1] * 3))
     for array in inputs:
         array.requires_grad = True
-    features = wp.ones((count, 2), dtype=wp.float64, device="cpu", requires_grad=True)
-    background = wp.array([0.25, 0.5], dtype=wp.float64, device="cpu", requires_grad=True)
+    features = wp.ones((count, 2), dtype=wp.float64, requires_grad=True)
+    background = wp.array([0.25, 0.5], dtype=wp.float64, requires_grad=True)
     with wp.Tape() as tape:
         out = raster.rasterize(*inputs, features, pinhole(20, 10), background)
     assert (out.features.numpy() == [0.25, 0.5]).all()
@@ -258,7 +258,7 @@ def test_one_million_gaussians_in_a_plane_let_through_what_the_dilogarithm_says(
     assert len(g) == 1_000_000
     cam = pinhole(25, 25, focal=12.5)
     blending = Blending(alpha_min=1e-3, alpha_max=1.0, transmittance_min=-0.5)
-    out = render(g, cam, np.ones((len(g), 1)), background=0.0, device="cpu", blending=blending)
+    out = render(g, cam, np.ones((len(g), 1)), background=0.0, blending=blending)
 
     def dilogarithm(v):
         return spence(1 - v)  # SciPy's spence(z) is Li2(1 - z)

@@ -9,7 +9,7 @@ from warprrf.geometry.splats.rasterizer import RADIO
 
 
 def test_inside_a_gaussian_only_a_peak_ahead_counts():
-    rays = GaussianRays(gaussians([0, 0, 0]), device="cpu")
+    rays = GaussianRays(gaussians([0, 0, 0]))
     found = rays.hits([[-0.05, 0, 0], [0.05, 0, 0], [0, 0, 0]], [1, 0, 0], 2)
     assert found.index[:, 0].tolist() == [0, -1, -1]  # at its very centre a Gaussian contributes nothing
     assert found.t[0, 0] == pytest.approx(0.05) and found.alpha[0, 0] == pytest.approx(0.8)
@@ -18,16 +18,16 @@ def test_inside_a_gaussian_only_a_peak_ahead_counts():
 def test_no_gaussian_met_and_none_there():
     nothing = gaussians(np.zeros((0, 3)))
     for g in (gaussians(), gaussians(opacities=0.0), nothing):
-        rays = GaussianRays(g, device="cpu")
+        rays = GaussianRays(g)
         found = rays.hits([0, 0, 0], [[-1, 0, 0], [0, 0, 1]], 3)
         assert (found.index == -1).all() and np.isinf(found.t).all() and not found.weight.any()
         np.testing.assert_array_equal(found.left, [1, 1])
         np.testing.assert_array_equal(rays.transmittance([0, 0, 0], [[0, 0, 9], [0, 9, 0]]), [1, 1])
-    assert GaussianRays(gaussians(), device="cpu").hits(np.zeros((0, 3)), [1, 0, 0]).index.shape == (0, 16)
+    assert GaussianRays(gaussians()).hits(np.zeros((0, 3)), [1, 0, 0]).index.shape == (0, 16)
 
 
 def test_between_two_equal_points_everything_passes():
-    rays = GaussianRays(gaussians(), device="cpu")
+    rays = GaussianRays(gaussians())
     np.testing.assert_array_equal(rays.transmittance([[2, 0, 0], [0, 0, 0]], [[2, 0, 0], [0, 0, 0]]), [1, 1])
 
 
@@ -41,7 +41,7 @@ def test_needles_of_one_to_ten_thousand_are_exact():
     origin = rng.uniform(-5, 5, (n, 3))
     axis = g.rotations[np.arange(n), :, np.argmax(g.scales, axis=1)]
     target = g.means + rng.normal(size=(n, 1)) * axis + 1e-4 * rng.normal(size=(n, 3))
-    found = GaussianRays(g, device="cpu").hits(origin, target - origin, 4)
+    found = GaussianRays(g).hits(origin, target - origin, 4)
     expected = [brute_hits(g, o, d, 4, RADIO) for o, d in zip(origin, target - origin, strict=True)]
     assert sum(len(rows) for rows, _ in expected) > 150
     for ray, (rows, _) in enumerate(expected):
@@ -54,7 +54,7 @@ def test_ten_micrometres_at_ten_metres_and_a_kilometre_away():
     rng = np.random.default_rng(9)
     n, size = 500, 1e-5
     means = (10.0 * rng.normal(size=(n, 3))).astype(np.float32)
-    rays = GaussianRays(gaussians(means, [size] * 3, 1.0), device="cpu")
+    rays = GaussianRays(gaussians(means, [size] * 3, 1.0))
     for origin in (np.zeros(3), np.array([800.0, -600.0, 20.0])):
         toward = means.astype(np.float64) - origin
         side = np.cross(toward, [0.3, 0.5, 0.8])
@@ -67,7 +67,7 @@ def test_ten_micrometres_at_ten_metres_and_a_kilometre_away():
 
 def test_a_hundred_metres_wide_gaussian_beside_a_millimetre_one():
     g = gaussians([[0, 0, 50], [3, 0, 0]], [[100] * 3, [1e-3] * 3])
-    rays = GaussianRays(g, device="cpu")
+    rays = GaussianRays(g)
     found = rays.hits([0, 0, 0], [[1, 1e-5, 0], [1, 0, 1e-3], [1, 1e-2, 0]], 2)
     for ray, direction in enumerate([[1, 1e-5, 0], [1, 0, 1e-3], [1, 1e-2, 0]]):
         rows, _ = brute_hits(g, np.zeros(3), np.array(direction), 2, RADIO)
@@ -79,11 +79,11 @@ def test_an_axis_parallel_ray_along_a_box_s_side_is_not_lost():
     y = (
         0.1 * np.sqrt(2 * np.log(1 / RADIO.alpha_min)) * (1 - 1e-9)
     )  # just inside the ellipsoid: alpha just counts
-    found = GaussianRays(g, device="cpu").hits([[0, y, 0], [0, -y, 0], [0, 1.001 * y, 0]], [1, 0, 0], 1)
+    found = GaussianRays(g).hits([[0, y, 0], [0, -y, 0], [0, 1.001 * y, 0]], [1, 0, 0], 1)
     assert found.index[:, 0].tolist() == [0, 0, -1]
 
 
 def test_ties_go_by_index():
-    rays = GaussianRays(gaussians([[2, 0, 0]] * 5, opacities=[0.1, 0.2, 0.3, 0.4, 0.5]), device="cpu")
+    rays = GaussianRays(gaussians([[2, 0, 0]] * 5, opacities=[0.1, 0.2, 0.3, 0.4, 0.5]))
     assert rays.hits([0, 0, 0], [1, 0, 0], 5).index[0].tolist() == [0, 1, 2, 3, 4]
     assert rays.hits([0, 0, 0], [1, 0, 0], 3).index[0].tolist() == [0, 1, 2]

@@ -34,7 +34,6 @@ def small_room(folder: Path) -> Path:
         shape=SHAPE,
         beam_sigma_rad=np.radians(6.0),
         roles=["train"] * 10 + ["test"] * 4,
-        device="cpu",
     )
     assert 0 < np.count_nonzero(ds.line_of_sight[10:]) < 4
     ds.save(folder / "spectra.nc")

@@ -43,11 +43,11 @@ def test_each_face_has_the_material_of_its_object(lobby: Scene) -> None:
 
 def test_air_is_free_and_solids_are_not(lobby: Scene) -> None:
     points = np.array([[7.3, 5.0, 1.5], [9.2, 3.0, 1.5], [3.6, 3.3, 1.0], [7.5, 6.0, -0.1], [7.5, 6.0, 6.0]])
-    np.testing.assert_array_equal(lobby.is_free(points, device="cpu"), [True, False, False, False, False])
+    np.testing.assert_array_equal(lobby.is_free(points), [True, False, False, False, False])
     behind = np.array([[-0.08, 1.38, 0.6]])  # in the west wall, 6 cm from where the sofa ends within it
-    np.testing.assert_array_equal(lobby.is_free(behind, device="cpu"), [False])
+    np.testing.assert_array_equal(lobby.is_free(behind), [False])
     near = np.array([[6.3 + 0.29, 2.0, 1.5], [6.3 + 0.31, 2.0, 1.5]])  # 0.29 and 0.31 m east of the partition
-    np.testing.assert_array_equal(lobby.is_free(near, clearance_m=0.3, device="cpu"), [False, True])
+    np.testing.assert_array_equal(lobby.is_free(near, clearance_m=0.3), [False, True])
 
 
 def test_missing_files_and_materials_are_named(copy: Path) -> None:

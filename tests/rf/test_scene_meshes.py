@@ -32,14 +32,14 @@ def test_names_that_nobody_knows_load_and_are_named_where_values_are_needed(tmp_
     with pytest.raises(
         ValueError, match=r"materials: nothing is known of 'Bark', 'Paint' but the name.*Scene\.load"
     ):
-        wr.simulate(scene, shape=(12, 24), device="cpu", **ends)
+        wr.simulate(scene, shape=(12, 24), **ends)
     with pytest.raises(ValueError, match="'Bark', 'Paint'"):
         wr.trace_paths(scene, **ends)
     paint = wr.em.itu_material("plasterboard")
     with pytest.raises(ValueError, match="materials: nothing is known of 'Bark' but"):
-        wr.simulate(wr.Scene.load(path, materials={"Paint": paint}), shape=(12, 24), device="cpu", **ends)
+        wr.simulate(wr.Scene.load(path, materials={"Paint": paint}), shape=(12, 24), **ends)
     known = wr.Scene.load(path, materials={"Paint": paint, "Bark": wr.em.itu_material("wood")})
-    assert len(wr.simulate(known, shape=(12, 24), device="cpu", **ends)) == 1
+    assert len(wr.simulate(known, shape=(12, 24), **ends)) == 1
     with pytest.raises(ValueError, match="materials: got 'Glass', of which nothing"):
         wr.Scene.load(path, materials={"Glass": paint})
 
@@ -102,7 +102,7 @@ def test_a_reconstruction_of_a_mesh_alone_saves_loads_and_fits(tmp_path: Path) -
     )
     ds = wr.simulate(
         scene, transmitter=[0.8, 0.9, 2.2], receivers=[[4.2, 3.1, 1.2], [4.0, 0.8, 1.5]], frequency_hz=CARRIER,
-        shape=(12, 24), beam_sigma_rad=0.2, device="cpu",
+        shape=(12, 24), beam_sigma_rad=0.2,
     )  # fmt: skip
-    field = wr.RadioField.fit(back, ds, quick=True, device="cpu")
+    field = wr.RadioField.fit(back, ds, quick=True)
     assert np.isfinite(field.spectrum(ds.receivers[0]).path_gain).all()

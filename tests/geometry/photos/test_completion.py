@@ -49,9 +49,7 @@ def made(folder, shown, places, turn=None, config=CONFIG):
         model.add_image_with_trivial_frame(image, pose)
     (folder / "model").mkdir()
     model.write_binary(str(folder / "model"))
-    return wr.Reconstruction.from_files(
-        folder / "g.ply", colmap=folder / "model", device="cpu", config=config
-    )
+    return wr.Reconstruction.from_files(folder / "g.ply", colmap=folder / "model", config=config)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.4])

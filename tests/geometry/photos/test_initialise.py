@@ -72,7 +72,7 @@ def sparse():
 def test_planes_go_as_far_as_photos_show_them_and_take_fine_discs_where_these_are_busy(sparse):
     images = [photo(camera) for camera in sparse.cameras.values()]
     config = ReconstructionConfig(plain=False, gaussians=3000)
-    planes, g = initialise(sparse, sparse.cameras, images, config=config, device="cpu")
+    planes, g = initialise(sparse, sparse.cameras, images, config=config)
     floor, _, table = planes
     np.testing.assert_array_equal([floor.normal, table.normal], [[0, 0, 1], [0, 0, 1]])
     # The floor beyond its points, but not beneath the table, of which there is no point at all.

@@ -140,7 +140,7 @@ def test_points_are_triangulated_from_known_poses_which_stay_as_they_are(triangu
         assert sparse.cameras[name].fx == 395.0
     assert len(sparse.points) > 100 and sparse.unposed == ()
     far = sparse.track_length > 2
-    assert np.median(truth.distance(sparse.points[far], device="cpu")) < 0.02
+    assert np.median(truth.distance(sparse.points[far])) < 0.02
     assert 0.1 < sparse.colors.mean() < 0.9
 
 
@@ -170,27 +170,27 @@ def rgbd(tmp_path_factory, truth) -> Path:
         np.savetxt(folder / f"frame-{k:06d}.pose.txt", camera_to_world(camera, opengl=False))
         view = camera.resized(320, 240)
         towards = view.directions().reshape(-1, 3)
-        hit = truth.cast(view.position, towards, device="cpu")
+        hit = truth.cast(view.position, towards)
         depth = np.where(hit.valid, hit.t * (towards @ camera.rotation[2]), 0.0).reshape(240, 320)
         image.fromarray(np.round(1000 * depth).astype(np.uint16)).save(folder / f"frame-{k:06d}.depth.png")
     return folder
 
 
 def test_measured_depth_is_fused_within_a_centimetre(rgbd, truth, tmp_path):
-    rec = wr.reconstruct(rgbd, workspace=tmp_path, poses=rgbd, up="z", config=QUICK, device="cpu")
+    rec = wr.reconstruct(rgbd, workspace=tmp_path, poses=rgbd, up="z", config=QUICK)
     assert rec.metric and rec.unposed == () and rec.guessed == ()
     true = list(lobby_cameras(NAMES).values())
     for own, camera in zip(rec.cameras.values(), true, strict=True):
         np.testing.assert_allclose(own.world_to_camera, camera.world_to_camera, atol=1e-6)
     centres = rec.mesh.triangles.mean(axis=1)
-    distance = truth.distance(centres, device="cpu")
+    distance = truth.distance(centres)
     assert rec.mesh.areas.sum() > 30 and np.average(distance < 0.03, weights=rec.mesh.areas) > 0.9
     assert np.median(np.repeat(distance, np.ceil(100 * rec.mesh.areas).astype(int))) < 0.01
 
 
 def test_depth_that_contradicts_the_poses_is_refused(rgbd, tmp_path):
     with pytest.raises(ValueError, match="depth and poses differ in unit"):
-        wr.reconstruct(rgbd, workspace=tmp_path, poses=rgbd, scale=3.0, up="z", config=QUICK, device="cpu")
+        wr.reconstruct(rgbd, workspace=tmp_path, poses=rgbd, scale=3.0, up="z", config=QUICK)
 
 
 def test_depth_of_frames_that_tell_it_is_found(rgbd, tmp_path):

@@ -8,6 +8,7 @@ import warp as wp
 from skimage.metrics import structural_similarity
 from views import look
 
+from warprrf.device import resolve
 from warprrf.geometry.photos.config import RefineConfig
 from warprrf.geometry.photos.densify import filled
 from warprrf.geometry.photos.refine import refine
@@ -33,7 +34,7 @@ def problem():
         rng.uniform(0.05, 0.2, (n, 3)), rng.uniform(0.5, 0.95, n), rng.normal(size=(n, 1, 3)) * 0.8,
     )  # fmt: skip
     cameras = ring_of_cameras()
-    photos = [np.clip(render(truth, c, device="cpu").features, 0, 1) for c in cameras]
+    photos = [np.clip(render(truth, c).features, 0, 1) for c in cameras]
     start = Gaussians(
         truth.means + rng.normal(size=(n, 3)) * 0.03, truth.quaternions, np.full((n, 3), 0.1), np.full(n, 0.5),
         np.zeros((n, 1, 3)),
@@ -48,22 +49,20 @@ CONFIG = RefineConfig(
 
 
 def psnr(g, photos, cameras):
-    errors = [
-        np.mean((render(g, c, device="cpu").features - p) ** 2) for c, p in zip(cameras, photos, strict=True)
-    ]
+    errors = [np.mean((render(g, c).features - p) ** 2) for c, p in zip(cameras, photos, strict=True)]
     return float(np.mean(-10 * np.log10(errors)))
 
 
 def test_refinement_learns_the_photos_and_densifies(problem):
     start, photos, cameras = problem
-    end = refine(start, PosedPhotos(photos, cameras), config=CONFIG, device="cpu")
+    end = refine(start, PosedPhotos(photos, cameras), config=CONFIG)
     assert psnr(end, photos, cameras) > psnr(start, photos, cameras) + 4
     assert len(end) > len(start)
 
 
 def test_a_run_continued_from_a_checkpoint_equals_one_never_stopped(problem, tmp_path):
     start, photos, cameras = problem
-    whole = refine(start, PosedPhotos(photos, cameras), config=CONFIG, device="cpu")
+    whole = refine(start, PosedPhotos(photos, cameras), config=CONFIG)
 
     class Killed(Exception):
         pass
@@ -84,12 +83,12 @@ def test_a_checkpoint_of_other_settings_or_a_damaged_one_is_refused(problem, tmp
     start, photos, cameras = problem
     file = tmp_path / "refine.safetensors"
     short = RefineConfig(iterations=20, downscale=1, checkpoint_every=20)
-    refine(start, PosedPhotos(photos, cameras), config=short, checkpoint=file, device="cpu")
+    refine(start, PosedPhotos(photos, cameras), config=short, checkpoint=file)
     with pytest.raises(ValueError, match="other settings"):
-        refine(start, PosedPhotos(photos, cameras), config=CONFIG, checkpoint=file, device="cpu")
+        refine(start, PosedPhotos(photos, cameras), config=CONFIG, checkpoint=file)
     file.write_bytes(file.read_bytes()[:100])
     with pytest.raises(ValueError, match="cannot be read"):
-        refine(start, PosedPhotos(photos, cameras), config=short, checkpoint=file, device="cpu")
+        refine(start, PosedPhotos(photos, cameras), config=short, checkpoint=file)
 
 
 @pytest.mark.usefixtures("device")
@@ -103,15 +102,15 @@ def test_gaussians_near_a_plane_are_pulled_flat_into_it():
         noisy, tilt, np.tile([0.06, 0.06, 0.003], (n, 1)), np.full(n, 0.8), rng.normal(size=(n, 1, 3))
     )
     cameras = ring_of_cameras(4)
-    photos = [np.clip(render(start, c, device="cpu").features, 0, 1) for c in cameras]
+    photos = [np.clip(render(start, c).features, 0, 1) for c in cameras]
     plane = Plane(
         normal=np.array([0, 0, 1.0]), offset=0.0, inliers=np.arange(n),
         corner=np.array([-1.0, -1.0]),
         cell_m=0.5, occupied=np.ones((4, 4), bool),
     )  # fmt: skip
     config = RefineConfig(iterations=60, downscale=1, densify_from=999)
-    free = refine(start, PosedPhotos(photos, cameras), config=config, device="cpu")
-    held = refine(start, PosedPhotos(photos, cameras), config=config, planes=[plane], device="cpu")
+    free = refine(start, PosedPhotos(photos, cameras), config=config)
+    held = refine(start, PosedPhotos(photos, cameras), config=config, planes=[plane])
     assert np.abs(held.means[:, 2]).max() < 1e-3 < np.abs(free.means[:, 2]).mean()
     assert np.degrees(np.arccos(np.clip(np.abs(held.normals[:, 2]), 0, 1))).max() < 1.0
 
@@ -122,7 +121,7 @@ def test_photo_loss_is_l1_and_ssim_and_its_derivative_is_right(lanes):
     rng = np.random.default_rng(2)
     shape = (24, 20, 3)
     image, target = rng.random(shape), rng.random(shape)
-    loss = PhotoLoss("cpu", 0.2, real=wp.float64, lanes=lanes)
+    loss = PhotoLoss(resolve(), 0.2, real=wp.float64, lanes=lanes)
 
     def evaluate(values):
         size = shape[:2]
@@ -153,9 +152,9 @@ def test_photos_of_changed_exposure_and_white_balance_give_the_same_colours(prob
     changed = [np.minimum(0.6 * p * g, 1) for p, g in zip(photos, gains, strict=True)]
     kept = [0.6 * p for p in photos]
     posed = PosedPhotos(changed, cameras)
-    fitted = refine(start, posed, config=CONFIG, device="cpu")
-    blind = refine(start, posed, config=replace(CONFIG, fit_exposure=False), device="cpu")
-    straight = refine(start, PosedPhotos(kept, cameras), config=CONFIG, device="cpu")
+    fitted = refine(start, posed, config=CONFIG)
+    blind = refine(start, posed, config=replace(CONFIG, fit_exposure=False))
+    straight = refine(start, PosedPhotos(kept, cameras), config=CONFIG)
     found, lost, best = (psnr(g, kept, cameras) for g in (fitted, blind, straight))
     assert best - found < 0.15 and best - lost > 3 * (best - found)
 
@@ -172,9 +171,9 @@ def test_gains_of_photos_are_recovered_whatever_is_masked_or_clipped():
     mask[:, :10] = True
     photos[1][mask] = 0.3
     camera = Camera.pinhole(30, 20, fx=30, fy=30, cx=15, cy=10, world_to_camera=np.eye(4))
-    targets = Targets(PosedPhotos(photos, [camera] * 4, [None, mask, None, None]), PhotoLoss("cpu", 0.2))
+    targets = Targets(PosedPhotos(photos, [camera] * 4, [None, mask, None, None]), PhotoLoss(resolve(), 0.2))
     exposures = Exposures(4, fitted=True)
-    rendered = wp.array(image, dtype=float, device="cpu")
+    rendered = wp.array(image, dtype=float)
     for visit in range(20):
         for view in range(4):
             exposures.fit(rendered, targets.at(view, 1), visit)
@@ -191,8 +190,7 @@ def test_masked_pixels_take_no_part(problem):
     rng = np.random.default_rng(4)
     spoilt = [np.where(m[..., None], rng.random(p.shape), p) for p, m in zip(photos, masks, strict=True)]
     one, other = (
-        refine(start, PosedPhotos(images, cameras, masks), config=CONFIG, device="cpu")
-        for images in (photos, spoilt)
+        refine(start, PosedPhotos(images, cameras, masks), config=CONFIG) for images in (photos, spoilt)
     )
     assert np.array_equal(one.sh, other.sh) and np.array_equal(one.means, other.means)
 
@@ -205,10 +203,10 @@ def test_a_hole_in_the_start_is_filled(problem):
     )  # fmt: skip
     wall = [np.full_like(p, 0.6) for p in photos]
     posed = PosedPhotos(wall, cameras)
-    uncovered = [(render(start, c, device="cpu").alpha < 0.5).mean() for c in cameras]
-    end = filled(start, posed, device="cpu")
-    left = [(render(end, c, device="cpu").alpha < 0.5).mean() for c in cameras]
+    uncovered = [(render(start, c).alpha < 0.5).mean() for c in cameras]
+    end = filled(start, posed)
+    left = [(render(end, c).alpha < 0.5).mean() for c in cameras]
     assert np.mean(uncovered) > 0.3 and np.mean(left) < 0.02
     masked = PosedPhotos(wall, cameras, [np.ones(p.shape[:2], bool) for p in wall])
-    assert len(filled(start, masked, device="cpu")) == len(start)
-    assert len(filled(end, posed, device="cpu")) <= len(end) + 20
+    assert len(filled(start, masked)) == len(start)
+    assert len(filled(end, posed)) <= len(end) + 20

@@ -25,7 +25,7 @@ def room() -> wr.Mesh:
 
 def test_a_surface_is_seen_by_the_cameras_that_look_at_it(room):
     ahead = look([1.0, 1.5, 1.2], [4.0, 1.5, 1.2], f=1.0)  # nearly all before it
-    seen = how_seen(room, [ahead, ahead, ahead], device="cpu")
+    seen = how_seen(room, [ahead, ahead, ahead])
     on_wall, behind = seen.points[:, 0] > 3.999, seen.points[:, 0] < 0.9
     assert on_wall.sum() > 1000 and (seen.photos[on_wall] == 3).all()
     assert behind.sum() > 1000 and (seen.photos[behind] == 0).all()
@@ -37,12 +37,12 @@ def test_a_surface_is_seen_by_the_cameras_that_look_at_it(room):
 
 def test_what_stands_before_a_surface_hides_it():
     both, _ = joined(box_mesh([0, 0, 0], [4, 3, 2.5], inward=True), box_mesh([2, 0, 0], [2.5, 3, 2.5]))
-    seen = how_seen(both, [look([1.0, 1.5, 1.2], [4.0, 1.5, 1.2], f=1.0)], device="cpu")
+    seen = how_seen(both, [look([1.0, 1.5, 1.2], [4.0, 1.5, 1.2], f=1.0)])
     assert (seen.photos[seen.points[:, 0] > 2.51] == 0).all()
 
 
 def test_from_outside_one_looks_through_the_backs_of_walls_and_ceiling(room):
-    points, light = from_outside(room, 0.25 * np.pi, width=120, device="cpu")
+    points, light = from_outside(room, 0.25 * np.pi, width=120)
     met = np.isfinite(points[..., 0])
     assert met.mean() > 0.4 and (light[met] > 0.5).all()
     shown = points[met]
@@ -73,7 +73,7 @@ def test_the_page_needs_nothing_else_and_shows_names_as_text(room, tmp_path: Pat
         causes={"dark.jpg": "shows 2 features"}, guessed=["scale: 3 m"], photos=files,
     )  # fmt: skip
     rec.save(tmp_path / "room")
-    wr.Reconstruction.load(tmp_path / "room").report(tmp_path / "page.html", device="cpu")
+    wr.Reconstruction.load(tmp_path / "room").report(tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "<b>" not in page and "&lt;b&gt;1&amp;.png" in page
     assert set(re.findall(r'src="([^,]*),', page)) == {"data:image/jpeg;base64"} and "href" not in page
@@ -89,10 +89,10 @@ def test_the_page_needs_nothing_else_and_shows_names_as_text(room, tmp_path: Pat
         assert text in page
     for file in files.values():
         file.unlink()
-    rec.report(tmp_path / "page.html", device="cpu")
+    rec.report(tmp_path / "page.html")
     assert "not there any more" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
 def test_a_mesh_alone_has_a_page_too(room, tmp_path: Path):
-    wr.Reconstruction(mesh=room).report(tmp_path / "page.html", device="cpu")
+    wr.Reconstruction(mesh=room).report(tmp_path / "page.html")
     assert "from four sides" in (tmp_path / "page.html").read_text(encoding="utf-8")

@@ -57,7 +57,7 @@ def spoiled(room):
 @pytest.fixture(scope="module")
 def found(room, spoiled):
     cameras, _, photos = room
-    return np.array(mended(spoiled[0], cameras, photos, progress=silent, device="cpu"))
+    return np.array(mended(spoiled[0], cameras, photos, progress=silent))
 
 
 def patterned(room):
@@ -102,12 +102,12 @@ def test_masked_pixels_are_not_mended(room, spoiled):
     cameras, _, photos = room
     masks = [np.ones((120, 160), np.uint8) for _ in cameras]
     hidden = PosedPhotos(photos.images, cameras, masks)
-    result = mended(spoiled[0], cameras, hidden, progress=silent, device="cpu")
+    result = mended(spoiled[0], cameras, hidden, progress=silent)
     np.testing.assert_array_equal(result, spoiled[0])
 
 
 def test_one_photo_or_no_depth_mends_nothing(room, spoiled):
     cameras, _, photos = room
     for maps in (spoiled[0][:1], [np.zeros((120, 160))]):
-        result = mended(maps, cameras[:1], photos.subset([0]), progress=silent, device="cpu")
+        result = mended(maps, cameras[:1], photos.subset([0]), progress=silent)
         np.testing.assert_array_equal(result, maps)

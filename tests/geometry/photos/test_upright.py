@@ -26,7 +26,7 @@ def lobby() -> sparse.SparseModel:
     points = []
     for camera in cameras.values():
         towards = camera.directions()[4::20, 4::20].reshape(-1, 3)
-        hit = mesh.cast(np.broadcast_to(camera.position, towards.shape), towards, device="cpu")
+        hit = mesh.cast(np.broadcast_to(camera.position, towards.shape), towards)
         points.append(hit.point[hit.valid])
     count = [len(p) for p in points]
     xyz = np.concatenate(points) + 0.003 * np.random.default_rng(0).standard_normal((sum(count), 3))

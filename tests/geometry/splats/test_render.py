@@ -32,7 +32,7 @@ def test_agrees_with_brute_force_in_float64_away_from_the_cutoff(camera, rule):
     rng = np.random.default_rng(3)
     g = cloud(rng, 300)
     features, background = rng.random((300, 6)), rng.random(6)
-    out = render(g, camera, features, background, device="cpu", blending=Blending(rule=rule))
+    out = render(g, camera, features, background, blending=Blending(rule=rule))
     color, alpha, depth, margin = blended(g, camera, features, Blending(rule=rule), background)
     clear = margin > 1e-3
     assert clear.mean() > 0.5
@@ -51,14 +51,14 @@ def test_blending_weights_rebuild_the_image(camera):
     rng = np.random.default_rng(4)
     g = cloud(rng, 200)
     features = rng.random((200, 3)).astype(np.float32)
-    out = render(g, camera, features, device="cpu", blending=RADIO)
-    w = blend_weights(g, camera, top_k=200, device="cpu")
+    out = render(g, camera, features, blending=RADIO)
+    w = blend_weights(g, camera, top_k=200)
     rebuilt = np.einsum(
         "hwk,hwkc->hwc", w.weight, features[np.maximum(w.index, 0)] * (w.index >= 0)[..., None]
     )
     assert np.abs(rebuilt - out.features).max() < 2e-4  # one contribution of alpha_min at a cutoff
     assert (np.diff(np.where(w.index >= 0, 1, 0), axis=2) <= 0).all()
-    few = blend_weights(g, camera, top_k=3, device="cpu")
+    few = blend_weights(g, camera, top_k=3)
     strongest = -np.sort(-w.weight, axis=2)[..., :3]
     assert np.allclose(-np.sort(-few.weight, axis=2), strongest, atol=1e-6)
     assert np.allclose(few.dropped, w.weight.sum(2) - strongest.sum(2), atol=1e-5)

@@ -44,7 +44,7 @@ def test_the_image_is_that_of_render():
     values = tensors(1, dtype=torch.float32)
     means, quaternions, scales, opacities, features, background = (v.detach().numpy() for v in values)
     g = Gaussians(means, quaternions, scales, opacities, np.zeros((len(means), 1, 3)))
-    expected = render(g, CAMERA, features, background, blending=Blending(), device="cpu")
+    expected = render(g, CAMERA, features, background, blending=Blending())
     found = images(values)
     for a, b in zip(found[:2], (expected.features, expected.alpha), strict=True):
         assert a.dtype == torch.float32

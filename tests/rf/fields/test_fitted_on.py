@@ -24,11 +24,9 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_field_and_its_file_know_what_it_was_fitted_on(model: str, room: Path, tmp_path: Path) -> None:
     ds = wr.SpectrumDataset.load(room / "spectra.nc")
     mixed = ds.subset([0, 1, 2, 11])  # the last one is for test
-    field = wr.RadioField.fit(
-        wr.Reconstruction.load(room / "reconstruction"), mixed, model, device="cpu", **QUICK[model]
-    )
+    field = wr.RadioField.fit(wr.Reconstruction.load(room / "reconstruction"), mixed, model, **QUICK[model])
     field.save(tmp_path / "field.safetensors")
-    again = wr.RadioField.load(tmp_path / "field.safetensors", device="cpu")
+    again = wr.RadioField.load(tmp_path / "field.safetensors")
     written, read = (leaves((f, f.spectrum(ds.receivers[11]))) for f in (field, again))
     assert not differs(read, written)
     for one in (field, again):
