@@ -146,16 +146,23 @@ def build(real: type) -> Any:
         """What interaction k of record i, a mirror or a slab, makes of (TE, TM) but for the share of its material. A slab of which
         nothing is known lets pass what neither face reflects."""
         g, angle = t.index[i, k], t.angle[i, k]
+        through = int(1)
+        row = g
         if kind_of(t, i, k) == wp.static(MIRROR):
-            return reflection(m, x, m.row[g], angle[0])
-        if m.permittivity.shape[0] > 0:
-            if m.permittivity[g][0] > real(0.0):
-                thickness = m.thickness[g]
-                if angle[2] > real(0.0):
-                    thickness = angle[2]
-                return slab(m.permittivity[g], thickness, angle[0], 1)
+            through = 0
+            row = m.row[g]
+        known = through == 0 and m.slab == 1
+        if through == 1 and m.permittivity.shape[0] > 0:
+            known = m.permittivity[g][0] > real(0.0)
+        if known:
+            thickness = m.thickness[row]
+            if through == 1 and angle[2] > real(0.0):
+                thickness = angle[2]
+            return slab(m.permittivity[row], thickness, angle[0], through)
         r = half_space(x, angle[0])
-        return vec2(real(1.0) - r[0] * r[0], real(1.0) - r[1] * r[1])
+        if through == 1:
+            r = vec2(real(1.0) - r[0] * r[0], real(1.0) - r[1] * r[1])
+        return r
 
     @wp.func
     def fields_slope(t: Table, m: Materials, x: real, i: int, k: int):
@@ -171,23 +178,47 @@ def build(real: type) -> Any:
         return rise
 
     @wp.func
-    def smooth(
-        t: Table, m: Materials, excess: wp.array(dtype=real), i: int, begin: int, end: int, raised: int
+    def turned(t: Table, r: vec2, i: int, k: int):
+        """Jones matrix of interaction k of record i, which makes ``r`` of (TE, TM): the axes turn into its plane first."""
+        c = wp.cos(t.angle[i, k][1])
+        s = wp.sin(t.angle[i, k][1])
+        return wp.diag(r) * mat2(c, s, -s, c)
+
+    @wp.func
+    def raised(
+        t: Table, m: Materials, excess: wp.array(dtype=real), i: int, begin: int, end: int, which: int
     ):
-        """Jones matrix of the mirrors and slabs in columns ``begin`` to ``end``; of ``raised`` the derivative to ln x."""
+        """Jones matrix of the mirrors and slabs in columns ``begin`` to ``end``: its derivative to ln(epsilon_r - 1) of column
+        ``which``, or itself where that is no column."""
         whole = mat2(real(1.0), real(0.0), real(0.0), real(1.0))
-        for k in range(wp.static(MOST)):
-            if k >= begin and k < end and k < t.index.shape[1]:
-                g = t.index[i, k]
-                if g >= 0:
-                    x = excess[m.row[g]]
-                    r = fields(t, m, x, i, k)
-                    if k == raised:
-                        r = fields_slope(t, m, x, i, k)
-                    c = wp.cos(t.angle[i, k][1])
-                    s = wp.sin(t.angle[i, k][1])
-                    whole = wp.diag(r) * (mat2(c, s, -s, c) * whole)
+        for k in range(begin, wp.min(end, t.index.shape[1])):
+            g = t.index[i, k]
+            if g >= 0:
+                r = vec2()
+                if k == which:
+                    r = fields_slope(t, m, excess[m.row[g]], i, k)
+                else:
+                    r = fields(t, m, excess[m.row[g]], i, k)
+                whole = turned(t, r, i, k) * whole
         return whole
+
+    @wp.func
+    def smooth(t: Table, m: Materials, excess: wp.array(dtype=real), i: int, begin: int, end: int):
+        """Jones matrix of the mirrors and slabs in columns ``begin`` to ``end``."""
+        return raised(t, m, excess, i, begin, end, -1)
+
+    @wp.func_grad(smooth)
+    def adjoint_smooth(
+        t: Table, m: Materials, excess: wp.array(dtype=real), i: int, begin: int, end: int, adjoint: mat2
+    ):
+        """Unrolled for Warp's own adjoint, the loop would take a GPU's compiler minutes."""
+        for k in range(begin, wp.min(end, t.index.shape[1])):
+            g = t.index[i, k]
+            if g >= 0:
+                x = excess[m.row[g]]
+                if x > real(0.0):
+                    slope = wp.ddot(adjoint, raised(t, m, excess, i, begin, end, k))
+                    wp.adjoint[excess][m.row[g]] += slope / x
 
     @wp.func
     def at(table: wp.array2d(dtype=real), row: int, cosine: real):
@@ -244,8 +275,8 @@ def build(real: type) -> Any:
         i: int,
     ):
         """Power of record i."""
-        before = smooth(t, m, excess, i, 0, t.rough, -1)
-        after = smooth(t, m, excess, i, t.rough + 1, wp.static(MOST), -1)
+        before = smooth(t, m, excess, i, 0, t.rough)
+        after = smooth(t, m, excess, i, t.rough + 1, wp.static(MOST))
         p = t.power[i] * real(0.5) * wp.ddot(before, before) * real(0.5) * wp.ddot(after, after)
         for k in range(wp.static(MOST)):
             if k != t.rough and k < t.index.shape[1]:
@@ -294,8 +325,8 @@ def build(real: type) -> Any:
             i = order[s]
             p = power_of(t, m, m.weight, m.excess, m.mirror, m.through, i)
             if p > real(0.0):
-                for k in range(wp.static(MOST)):
-                    if k != t.rough and k < t.index.shape[1]:
+                for k in range(t.index.shape[1]):
+                    if k != t.rough:
                         if t.index[i, k] >= 0:
                             column = place[m.row[t.index[i, k]]] + lobes
                             begin = int(0)
@@ -303,11 +334,11 @@ def build(real: type) -> Any:
                             if k > t.rough:
                                 begin = t.rough + 1
                                 end = wp.static(MOST)
-                            run = smooth(t, m, m.excess, i, begin, end, -1)
-                            raised = smooth(t, m, m.excess, i, begin, end, k)
+                            run = smooth(t, m, m.excess, i, begin, end)
+                            bent = raised(t, m, m.excess, i, begin, end, k)
                             size = wp.ddot(run, run)
                             if size > real(0.0):
-                                slope[b, column] += real(2.0) * p * wp.ddot(run, raised) / size
+                                slope[b, column] += real(2.0) * p * wp.ddot(run, bent) / size
                             if kind_of(t, i, k) == wp.static(MIRROR):
                                 slope[b, column + 1] += p
                             else:
