@@ -53,9 +53,10 @@ def trace_paths(
     a slab of its own.
 
     Over the edge of a wedge or a sheet, paths of kind ``"edge"`` go round: one edge, and one mirror or slab before or behind
-    it if these are asked for (:mod:`~warprrf.rf.em.diffraction`, :mod:`~warprrf.rf.paths.edge_paths`). Fields add up: with them the sum
-    of ``jones``, or of a bare mesh's ``gain``, is continuous where line of sight and mirror paths end. A bare mesh's edges
-    are conductors' of hard polarisation, which has no sign change. The phase of ``gain`` is that of the field along the edge.
+    it if these are asked for (:mod:`~warprrf.rf.em.diffraction`, :mod:`~warprrf.rf.paths.edge_paths`). Fields add up: with
+    them the sum of ``jones``, or of a bare mesh's ``gain``, is continuous where line of sight and mirror paths end. A bare
+    mesh's edges are conductors' of hard polarisation, which has no sign change. The phase of ``gain`` is that of the field
+    along the edge.
 
     Args:
         mesh_or_scene: A :class:`Mesh` or anything with a ``mesh``; a scene has ``face_material`` and ``materials`` too.
