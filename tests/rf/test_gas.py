@@ -207,7 +207,7 @@ def test_light_that_mirrors_throw_has_its_images_length(dry: SpectrumDataset) ->
     point = views[0].hits.points(lit)
     length = by_image(point) + np.linalg.norm(point - SEEN, axis=1)
     np.testing.assert_allclose(after[lit], before[lit] * passed(length), rtol=1e-5)
-    onto = [view.tracer.mirrored.onto for view in views]
+    onto = [view.tracer.mirrored().onto for view in views]
     before, after = (np.bincount(r.ray, r.powers(materials), field.surface.element_sides) for r in onto)
     lit = np.flatnonzero(before)
     assert len(lit) > 40

@@ -151,16 +151,18 @@ def exact_paths(
         clear = np.flatnonzero(free)
         clear = clear[distinct(row[clear], point[clear], 3.0 * patches.tolerance_m)]
         found = row[clear], patch[clear], point[clear], np.ones(len(clear))
-        parts.append(_described(patches, source, receivers, found, order, walls))
+        parts.append(described(patches, source, receivers, found, order, walls))
         if walls is not None:
             dark = np.flatnonzero(~free)
-            legs = _legs(patches, source, receivers[row[dark]], patch[dark], point[dark], patches.tolerance_m)
+            legs = legs_of(
+                patches, source, receivers[row[dark]], patch[dark], point[dark], patches.tolerance_m
+            )
             through, slabs = passed(walls, *legs)
             through = dark[through]
             own = distinct(row[through], point[through], 3.0 * patches.tolerance_m)
             own, slabs = through[own], [s.take(own) for s in slabs]
             found = row[own], patch[own], point[own], np.ones(len(own))
-            parts.append(_described(patches, source, receivers, found, order, walls, slabs))
+            parts.append(described(patches, source, receivers, found, order, walls, slabs))
     paths = joined(parts)
     return paths.subset(np.argsort(paths.receiver, kind="stable"))
 
@@ -211,7 +213,7 @@ def zone_paths(
             dark = dark[through.reached(receivers[row[dark]], patch[dark], point[dark])]
             own, slabs = passed(
                 walls,
-                *_legs(patches, source, receivers[row[dark]], patch[dark], point[dark], position_error_m),
+                *legs_of(patches, source, receivers[row[dark]], patch[dark], point[dark], position_error_m),
             )
             dark = dark[own]
             kept[dark] = False
@@ -221,10 +223,10 @@ def zone_paths(
                 point[dark],
                 through.share(receivers[row[dark]], patch[dark], point[dark]),
             )
-            parts.append(_described(patches, source, receivers, found, order, walls, slabs))
+            parts.append(described(patches, source, receivers, found, order, walls, slabs))
         row, patch, point = row[kept], patch[kept], point[kept]
         found = row, patch, point, zone.share(receivers[row], patch, point)
-        parts.append(_described(patches, source, receivers, found, order, walls))
+        parts.append(described(patches, source, receivers, found, order, walls))
     return joined(parts)
 
 
@@ -362,7 +364,7 @@ def unobstructed(
     See :func:`_legs`; a leg is also drawn out by the clearance that :meth:`Mesh.visible` leaves at ends, so that whatever
     lies further off than the tolerance is met.
     """
-    begin, end = _legs(patches, source, ends, patch, point, patches.tolerance_m)
+    begin, end = legs_of(patches, source, ends, patch, point, patches.tolerance_m)
     toward = (end - begin) / np.maximum(np.linalg.norm(end - begin, axis=2, keepdims=True), 1e-12)
     begin[:, 1:] -= ENDPOINT_CLEARANCE * toward[:, 1:]
     end[:, :-1] += ENDPOINT_CLEARANCE * toward[:, :-1]
@@ -373,7 +375,7 @@ def unobstructed(
     return free
 
 
-def _legs(
+def legs_of(
     patches: PlanarPatches,
     source: np.ndarray,
     ends: np.ndarray,
@@ -421,7 +423,7 @@ def distinct(row: np.ndarray, point: np.ndarray, distance_m: float) -> np.ndarra
     return np.flatnonzero(~same)
 
 
-def _described(
+def described(
     patches: PlanarPatches,
     source: np.ndarray,
     receivers: np.ndarray,

@@ -86,8 +86,10 @@ def irradiance(tracer: Tracer, p: Parameters, effects: Effects) -> np.ndarray | 
     tables = [*light.lit, *light.through, *(light.behind if effects.scatter_mirror else [])]
     got = sum(np.bincount(r.ray, r.powers(materials), minlength=sides) for r in tables)
     if effects.mirror_scatter:
-        onto = tracer.mirrored.onto
-        got = got + light.between @ (share * np.bincount(onto.ray, onto.powers(materials), minlength=sides))
+        for onto in (tracer.mirrored(slabs).onto for slabs in {0, most}):
+            got = got + light.between @ (
+                share * np.bincount(onto.ray, onto.powers(materials), minlength=sides)
+            )
     first = got
     for _ in range(2, effects.scatterings):
         got = first + light.between @ (share * got)

@@ -3,8 +3,9 @@
 Rays fill the sphere around a receiver. What they hit is connected to the transmitter (``S``) and to its images in mirrors
 (``MS``); some go on turned at a mirror and are connected there (``SM``, ``MSM``). Elements of the surface send on what they
 got of others (:mod:`warprrf.rf.tracing.interreflection`), and are seen directly (``E``) or in a mirror (``EM``). Slabs
-(``T``) may stand in the way of light to a surface (``TS``), or of sight (``ST``, ``ET``), where rays go straight on. Line
-of sight and mirrors alone, through slabs too, come from the image method (:mod:`warprrf.rf.paths.mirror_paths`).
+(``T``) may stand in the way of light to a surface (``TS``; ``MTS``, before or behind the mirror), or of sight (``ST``, ``ET``),
+where rays go straight on. Line of sight and mirrors alone, through slabs too, come from the image method
+(:mod:`warprrf.rf.paths.mirror_paths`).
 
 A :class:`Tracer` belongs to a surface, a transmitter and a grid of rays; what it traced gives the :class:`View` of a receiver.
 """
@@ -26,7 +27,7 @@ from warprrf.rf.em.fresnel import slab_passage
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.edge_paths import EdgeFinder
 from warprrf.rf.paths.images import MirrorImages
-from warprrf.rf.paths.mirror_paths import MirrorPaths, ZoneRays, zone_paths
+from warprrf.rf.paths.mirror_paths import MirrorPaths, ZoneRays, described, legs_of, passed, zone_paths
 from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.paths.slabs import Slabs, Walls
 from warprrf.rf.spectra.spectrum import unit_beams
@@ -56,6 +57,7 @@ def sequences(effects: Effects) -> tuple[str, ...]:
         "E": e.scatterings > 1,
         "EM": e.scatterings > 1 and e.scatter_mirror,
         "TS": slabs,
+        "MTS": slabs and e.mirror_scatter,
         "TSM": slabs and e.scatter_mirror,
         "ST": slabs and e.scatter_mirror,
         "TST": slabs and e.scatter_mirror,
@@ -142,26 +144,29 @@ class View:
 
 @dataclass(frozen=True)
 class Interactions:
-    """Interactions of one kind, K in a row: mirrors or slabs.
+    """Interactions, K in a row.
 
     Attributes:
         index: group of each, from the transmitter on, -1 for none, shape ``(N, K)``.
         angle: its angles, see :mod:`warprrf.kernels.radio.records`, shape ``(N, K, 3)``.
-        kind: of all.
+        kind: as of :class:`~warprrf.rf.tracing.records.Records`, shape ``(N, K)`` or ``(1, K)``; one column stands for all.
     """
 
     index: np.ndarray
     angle: np.ndarray
-    kind: int
+    kind: np.ndarray
 
     @classmethod
     def of_mirrors(cls, group: np.ndarray, cosine: np.ndarray) -> Interactions:
         """One mirror each: group ``(N,)`` and cosine of incidence ``(N,)``."""
-        return cls(group[:, None], np.column_stack([cosine, 0.0 * cosine, 0.0 * cosine])[:, None], MIRROR)
+        return cls(
+            group[:, None], np.column_stack([cosine, 0.0 * cosine, 0.0 * cosine])[:, None], one_kind(MIRROR)
+        )
 
     def take(self, rows: np.ndarray) -> Interactions:
         """Those of ``rows``."""
-        return replace(self, index=self.index[rows], angle=self.angle[rows])
+        kind = self.kind if len(self.kind) == 1 else self.kind[rows]
+        return Interactions(self.index[rows], self.angle[rows], kind)
 
 
 @dataclass(frozen=True)
@@ -253,10 +258,9 @@ class Tracer:
         first.grid = self._first_grid
         return first
 
-    @property
-    def mirrored(self) -> MirroredLight:
-        """Images of the transmitter that light faces."""
-        return self.kept.get("mirrored", lambda: MirroredLight(self))
+    def mirrored(self, most: int = 0) -> MirroredLight:
+        """Images of the transmitter that light faces; with ``most`` those that do so through slabs alone, up to that many."""
+        return self.kept.get(("mirrored", most), lambda: MirroredLight(self, self.walls(most)))
 
     @property
     def images(self) -> MirrorImages:
@@ -319,7 +323,7 @@ class Tracer:
         """
         places = np.asarray(receivers, np.float64).reshape(-1, 3)
         found = self.paths(places, effects) if paths is None else paths
-        return View(self, places, self.grid.hit(places), found, {SPECULAR: self._specular(found)}, keeps)
+        return View(self, places, self.grid.hit(places), found, {SPECULAR: self.specular(found)}, keeps)
 
     def trace(self, view: View, names: Sequence[str]) -> dict[str, Records]:
         """Tables of sequences that a receiver sees, by name."""
@@ -341,7 +345,9 @@ class Tracer:
             elif sequence[0] == "E":
                 made[name] = self.seen(seen[last])
             elif sequence[0] == "M":
-                made[name] = self.lit_by_mirrors(seen[last])
+                made[name] = self.lit_by_mirrors(
+                    seen[last], most if sequence[1] == "T" and last == "S" else 0
+                )
             else:
                 if last not in lights:
                     lights[last] = self.light(seen[last])
@@ -352,7 +358,7 @@ class Tracer:
                 )
         return made
 
-    def _specular(self, p: MirrorPaths) -> Records:
+    def specular(self, p: MirrorPaths) -> Records:
         """Line of sight and mirror paths as records, in double precision."""
         friis = (self.wavelength_m / (4.0 * np.pi * p.length_m)) ** 2 * p.share**2
         mirrors, slabs = p.patch >= 0, p.slab >= 0
@@ -384,23 +390,26 @@ class Tracer:
         before = self._through(slabs, light.point[row] - self.transmitter)
         return self.scattered(rays, row, light.strength[row], light.angle[row], before)
 
-    def lit_by_mirrors(self, rays: Rays) -> Records:
-        """What some rays of each pixel see of surfaces that images of the transmitter light."""
+    def lit_by_mirrors(self, rays: Rays, most: int = 0) -> Records:
+        """What some rays of each pixel see of surfaces that images of the transmitter light; with ``most`` those that they light
+        through slabs alone, up to that many."""
         chosen, times = np.flatnonzero(rays.hits.face >= 0), 1.0
         if rays.after is None:
             places = ((np.arange(THROUGH_MIRRORS) + 0.5) * self.grid.per_pixel / THROUGH_MIRRORS).astype(int)
             places = np.unique(places)
             times = self.grid.per_pixel / len(places)
             chosen = chosen[np.isin(chosen % self.grid.per_pixel, places)]
-        row, image = self.mirrored.pairs(rays.hits.face[chosen])
-        row, m = chosen[row], self.mirrored
+        m = self.mirrored(most)
+        row, image = m.pairs(rays.hits.face[chosen])
+        row = chosen[row]
         light = self.grid.light_through(rays.hits, m.image[image], row)
         k = np.flatnonzero(light.strength > 0)
-        patch = m.patch[image[k]]
-        way = m.image[image[k]] - light.point[k]
-        way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
-        cosine = np.abs(np.einsum("ni,ni->n", way, self.surface.plane_normal[patch]))
-        before = Interactions.of_mirrors(self.surface.patch_group[patch], cosine)
+        before = m.before.take(image[k])
+        if not most:
+            way = m.image[image[k]] - light.point[k]
+            way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
+            cosine = np.abs(np.einsum("ni,ni->n", way, self.surface.plane_normal[m.patch[image[k]]]))
+            before = Interactions.of_mirrors(before.index[:, 0], cosine)
         return self.scattered(
             rays, row[k], light.strength[k] * self.grid.dtype.type(times), light.angle[k], before
         )
@@ -438,21 +447,28 @@ class Tracer:
         power: np.ndarray,
         index: np.ndarray,
         angle: np.ndarray,
-        kind: int,
+        last: int,
         before: Interactions | None = None,
     ) -> Records:
         after, dtype = None if rays.after is None else rays.after.take(row), self.grid.dtype
         legs = [
             leg
-            for leg in (before, Interactions(index[:, None], angle[:, None], kind), after)
+            for leg in (before, Interactions(index[:, None], angle[:, None], one_kind(last)), after)
             if leg is not None
         ]
-        residual_row = -1 if after is not None else int(kind == SOURCE or before is not None)
-        kinds = np.concatenate([np.full(leg.index.shape[1], leg.kind, np.int32) for leg in legs])[None]
+        residual_row = -1 if after is not None else int(last == SOURCE or before is not None)
+        kinds = [
+            leg.kind if len(leg.kind) else one_kind(0) for leg in legs
+        ]  # of no record it does not matter
+        rows = max(map(len, kinds))
+        kind = np.concatenate(
+            [np.broadcast_to(own, (rows, leg.index.shape[1])) for own, leg in zip(kinds, legs, strict=True)],
+            axis=1,
+        )
         return Records(
             np.asarray(power, dtype), rays.ray[row].astype(np.int32),
             np.concatenate([leg.index for leg in legs], axis=1).astype(np.int32),
-            np.concatenate([leg.angle for leg in legs], axis=1).astype(dtype), kinds, residual_row, self.grid.half_width,
+            np.concatenate([leg.angle for leg in legs], axis=1).astype(dtype), kind, residual_row, self.grid.half_width,
         )  # fmt: skip
 
     def _through(self, slabs: Slabs, way: np.ndarray) -> Interactions:
@@ -465,7 +481,9 @@ class Tracer:
         turn[more] = np.where(met[more], turns(stops, normal), 0.0)
         thickness = np.nan_to_num(slabs.thickness_m) / self.wavelength_m
         return Interactions(
-            np.where(met, s.group[slabs.face], -1), np.stack([slabs.cosine, turn, thickness], axis=2), SLAB
+            np.where(met, s.group[slabs.face], -1),
+            np.stack([slabs.cosine, turn, thickness], axis=2),
+            one_kind(SLAB),
         )
 
     def behind(self, rays: Rays, most: int) -> Rays:
@@ -511,6 +529,11 @@ class Tracer:
         return replace(view, tracer=self, hits=replace(view.hits, **own))
 
 
+def one_kind(kind: int) -> np.ndarray:
+    """``kind`` of all interactions of all records."""
+    return np.full((1, 1), kind, np.int32)
+
+
 def traced(
     again: Callable[[], Tracer], effects: Effects, keeps: bool, part: tuple[np.ndarray, MirrorPaths]
 ) -> View:
@@ -529,14 +552,19 @@ def images_of(surface: Surface, transmitter: np.ndarray, device: DeviceLike) -> 
 class MirroredLight:
     """Images of the transmitter in single mirrors that light each face, found once at the middles of the faces.
 
+    Args:
+        tracer: of the transmitter.
+        walls: if any, the images are those whose light comes through some of these, before or behind the mirror.
+
     Attributes:
         image: of each pair of a face and an image that lights it [m], shape ``(N, 3)``.
         patch: its mirror, shape ``(N,)``.
+        before: what its light meets on the way to the middle of the face.
         onto: its light on the sides of elements: records whose ray is the side, of irradiance where the transmitter gives
             cos(theta_i) / d1^2 [1/m^2].
     """
 
-    def __init__(self, tracer: Tracer) -> None:
+    def __init__(self, tracer: Tracer, walls: Walls | None = None) -> None:
         s, transmitter, grid = tracer.surface, tracer.transmitter, tracer.grid
         centre, image = s.mesh.triangles.mean(axis=1), s.images(transmitter)[0]
         face, patch, point = images_of(s, transmitter, grid.device).candidates(centre, 1)
@@ -545,12 +573,26 @@ class MirroredLight:
         side = ((point[:, 0] - centre[face]) * normal).sum(axis=1)
         normal = np.where(s.two_sided & (side < 0)[:, None], -normal, normal)
         own = np.flatnonzero((s.two_sided | (side > 0)) & (s.patch[face] != patch[:, 0]))
-        face, patch, point, normal = face[own], patch[own], point[own], normal[own]
-        rays = ZoneRays(s.patches, transmitter, 0.0, s.position_error_m, grid.device)
-        free = rays.reached(centre[face], patch, point, s.position_error_m * normal)
-        face, patch, normal = face[free], patch[free, 0], normal[free]
-        order = np.lexsort((patch, face))
-        face, patch, normal = face[order], patch[order], normal[order]
+        order = own[np.lexsort((patch[own, 0], face[own]))]
+        face, patch, point, normal = face[order], patch[order], point[order], normal[order]
+        lift_m = s.position_error_m
+        ends = centre[face], patch, point, lift_m * normal
+        chosen = ZoneRays(s.patches, transmitter, 0.0, lift_m, grid.device).reached(*ends)
+        slabs = None
+        if walls is not None:
+            through = ZoneRays(s.patches, transmitter, 0.0, lift_m, grid.device, walls)
+            dark = np.flatnonzero(~chosen)
+            dark = dark[through.reached(*(a[dark] for a in ends))]
+            legs = legs_of(
+                s.patches, transmitter, (ends[0] + ends[3])[dark], patch[dark], point[dark], lift_m
+            )
+            arrived, slabs = passed(walls, *legs)
+            chosen = dark[arrived]
+        face, patch, point, normal = face[chosen], patch[chosen], point[chosen], normal[chosen]
+        found = face, patch, point, np.ones(len(face))
+        paths = tracer.specular(described(s.patches, transmitter, centre, found, 1, walls, slabs))
+        self.before = Interactions(paths.index, paths.angle, paths.kind)
+        patch = patch[:, 0]
         self.image, self.patch = image[patch], patch
         self._first = np.searchsorted(face, np.arange(len(s.mesh.faces) + 1))
         way = self.image - centre[face]
@@ -559,10 +601,7 @@ class MirroredLight:
         cos_in = np.maximum((toward * normal).sum(axis=1), 0.0)
         share = s.mesh.areas[face] / s.element_area[s.element[face]]
         power = share * cos_in / np.maximum(length, NEAREST_M) ** 2 * grid.transmittance(length)
-        cosine = np.abs((toward * s.plane_normal[patch]).sum(axis=1))
-        mirror = Interactions.of_mirrors(s.patch_group[patch], cosine)
-        kind = np.array([[MIRROR]], np.int32)
-        self.onto = Records(power, s.side_met(face, -normal), mirror.index, mirror.angle, kind)
+        self.onto = replace(paths, power=power, ray=s.side_met(face, -normal))
 
     def pairs(self, face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows of ``face`` (N,) and images that light them, one for each pair."""
