@@ -18,7 +18,7 @@ from typing import Any
 from fuzz.trial import Outcome
 
 LIMIT_S = 30.0
-"""How long a case may take, of which an undamaged one takes a tenth at most."""
+"""How long a case may take, of which an undamaged one takes a tenth at most; as much longer as others keep the machine busy."""
 START_S = 180.0
 MEMORY = 12 << 30
 """Bytes of address space of a worker: more is refused by the system, which the worker survives."""
@@ -71,7 +71,8 @@ class Workers:
                     worker.case = next(waiting, None)
                     if worker.case is not None:
                         worker.pipe.send(worker.case)
-                        worker.until = max(worker.until, time.monotonic()) + self._limit_s
+                        busier = max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+                        worker.until = max(worker.until, time.monotonic()) + busier * self._limit_s
             busy = [worker for worker in self._all if worker.case is not None]
             if not busy:
                 return

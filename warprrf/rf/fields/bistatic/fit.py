@@ -77,6 +77,9 @@ READINGS, LEAST_READINGS = 12_000, 200
 """Readings that parameters are fitted to, spread over the training receivers, and of each at least."""
 KNOWN_BETTER = 2.0
 """By how much more readings count that hold line of sight alone: no material is in them. They tell a chain's gain."""
+BEHIND_WALLS = 0.5
+"""How much directions count that were measured behind slabs: of what comes through these more is left out (light between
+surfaces that passes them on its way), and what a material must make up for there it lacks in the open."""
 SIDE_LOBES_DB = 3.0
 """Standard deviation of the level of an antenna's side lobes, which few measure."""
 HANGING_DB = 1.0  # that this moves a chain's gain by and is worth a warning
@@ -445,6 +448,9 @@ class Training:
             part = o.part(known[np.sort(rng.choice(len(known), size, replace=False))])
             if part.sight is not None:
                 part = replace(part, target=part.target.trusted(1.0 + KNOWN_BETTER * part.sight))
+            straight = o.view.paths.order == 0
+            if not totals and (straight & (o.view.paths.slabs > 0)).any():
+                part = replace(part, target=part.target.trusted(np.full(len(part.target.db), BEHIND_WALLS)))
             parts.append(part)
         steps = _Steps(progress, count, 4 + len(candidates) + MERGES + (2 * count if count <= FEW else 3))
         return cls(

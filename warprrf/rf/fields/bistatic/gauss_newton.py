@@ -107,7 +107,7 @@ class Problem:
 
     def materials(self, p: Parameters, ratio: float) -> Evaluation:
         """Parameters ``p`` at ``ratio`` times their carrier, as kernels take them."""
-        tracer = self.observations[0].view.tracer
+        tracer = next(o.view.tracer for o in self.observations if o.ratio == ratio)
         slabs = tracer.slabs(self.effects.transmissions)
         return Evaluation(p.at_ratio(ratio), self.material, slabs=slabs, device=tracer.grid.device)
 
