@@ -34,8 +34,9 @@ from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
 from warprrf.kernels.radio.records import MIRROR, SCATTER, SLAB
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.paths.mirror_paths import unobstructed
+from warprrf.rf.paths.mirror_paths import described, legs_of, passed, unobstructed
 from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.paths.slabs import Slabs
 from warprrf.rf.paths.trace import MirrorTracer
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.spectrum import (
@@ -219,7 +220,7 @@ class ExactEngine:
         starts: list[_Beams] = []
         for rays in self._and_behind(coarse, FURTHER_SUB_PIXELS):
             if e.mirror_scatter:
-                yield self._lit_by_mirrors(rays)
+                yield from self._lit_by_mirrors(rays)
             if e.scatterings > 1:
                 starts.append(self._scattered_on(rays, 1))
             if e.scatter_mirror:
@@ -230,7 +231,7 @@ class ExactEngine:
                 for own in self._and_behind(rays, FURTHER_SUB_PIXELS):
                     yield from self._lit(own, FURTHER_SUB_PIXELS)
                     if e.mirror_scatter:
-                        yield self._lit_by_mirrors(own)
+                        yield from self._lit_by_mirrors(own)
                 depth += 1
                 if depth >= e.scatterings:
                     break
@@ -288,8 +289,9 @@ class ExactEngine:
             out = rays.hits.points(records.ray) - tracer.transmitter
             yield self._paths(rays, records, np.linalg.norm(out, axis=1), out, name, tracer)
 
-    def _lit_by_mirrors(self, rays: _Beams) -> DiffusePaths:
-        """What images of the transmitter light there, by one ray of :data:`THROUGH_MIRRORS`."""
+    def _lit_by_mirrors(self, rays: _Beams) -> Iterator[DiffusePaths]:
+        """What images of the transmitter light there, and what they light through slabs, by one ray of
+        :data:`THROUGH_MIRRORS`."""
         tracer, patches = self._tracers[min(FURTHER_SUB_PIXELS, self.sub_pixels)], self.mirrors.patches
         every = min(THROUGH_MIRRORS, tracer.grid.per_pixel)
         ray = np.flatnonzero((rays.hits.face >= 0) & (rays.ray % every == every // 2))
@@ -300,20 +302,25 @@ class ExactEngine:
         own &= patches.contains(patch[:, 0], met[:, 0])
         row, patch, met = row[own], patch[own], met[own]
         free = unobstructed(patches, tracer.transmitter, point[row], patch, met, tracer.grid.device)
-        row, patch = row[free], patch[free, 0]
-        image = self.surface.images(tracer.transmitter)[0][patch]
-        light = tracer.grid.light_through(rays.hits, image, ray[row])
-        k = np.flatnonzero(light.strength > 0)
-        row, patch, way = row[k], patch[k], point[row[k]] - image[k]
-        length, plane = np.linalg.norm(way, axis=1), self.surface.plane_normal[patch]
-        across = (way * plane).sum(axis=1)
-        cosine = np.abs(across) / np.maximum(length, 1e-9)
-        before = Interactions.of_mirrors(self.surface.patch_group[patch], cosine)
-        strength = every * light.strength[k]
-        records = tracer.scattered(
-            Rays(rays.hits, np.arange(len(rays.ray))), ray[row], strength, light.angle[k], before
-        )
-        return self._paths(rays, records, length, way - 2.0 * across[:, None] * plane, "MS", tracer)
+        ways: dict[str, tuple[np.ndarray, list[Slabs] | None]] = {"MS": (free.nonzero()[0], None)}
+        walls = self.mirrors.walls
+        if walls is not None:
+            legs = legs_of(patches, tracer.transmitter, point[row], patch, met, walls.clearance_m)
+            ways["MTS"] = passed(walls, *legs)
+        for name, (chosen, slabs) in ways.items():
+            found = point, (row[chosen], patch[chosen], met[chosen], np.ones(len(row))[chosen])
+            mirrors = described(patches, tracer.transmitter, *found, 1, walls, slabs)
+            image = self.surface.images(tracer.transmitter)[0][patch[chosen, 0]]
+            light = tracer.grid.light_through(rays.hits, image, ray[row[chosen]])
+            k = np.flatnonzero(light.strength > 0)
+            own, image, mirrors = row[chosen][k], image[k], mirrors.subset(k)
+            way, plane = point[own] - image, self.surface.plane_normal[patch[chosen, 0][k]]
+            met_before = tracer.specular(mirrors)
+            before = Interactions(met_before.index, met_before.angle, met_before.kind)
+            seen = Rays(rays.hits, np.arange(len(rays.ray)))
+            records = tracer.scattered(seen, ray[own], every * light.strength[k], light.angle[k], before)
+            departure = way - 2.0 * (way * plane).sum(axis=1)[:, None] * plane
+            yield self._paths(rays, records, np.linalg.norm(way, axis=1), departure, name, tracer)
 
     def _paths(
         self,

@@ -99,30 +99,39 @@ def test_ways_through_slabs_are_the_same_both_ways_and_as_many_as_asked_for() ->
 
 
 def test_what_scatters_before_and_behind_a_slab_is_the_integral_over_the_floor() -> None:
-    """Lambertian scattering of a floor, lit through the pane or seen through it."""
-    effects = Effects(mirrors=0, scatterings=1, mirror_scatter=False, diffractions=0, residual=False)
-    engine = ExactEngine(SHEET, transmitter=TX, frequency_hz=F, shape=(90, 180), effects=effects)
+    """Lambertian scattering of a floor, lit through the pane, from a metal ceiling too, or seen through it."""
+    effects = Effects(mirrors=1, scatterings=1, mirror_scatter=True, diffractions=0, residual=False)
+    ceiling = FLOOR[0] + [0, 0, 6.0], FLOOR[1][:, ::-1]
+    mesh, part = joined(FLOOR, pane(1.0), ceiling)
+    scene = Scene(mesh, [FLOORING, GLASS, itu_material("metal")], part)
+    engine = ExactEngine(scene, transmitter=TX, frequency_hz=F, shape=(90, 180), effects=effects)
     found = {p.sequence: p.power.sum() for p in engine.sequences(RX)}
+    tracer = engine._tracers[engine.sub_pixels]
+    by_field = tracer.trace(tracer.view(RX, effects), ["MTS3"])["MTS3"].powers(engine.materials)
     step = 0.02
     x, y = np.meshgrid(*2 * [np.arange(-6 + step / 2, 6, step)], indexing="ij")
     point = np.stack([x, y, 0 * x], axis=-1)
-    into, out = TX - point, RX - point
-    d1, d2 = (np.linalg.norm(way, axis=-1) for way in (into, out))
+    into, out, image = (end - point for end in (TX, RX, TX * [1, 1, -1] + [0, 0, 12]))
+    d1, d2, d3 = (np.linalg.norm(way, axis=-1) for way in (into, out, image))
     table = engine.mirrors.table
-    cos_i, cos_s = into[..., 2] / d1, out[..., 2] / d2
+    cos_i, cos_s, cos_m = into[..., 2] / d1, out[..., 2] / d2, image[..., 2] / d3
     eta, thick = table.permittivity[0], table.thickness_m[0]
     wavelength_m = engine.mirrors.wavelength_m
-    gamma = 0.5 * sum(np.abs(r) ** 2 for r in slab_reflection(cos_i, eta, thick, wavelength_m))
+
+    def even(cosine: np.ndarray) -> np.ndarray:
+        return 0.5 * sum(np.abs(r) ** 2 for r in slab_reflection(cosine, eta, thick, wavelength_m))
+
     passed = []
-    for way, d in ((into, d1), (out, d2)):
+    for way, d in ((into, d1), (out, d2), (image, d3)):
         waves = slab_transmission(np.abs(way[..., 0]) / d, table.permittivity[1], 0.01, wavelength_m)
         passed.append(0.5 * sum(np.abs(t) ** 2 for t in waves))
-    power = (
-        (wavelength_m / (4 * np.pi)) ** 2 * 0.8**2 / np.pi * gamma * cos_i * cos_s / (d1 * d2) ** 2 * step**2
-    )
+    power = (wavelength_m / (4 * np.pi)) ** 2 * 0.8**2 / np.pi * cos_s / d2**2 * step**2
     power = np.where(np.hypot(*np.moveaxis(point[..., :2], -1, 0)) < 9, power, 0.0)
-    assert found["TS"] == pytest.approx((power * passed[0])[x > 1.0].sum(), rel=0.01)
-    assert found["ST"] == pytest.approx((power * passed[1])[x < 1.0].sum(), rel=0.01)
+    direct, mirrored = (power * even(c) * c / d**2 for c, d in ((cos_i, d1), (cos_m, d3)))
+    assert found["TS"] == pytest.approx((direct * passed[0])[x > 1.0].sum(), rel=0.01)
+    assert found["ST"] == pytest.approx((direct * passed[1])[x < 1.0].sum(), rel=0.01)
+    assert found["MTS"] == pytest.approx((mirrored * passed[2])[x > 1.0].sum(), rel=0.02)
+    assert by_field.sum() == pytest.approx(found["MTS"], rel=0.15)  # faces are lit whole
 
 
 def test_spectra_do_not_jump_at_a_shadow_s_boundary() -> None:

@@ -361,7 +361,7 @@ def unobstructed(
 ) -> np.ndarray:
     """Whether every leg of each path is free, shape ``(L,)``.
 
-    See :func:`_legs`; a leg is also drawn out by the clearance that :meth:`Mesh.visible` leaves at ends, so that whatever
+    See :func:`legs_of`; a leg is also drawn out by the clearance that :meth:`Mesh.visible` leaves at ends, so that whatever
     lies further off than the tolerance is met.
     """
     begin, end = legs_of(patches, source, ends, patch, point, patches.tolerance_m)
