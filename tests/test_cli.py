@@ -72,7 +72,7 @@ def test_examples_of_simulate_that_need_the_repository_alone_run(tmp_path, monke
 
 def test_numbers_below_zero_are_no_options():
     words = "simulate s.xml -o x.nc --transmitter -1e-3 -2 -.5 --receivers -1,4,-1.5".split()
-    seen: list[object] = []
+    seen = []
     parser = cli._parser()
     for action in parser._subparsers._group_actions[0].choices.values():
         action.set_defaults(command=lambda args, out: seen.append((args.transmitter, args.receivers)))
@@ -84,8 +84,8 @@ def test_numbers_below_zero_are_no_options():
 
 @pytest.mark.parametrize("kind", [ValueError, TypeError, OSError, ImportError, MemoryError])
 def test_what_went_wrong_is_one_line_and_a_bug_is_a_traceback(kind, monkeypatch, capsys):
-    def fail(error: type[Exception]) -> object:
-        def load(path: object, device: object = None) -> None:
+    def fail(error):
+        def load(path, device=None):
             raise error("first line\nsecond")
 
         return load
@@ -237,7 +237,7 @@ def test_each_file_of_measurements_has_its_own_settings(tmp_path, monkeypatch, c
 
 
 def test_materials_that_are_given_are_those_of_a_mesh_whatever_lies_beside_it(tmp_path, monkeypatch, capsys):
-    seen: list[wr.Scene] = []
+    seen = []
     monkeypatch.setattr(wr, "relevance", lambda scene, **_: seen.append(scene) or {}[0])
     (tmp_path / "room.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl pane\nf 1 2 3\n")
     (tmp_path / "mine.json").write_text('{"pane": {"itu": "glass", "thickness": 0.01}}')

@@ -9,7 +9,6 @@ import sys
 import textwrap
 import typing
 from functools import reduce
-from pathlib import Path
 
 import pytest
 from fuzz.calls import public
@@ -85,7 +84,7 @@ def test_files_that_a_page_links_exist(page):
         assert (ROOT / target).exists(), f"{target} is named and not there"
 
 
-def examples(source: Path) -> list[str]:
+def examples(source):
     """Python on a page, calls in its lines, or examples in the docstrings of a module."""
     text, blocks = source.read_text(), r"Example::\n\n((?: +[^\s\"].*\n)+)"
     if source.suffix == ".md":
@@ -98,7 +97,7 @@ def examples(source: Path) -> list[str]:
     ]
 
 
-def called(call: ast.Call) -> list[inspect.Signature]:
+def called(call):
     """Signatures of what a call may mean: ``wr.NAME``, or a method of that name of anything public."""
     if not isinstance(call.func, ast.Attribute):
         return []

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,11 +28,11 @@ from warprrf.files import (
 
 
 @pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
-def test_a_failed_write_leaves_the_old_file(tmp_path: Path, error: BaseException) -> None:
+def test_a_failed_write_leaves_the_old_file(tmp_path, error):
     path = tmp_path / "kept.txt"
     path.write_text("old")
 
-    def broken(file: Path) -> None:
+    def broken(file):
         file.write_text("half")
         raise error
 
@@ -43,9 +42,9 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, error: BaseException
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_the_file_is_written_beside_its_place_under_its_suffix(tmp_path: Path) -> None:
+def test_the_file_is_written_beside_its_place_under_its_suffix(tmp_path):
     path = tmp_path / "new" / "folder" / "field.v2.nc"
-    seen: list[Path] = []
+    seen = []
     write_atomically(
         path, lambda file: (seen.append(file), file.write_bytes(b"data"), path.exists() and 1 / 0)
     )
@@ -53,13 +52,13 @@ def test_the_file_is_written_beside_its_place_under_its_suffix(tmp_path: Path) -
     assert seen[0].parent == path.parent and seen[0].suffix == ".nc" and not seen[0].exists()
 
 
-def test_names_as_long_as_the_system_takes_them_are_written(tmp_path: Path) -> None:
+def test_names_as_long_as_the_system_takes_them_are_written(tmp_path):
     for name in ("ö" * 125 + ".nc", "a." + "b" * 250):
         write_text(tmp_path / name, "text")
         assert (tmp_path / name).read_text() == "text"
 
 
-def test_a_full_disk_is_an_error_that_names_the_file_and_leaves_the_old_one(tmp_path: Path) -> None:
+def test_a_full_disk_is_an_error_that_names_the_file_and_leaves_the_old_one(tmp_path):
     path = tmp_path / "kept.bin"
     path.write_bytes(b"old")
     handler, limit = signal.signal(signal.SIGXFSZ, signal.SIG_IGN), resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -74,7 +73,7 @@ def test_a_full_disk_is_an_error_that_names_the_file_and_leaves_the_old_one(tmp_
 
 
 @pytest.mark.parametrize("mask", [0o022, 0o027, 0o002])
-def test_files_have_the_rights_that_the_umask_leaves(tmp_path: Path, mask: int) -> None:
+def test_files_have_the_rights_that_the_umask_leaves(tmp_path, mask):
     before = os.umask(mask)
     try:
         write_bytes(tmp_path / "bytes", b"")
@@ -85,7 +84,7 @@ def test_files_have_the_rights_that_the_umask_leaves(tmp_path: Path, mask: int) 
     assert modes == {"bytes": 0o666 & ~mask, "tensors": 0o666 & ~mask}
 
 
-def test_threads_may_write_one_file(tmp_path: Path) -> None:
+def test_threads_may_write_one_file(tmp_path):
     path = tmp_path / "shared"
     contents = [bytes([k]) * 100_000 for k in range(8)]
     with ThreadPoolExecutor(8) as pool:
@@ -93,7 +92,7 @@ def test_threads_may_write_one_file(tmp_path: Path) -> None:
     assert path.read_bytes() in contents and os.listdir(tmp_path) == ["shared"]
 
 
-def test_partial_files_of_killed_processes_are_removed_and_those_of_living_ones_stay(tmp_path: Path) -> None:
+def test_partial_files_of_killed_processes_are_removed_and_those_of_living_ones_stay(tmp_path):
     killed = (
         "import os, sys, time; from pathlib import Path; from warprrf.files import write_atomically;"
         "write_atomically(sys.argv[1], lambda p: (p.write_text('half'), print(p.name, flush=True), time.sleep(60)))"
@@ -114,12 +113,12 @@ def test_partial_files_of_killed_processes_are_removed_and_those_of_living_ones_
     assert sorted(os.listdir(tmp_path)) == sorted([other_machine, "b.txt"])
 
 
-def test_a_path_without_a_name_is_refused() -> None:
+def test_a_path_without_a_name_is_refused():
     with pytest.raises(ValueError, match="path: got ''"):
         partial_path("")
 
 
-def test_text_and_arrays_come_back(tmp_path: Path) -> None:
+def test_text_and_arrays_come_back(tmp_path):
     write_text(tmp_path / "a.txt", "größer")
     assert (tmp_path / "a.txt").read_bytes() == "größer".encode()
     held = {"x": np.arange(3), "y": np.eye(2, order="F"), "z": np.array("text"), "none": np.zeros((0, 3))}
@@ -134,7 +133,7 @@ def test_text_and_arrays_come_back(tmp_path: Path) -> None:
         write_arrays(tmp_path / "a.bin", {"x": np.array([None])})
 
 
-def test_arrays_that_state_more_than_they_hold_are_refused(tmp_path: Path) -> None:
+def test_arrays_that_state_more_than_they_hold_are_refused(tmp_path):
     path = tmp_path / "a.npz"
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
@@ -147,7 +146,7 @@ def test_arrays_that_state_more_than_they_hold_are_refused(tmp_path: Path) -> No
             read_arrays(path)
 
 
-def test_a_seal_is_seen(tmp_path: Path) -> None:
+def test_a_seal_is_seen(tmp_path):
     """What damage does to sealed files, arrays and JSON is in tests/fuzz."""
     path = tmp_path / "a"
     for data in (b"", b"content", bytes(3_000_000)):
@@ -164,7 +163,7 @@ def test_a_seal_is_seen(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["[5]", "5", "", "{", "[" * 100_000, '{"a": NaN}', '{"a": 1e999}', "\xff"])
-def test_json_that_is_no_mapping_of_finite_numbers_is_refused(tmp_path: Path, text: str) -> None:
+def test_json_that_is_no_mapping_of_finite_numbers_is_refused(tmp_path, text):
     path = tmp_path / "a.json"
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(ValueError, match=r"a\.json: "):

@@ -1,9 +1,5 @@
 """The notebooks run from beginning to end, and what is committed was made from the text beside it."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 from places import ROOT
 
@@ -12,7 +8,7 @@ MAX_BYTES = 1_500_000
 
 
 @pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda path: path.stem)
-def test_committed_notebook_is_its_text(source: Path) -> None:
+def test_committed_notebook_is_its_text(source):
     jupytext = pytest.importorskip("jupytext")
     text, paired = jupytext.read(source), jupytext.read(source.with_suffix(".ipynb"))
     kept = [(cell.cell_type, cell.source) for cell in paired.cells]
@@ -25,7 +21,7 @@ def test_committed_notebook_is_its_text(source: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook_runs(source: Path) -> None:
+def test_notebook_runs(source):
     jupytext = pytest.importorskip("jupytext")
     nbclient = pytest.importorskip("nbclient")
     notebook = jupytext.read(source)

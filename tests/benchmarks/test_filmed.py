@@ -1,7 +1,5 @@
 """The film's reference and its score, on frames of a box drawn in closed form."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,9 +1,5 @@
 """The lobby: closed solids in a room of the stated size, committed files that the script builds, cameras where they say."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from places import LOBBY
@@ -17,11 +13,11 @@ from warprrf.rf.scene import Scene
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene():
     return Scene.load(LOBBY / "scene.xml")
 
 
-def test_the_air_has_the_volume_of_the_room_less_its_furniture(scene: Scene) -> None:
+def test_the_air_has_the_volume_of_the_room_less_its_furniture(scene):
     # Furniture does not overlap itself beyond the few centimetres it is sunk in: the prisms' volumes inside the room
     # follow from their profiles (shoelace formula).
     solid_volume = 0.0
@@ -35,7 +31,7 @@ def test_the_air_has_the_volume_of_the_room_less_its_furniture(scene: Scene) -> 
     assert share == pytest.approx(1 - solid_volume / float(np.prod(ROOM[1] - ROOM[0])), abs=0.008)
 
 
-def test_the_committed_files_are_what_the_script_builds(tmp_path: Path) -> None:
+def test_the_committed_files_are_what_the_script_builds(tmp_path):
     images = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
     assert build(tmp_path).read_text() == (LOBBY / "scene.xml").read_text()
     for solid in SOLIDS:
@@ -50,7 +46,7 @@ def test_the_committed_files_are_what_the_script_builds(tmp_path: Path) -> None:
         assert np.mean(np.abs(ours.astype(int) - theirs) > 2) < 1e-3
 
 
-def test_mitsuba_sees_what_the_mesh_says_at_every_pixel(scene: Scene) -> None:
+def test_mitsuba_sees_what_the_mesh_says_at_every_pixel(scene):
     pytest.importorskip("mitsuba", reason="mitsuba is not installed")
     from benchmarks.lobby.photos import render_positions
 

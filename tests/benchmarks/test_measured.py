@@ -1,7 +1,5 @@
 """A measured place: rivals find the law that made the links, noise of means is that of their halves."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,10 +1,6 @@
 """Calibration with Sionna RT's own gradients on a small room whose materials are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +13,7 @@ from benchmarks.baselines.sionna_calibration import Calibration, calibrate_sionn
 from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
 
 
-def test_calibration_lowers_the_error_and_finds_what_scatters(tmp_path: Path) -> None:
+def test_calibration_lowers_the_error_and_finds_what_scatters(tmp_path):
     folder = small_room(tmp_path)
     train = wr.SpectrumDataset.load(folder / "spectra.nc").split(4)[0]
     true = wr.Scene.load(folder / "scene.xml")
@@ -39,7 +35,7 @@ def test_calibration_lowers_the_error_and_finds_what_scatters(tmp_path: Path) ->
     recorded = []
 
     class Engine(SionnaEngine):
-        def _read(self, paths: Any) -> Any:
+        def _read(self, paths):
             recorded.append(any(drjit.grad_enabled(part) for part in paths.a))
             return super()._read(paths)
 

@@ -1,8 +1,6 @@
 """Hard cases of the rasteriser, each with the right answer: from a closed form, or from the definition evaluated in
 NumPy with long doubles where a double would cancel."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import warp as wp

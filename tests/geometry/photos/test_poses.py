@@ -1,9 +1,6 @@
 """Poses and depth that are known already: read, matched with photos, triangulated from, fused."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,25 +26,25 @@ QUICK = ReconstructionConfig(
 )  # fmt: skip
 
 
-def camera_to_world(camera: wr.Camera, opengl: bool = True) -> list[list[float]]:
+def camera_to_world(camera, opengl=True):
     return (np.linalg.inv(camera.world_to_camera) @ np.diag([1, -1, -1, 1] if opengl else [1] * 4)).tolist()
 
 
-def frames(names: list[str] = NAMES, folder: str = "images/") -> list[dict[str, object]]:
+def frames(names=NAMES, folder="images/"):
     return [
         {"file_path": folder + name, "transform_matrix": camera_to_world(camera)}
         for name, camera in lobby_cameras(names).items()
     ]
 
 
-def written(folder: Path, **values: object) -> Path:
+def written(folder, **values):
     path = folder / "transforms.json"
     path.write_text(json.dumps({**LENS, "frames": frames(), **values}))
     return path
 
 
 @pytest.fixture(scope="module")
-def truth() -> wr.Mesh:
+def truth():
     return wr.Scene.load(LOBBY / "scene.xml").mesh
 
 
@@ -148,7 +145,7 @@ def test_points_of_a_colmap_model_are_taken_as_they_are(triangulated, tmp_path):
     folder, sparse = triangulated
     cameras = sfm.read_known(folder / "w" / "sfm" / "model")
     known = KnownPoses(cameras, folder / "w" / "sfm" / "model", {name: name for name in cameras})
-    stages: list[str] = []
+    stages = []
     again = sfm.structure_from_motion(
         PHOTOS[:5], workspace=tmp_path, poses=KnownPoses({n: cameras[n] for n in NAMES[:5]}, known.model, known.names),
         progress=lambda stage, done, total: stages.append(stage),
@@ -161,7 +158,7 @@ def test_points_of_a_colmap_model_are_taken_as_they_are(triangulated, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def rgbd(tmp_path_factory, truth) -> Path:
+def rgbd(tmp_path_factory, truth):
     """Eight photos of the lobby with poses and the true depth, in a folder as of 7-Scenes."""
     folder = tmp_path_factory.mktemp("rgbd")
     np.savetxt(folder / "camera-intrinsics.txt", [[395.0, 0, 320], [0, 395, 240], [0, 0, 1]])

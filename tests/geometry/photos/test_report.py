@@ -1,9 +1,6 @@
 """The page of a reconstruction: whole, safe, and its figures by closed form."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +16,7 @@ image = pytest.importorskip("PIL.Image")
 
 
 @pytest.fixture(scope="module")
-def room() -> wr.Mesh:
+def room():
     return wr.Mesh(*box_mesh([0, 0, 0], [4, 3, 2.5], inward=True))
 
 
@@ -58,7 +55,7 @@ def test_psnr_and_matched_colours_are_by_definition():
     assert psnr_db(colours_matched(mixed, photo), photo) > 100
 
 
-def test_the_page_needs_nothing_else_and_shows_names_as_text(room, tmp_path: Path):
+def test_the_page_needs_nothing_else_and_shows_names_as_text(room, tmp_path):
     cameras, files = {}, {}
     for k in range(4):
         name = f"<b>{k}&.png"
@@ -93,6 +90,6 @@ def test_the_page_needs_nothing_else_and_shows_names_as_text(room, tmp_path: Pat
     assert "not there any more" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
-def test_a_mesh_alone_has_a_page_too(room, tmp_path: Path):
+def test_a_mesh_alone_has_a_page_too(room, tmp_path):
     wr.Reconstruction(mesh=room).report(tmp_path / "page.html")
     assert "from four sides" in (tmp_path / "page.html").read_text(encoding="utf-8")

@@ -1,7 +1,5 @@
 """Up, floor and scale where nobody surveyed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +17,7 @@ EMPTY = np.zeros(0, dtype=np.int64)
 
 
 @pytest.fixture(scope="module")
-def lobby() -> sparse.SparseModel:
+def lobby():
     """Twelve true cameras of the lobby, and points that each sees on the true mesh."""
     cameras = lobby_cameras([f"view_{k:03d}.jpg" for k in range(0, 120, 10)])
     mesh = wr.Scene.load(LOBBY / "scene.xml").mesh
@@ -37,13 +35,13 @@ def lobby() -> sparse.SparseModel:
 
 
 @pytest.fixture(scope="module")
-def lost(lobby) -> sparse.SparseModel:
+def lost(lobby):
     """The same in units and axes of their own."""
     turn = np.linalg.qr(np.random.default_rng(3).standard_normal((3, 3)))[0]
     return sparse.transformed(lobby, 0.13, turn * np.linalg.det(turn), np.array([3.0, -2.0, 1.0]))
 
 
-def read(name: str) -> np.ndarray:
+def read(name):
     return read_photo(LOBBY / "photos" / name)
 
 
