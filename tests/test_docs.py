@@ -67,9 +67,8 @@ def test_figures_of_a_settled_question_say_when_of_what_and_what_they_answer():
     files = list((ROOT / "benchmarks" / "results" / "settled").glob("*.json"))
     for file in files:
         found = json.loads(file.read_text())
-        assert re.fullmatch(r"20\d\d-\d\d-\d\d", found["date"]) and re.fullmatch(
-            r"[0-9a-f]{7,40}", found["commit"]
-        )
+        assert re.fullmatch(r"20\d\d-\d\d-\d\d", found["date"])
+        assert re.fullmatch(r"[0-9a-f]{7,40}", found["commit"])
         assert found["question"].endswith("?") and found["answer"], file.name
     assert len(files) > 5
 
@@ -172,12 +171,8 @@ def test_commands_on_pages_are_taken_by_the_parser():
 def test_what_a_page_writes_has_a_name_that_no_other_page_gives_to_something_else():
     stores = {name for code in CODE.values() for name in re.findall(r"store=(\"\S+?\")", code)}
     for name in stores:
-        lines = [
-            line
-            for code in CODE.values()
-            for line in code.splitlines()
-            if f"{name}" in line and "open" not in line
-        ]
+        every = [line for code in CODE.values() for line in code.splitlines()]
+        lines = [line for line in every if name in line and "open" not in line]
         assert len({"".join(re.findall(r"field\.(\w+)\(.*store=", line)) for line in lines}) == 1, lines
     places = [w for code in CODE.values() for w in re.findall(r"workspace=(\"\S+?\")", code)]
     assert stores and len(places) == len(set(places)), "two reconstructions in one workspace"

@@ -100,7 +100,6 @@ def test_partial_files_of_killed_processes_are_removed_and_those_of_living_ones_
     with subprocess.Popen(
         [sys.executable, "-c", killed, tmp_path / "a.nc"], stdout=subprocess.PIPE, text=True
     ) as process:
-        assert process.stdout is not None
         name = process.stdout.readline().strip()
         write_text(tmp_path / "b.txt", "")
         assert sorted(os.listdir(tmp_path)) == sorted([name, "b.txt"])

@@ -176,7 +176,6 @@ def interrupted(words, when, folder, file="*"):
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     signal.signal(signal.SIGINT, before)
-    assert process.stdout is not None
     for line in process.stdout:
         if when in line:
             break
