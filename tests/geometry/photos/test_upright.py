@@ -88,15 +88,10 @@ def test_noise_proves_no_vertical(lost):
         (("view_000.jpg", "view_010.jpg", 0.0), "distance in metres"),
         (("view_000.jpg", "view_000.jpg", 1.0), "twice"),
         (("view_000.jpg", "gone.jpg", 1.0), "no pose was found for gone.jpg"),
+        (("view_000.jpg", "view_110.jpg", 1.0), "at one place"),
     ],
 )
 def test_a_scale_that_says_nothing_is_refused(lost, scale, message):
+    cameras = lost.cameras | {"view_110.jpg": lost.cameras["view_000.jpg"]}
     with pytest.raises(ValueError, match=message):
-        sparse.scaled(replace(lost, unposed=("gone.jpg",)), scale)
-
-
-def test_cameras_at_one_place_give_no_scale(lost):
-    first, *_, last = lost.cameras
-    same = replace(lost, cameras=lost.cameras | {last: lost.cameras[first]})
-    with pytest.raises(ValueError, match="at one place"):
-        sparse.scaled(same, (first, last, 1.0))
+        sparse.scaled(replace(lost, cameras=cameras, unposed=("gone.jpg",)), scale)
