@@ -90,10 +90,8 @@ def examples(source):
         blocks, text = r"```python\n(.*?)```", re.sub(r"`(\w[^`\n]*[^=]\))`", r"```python\n\1```", text)
     if source.parent.name == "notebooks":
         return [text]
-    return [
-        textwrap.dedent(found)
-        for found in re.findall(blocks, text, flags=0 if source.suffix == ".py" else re.DOTALL)
-    ]
+    found = re.findall(blocks, text, flags=0 if source.suffix == ".py" else re.DOTALL)
+    return [textwrap.dedent(block) for block in found]
 
 
 def called(call):
@@ -139,9 +137,8 @@ def test_names_of_the_reference_are_reached_as_it_prints_them():
 
 
 def test_terms_of_the_glossary_are_those_of_the_library():
-    terms = re.findall(
-        r"^\| (?!term)([^|]+) \| [^|]+\. \|", (ROOT / "docs/glossary.md").read_text(), re.MULTILINE
-    )
+    glossary = (ROOT / "docs/glossary.md").read_text()
+    terms = re.findall(r"^\| (?!term)([^|]+) \| [^|]+\. \|", glossary, re.MULTILINE)
     assert len(terms) >= 50 and len(terms) == len(set(terms))
     texts = [p.read_text() for p in (*(ROOT / "warprrf").rglob("*.py"), *PAGES) if p.stem != "glossary"]
     used = re.sub(r"[\s_-]+", " ", " ".join(texts)).lower()
@@ -152,9 +149,8 @@ def test_terms_of_the_glossary_are_those_of_the_library():
 def test_public_names_are_words_of_the_field():
     own = "look skin crumb sort sent shown told recipe adopt tied lit".split()
     calls = {name: inspect.signature(call).parameters for name, call in public().items()}
-    assert [
-        n for call, given in calls.items() for n in (call, *given) if {*re.split(r"[._]", n)} & {*own}
-    ] == []
+    names = [n for call, given in calls.items() for n in (call, *given)]
+    assert [n for n in names if {*re.split(r"[._]", n)} & {*own}] == []
 
 
 def test_commands_on_pages_are_taken_by_the_parser():

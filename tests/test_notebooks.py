@@ -3,13 +3,13 @@
 import pytest
 from places import ROOT
 
+jupytext = pytest.importorskip("jupytext")
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
 MAX_BYTES = 1_500_000
 
 
 @pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda path: path.stem)
 def test_committed_notebook_is_its_text(source):
-    jupytext = pytest.importorskip("jupytext")
     text, paired = jupytext.read(source), jupytext.read(source.with_suffix(".ipynb"))
     kept = [(cell.cell_type, cell.source) for cell in paired.cells]
     assert kept == [(cell.cell_type, cell.source) for cell in text.cells]
@@ -21,11 +21,9 @@ def test_committed_notebook_is_its_text(source):
 @pytest.mark.slow
 @pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs(source):
-    jupytext = pytest.importorskip("jupytext")
     nbclient = pytest.importorskip("nbclient")
     notebook = jupytext.read(source)
-    nbclient.NotebookClient(
-        notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(source.parent)}}
-    ).execute()
+    where = {"metadata": {"path": str(source.parent)}}
+    nbclient.NotebookClient(notebook, timeout=600, kernel_name="python3", resources=where).execute()
     printed = [o.get("text", "") for c in notebook.cells if c.cell_type == "code" for o in c.outputs]
     assert any("all of it" in text for text in printed)

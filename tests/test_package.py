@@ -167,9 +167,8 @@ def _core_files():
         seen.add(name)
         distribution = metadata.distribution(name)
         root = Path(str(distribution.locate_file("")))
-        found |= {
-            root / f.parts[0] for f in distribution.files or () if f.parts[0] not in ("..", "__pycache__")
-        }
+        first = {f.parts[0] for f in distribution.files or ()} - {"..", "__pycache__"}
+        found |= {root / name for name in first}
         for line in distribution.requires or ():
             requirement = Requirement(line)
             if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
@@ -194,9 +193,8 @@ def test_wheel_works_in_a_fresh_environment_without_extras(wheel, tmp_path):
 
     assert python(f"import importlib.util as u; print([m for m in {WRAPPED!r} if u.find_spec(m)])") == "[]"
     names = sorted({name.split(".")[0] for name in PUBLIC})
-    assert str(fresh) in python(
-        f"import warprrf as wr; [getattr(wr, n) for n in {names!r}]; print(wr.__file__)"
-    )
+    every = f"import warprrf as wr; [getattr(wr, n) for n in {names!r}]; print(wr.__file__)"
+    assert str(fresh) in python(every)
     assert len(TEN_LINES.strip().splitlines()) == 10
     score = "print(wr.evaluate(spectra.split(10)[1], field.spectrum)['psnr_db'], spectrum.path_gain.sum())"
     psnr_db, path_gain = (float(word) for word in python(TEN_LINES + score).split()[-2:])

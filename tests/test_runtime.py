@@ -57,8 +57,7 @@ def test_a_module_that_cannot_be_kept_in_the_cache_is_compiled_elsewhere(monkeyp
 
 def test_other_words_on_standard_error_are_kept(capfd):
     with device._without_cuda_warning():
-        os.write(
-            2, b"before\nWarp CUDA warning: Could not find or load the NVIDIA CUDA driver. None.\nafter\n"
-        )
+        warning = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver. None.\n"
+        os.write(2, b"before\n" + warning + b"after\n")
     os.write(2, b"later\n")
     assert capfd.readouterr().err == "before\nafter\nlater\n"

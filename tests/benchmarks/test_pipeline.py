@@ -28,9 +28,8 @@ def data(tmp_path_factory):
         views[f"v{k}.jpg"] = {"world_to_camera": pose.tolist()}
         for sub in ("photos", "photos_noise"):
             (folder / sub).mkdir(exist_ok=True)
-            images.fromarray(rng.integers(100, 140, (48, 64, 3)).astype(np.uint8)).save(
-                folder / sub / f"v{k}.jpg"
-            )
+            pixels = rng.integers(100, 140, (48, 64, 3)).astype(np.uint8)
+            images.fromarray(pixels).save(folder / sub / f"v{k}.jpg")
     lens = {"width": 64, "height": 48, "fx": 40.0, "fy": 40.0, "cx": 32.0, "cy": 24.0}
     write_json(folder / "poses_true.json", {**lens, "views": views})
     write_json(folder / "photos.json", {"photos": list(views), "held_out": list(views)[1:3]})
