@@ -88,9 +88,8 @@ def test_a_task_takes_one_thread_unless_told(monkeypatch):
     distributed = pytest.importorskip("distributed")
     monkeypatch.delenv("WARPRRF_THREADS", raising=False)
     device._threads.cache_clear()
-    with distributed.Client(
-        processes=False, n_workers=1, threads_per_worker=2, dashboard_address=None
-    ) as client:
+    how = {"processes": False, "n_workers": 1, "threads_per_worker": 2, "dashboard_address": None}
+    with distributed.Client(**how) as client:
         assert dict(each(lambda k: (k, threads()), range(4), client)) == {k: (k, 1) for k in range(4)}
     assert threads() == len(os.sched_getaffinity(0))
     device._threads.cache_clear()

@@ -86,9 +86,8 @@ def test_the_page_opens_with_all_of_it(place):
     things = "office.obj field.safetensors truth.nc horn.csv receive-pattern=20"
     options = f"--frequency {CARRIER_HZ} --noise-floor-db -150 --port 8210 --no-browser"
     command = [sys.executable, *f"-m warprrf view {things} {options}".split()]
-    with subprocess.Popen(
-        command, cwd=place, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as page:
+    said = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    with subprocess.Popen(command, cwd=place, **said) as page:
         try:
             found = (re.search(r"http://127\.0\.0\.1:\d+\S*", line) for line in page.stdout)
             address = next(filter(None, found))

@@ -54,10 +54,8 @@ def test_a_log_gets_a_line_every_half_minute_and_a_terminal_one_line_that_moves(
         out.error("error: no", 2)
         return stream.getvalue()
 
-    bar = [
-        f"refine:  {90 + k}%|{'#' * 18}  | {900 + 10 * k}/1000 [{end}]"
-        for k, end in ((0, "00:00<?"), (1, "00:40<05:00"))
-    ]
+    ends = "00:00<?", "00:40<05:00"
+    bar = [f"refine:  {90 + k}%|{'#' * 18}  | {900 + 10 * k}/1000 [{end}]" for k, end in enumerate(ends)]
     report = f"report:   0%|{' ' * 20}| 0/2 [00:00<?]"
     assert drawn(False).splitlines() == [*bar, report, "warprrf: error: no"]
     moving = drawn(True)
