@@ -57,6 +57,16 @@ def each_form(request, monkeypatch):
 
 
 @pytest.fixture(scope="session")
+def lobby_scene():
+    """The lobby with its true materials."""
+    from places import LOBBY
+
+    from warprrf import Scene
+
+    return Scene.load(LOBBY / "scene.xml")
+
+
+@pytest.fixture(scope="session")
 def place(tmp_path_factory):
     """A small room, and files of all kinds that the library makes of it."""
     from fuzz.place import Place

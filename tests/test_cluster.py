@@ -2,10 +2,7 @@
 
 import os
 import signal
-from collections.abc import Iterator
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,24 +22,24 @@ F = np.linspace(299e9, 301e9, 4)
 
 
 @pytest.fixture(scope="module")
-def client() -> Iterator[Any]:
+def client():
     pytest.importorskip("distributed")
     with connected(None, 2) as client:
         client.wait_for_workers(2)
         yield client
 
 
-def same(a: Any, b: Any) -> None:
+def same(a, b):
     """The same bits."""
     assert leaves(a) and not differs(leaves(a), leaves(b))
 
 
 @pytest.fixture(autouse=True)
-def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+def small_parts(monkeypatch):
     monkeypatch.setattr(batches, "AT_ONCE", 2)
 
 
-def test_every_verb_gives_the_bits_of_one_process(client: Any, tmp_path: Path) -> None:
+def test_every_verb_gives_the_bits_of_one_process(client, tmp_path):
     scene, field, ds = make.room(), make.bistatic(), make.spectra()
     how = {"transmitter": ds.transmitter, "frequency_hz": ds.frequency_hz, "shape": (12, 24)}
     link = {"max_paths": 20, "diffuse": "random_phase"}
@@ -56,11 +53,11 @@ def test_every_verb_gives_the_bits_of_one_process(client: Any, tmp_path: Path) -
     same(wr.simulate(scene, client=client, **workspace), wr.simulate(scene, **workspace))
 
 
-def test_a_killed_worker_changes_no_bit(client: Any, tmp_path: Path) -> None:
+def test_a_killed_worker_changes_no_bit(client, tmp_path):
     field = make.bistatic()
     workers, killed = list(client.run(os.getpid).values()), []
 
-    def kill(stage: str, done: int, total: int) -> None:
+    def kill(stage, done, total):
         if not killed:
             killed.append(workers[0])
             os.kill(workers[0], signal.SIGKILL)
@@ -71,12 +68,12 @@ def test_a_killed_worker_changes_no_bit(client: Any, tmp_path: Path) -> None:
     assert killed[0] not in client.run(os.getpid).values()
 
 
-def test_an_error_comes_back_and_a_part_that_kills_every_worker_is_named(client: Any) -> None:
+def test_an_error_comes_back_and_a_part_that_kills_every_worker_is_named(client):
     with pytest.raises(ZeroDivisionError):
         dict(each(partial(divmod, 7), [1, 0, 2], client))
     assert [k for k, _ in each(str, range(3))] == [0, 1, 2]  # in order, without a cluster
 
-    def deaths(allowed: int, dask_scheduler: Any = None) -> None:
+    def deaths(allowed, dask_scheduler=None):
         dask_scheduler.allowed_failures = allowed
 
     client.run_on_scheduler(deaths, 0)
@@ -87,13 +84,12 @@ def test_an_error_comes_back_and_a_part_that_kills_every_worker_is_named(client:
         client.run_on_scheduler(deaths, 3)
 
 
-def test_a_task_takes_one_thread_unless_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_task_takes_one_thread_unless_told(monkeypatch):
     distributed = pytest.importorskip("distributed")
     monkeypatch.delenv("WARPRRF_THREADS", raising=False)
     device._threads.cache_clear()
-    with distributed.Client(
-        processes=False, n_workers=1, threads_per_worker=2, dashboard_address=None
-    ) as client:
+    how = {"processes": False, "n_workers": 1, "threads_per_worker": 2, "dashboard_address": None}
+    with distributed.Client(**how) as client:
         assert dict(each(lambda k: (k, threads()), range(4), client)) == {k: (k, 1) for k in range(4)}
     assert threads() == len(os.sched_getaffinity(0))
     device._threads.cache_clear()

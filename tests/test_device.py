@@ -1,7 +1,5 @@
 """Launches are cut over threads; tests/test_concurrency.py has them in forked children."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np

@@ -9,7 +9,6 @@ import sys
 import textwrap
 import typing
 from functools import reduce
-from pathlib import Path
 
 import pytest
 from fuzz.calls import public
@@ -68,9 +67,8 @@ def test_figures_of_a_settled_question_say_when_of_what_and_what_they_answer():
     files = list((ROOT / "benchmarks" / "results" / "settled").glob("*.json"))
     for file in files:
         found = json.loads(file.read_text())
-        assert re.fullmatch(r"20\d\d-\d\d-\d\d", found["date"]) and re.fullmatch(
-            r"[0-9a-f]{7,40}", found["commit"]
-        )
+        assert re.fullmatch(r"20\d\d-\d\d-\d\d", found["date"])
+        assert re.fullmatch(r"[0-9a-f]{7,40}", found["commit"])
         assert found["question"].endswith("?") and found["answer"], file.name
     assert len(files) > 5
 
@@ -85,20 +83,18 @@ def test_files_that_a_page_links_exist(page):
         assert (ROOT / target).exists(), f"{target} is named and not there"
 
 
-def examples(source: Path) -> list[str]:
+def examples(source):
     """Python on a page, calls in its lines, or examples in the docstrings of a module."""
     text, blocks = source.read_text(), r"Example::\n\n((?: +[^\s\"].*\n)+)"
     if source.suffix == ".md":
         blocks, text = r"```python\n(.*?)```", re.sub(r"`(\w[^`\n]*[^=]\))`", r"```python\n\1```", text)
     if source.parent.name == "notebooks":
         return [text]
-    return [
-        textwrap.dedent(found)
-        for found in re.findall(blocks, text, flags=0 if source.suffix == ".py" else re.DOTALL)
-    ]
+    found = re.findall(blocks, text, flags=0 if source.suffix == ".py" else re.DOTALL)
+    return [textwrap.dedent(block) for block in found]
 
 
-def called(call: ast.Call) -> list[inspect.Signature]:
+def called(call):
     """Signatures of what a call may mean: ``wr.NAME``, or a method of that name of anything public."""
     if not isinstance(call.func, ast.Attribute):
         return []
@@ -141,9 +137,8 @@ def test_names_of_the_reference_are_reached_as_it_prints_them():
 
 
 def test_terms_of_the_glossary_are_those_of_the_library():
-    terms = re.findall(
-        r"^\| (?!term)([^|]+) \| [^|]+\. \|", (ROOT / "docs/glossary.md").read_text(), re.MULTILINE
-    )
+    glossary = (ROOT / "docs/glossary.md").read_text()
+    terms = re.findall(r"^\| (?!term)([^|]+) \| [^|]+\. \|", glossary, re.MULTILINE)
     assert len(terms) >= 50 and len(terms) == len(set(terms))
     texts = [p.read_text() for p in (*(ROOT / "warprrf").rglob("*.py"), *PAGES) if p.stem != "glossary"]
     used = re.sub(r"[\s_-]+", " ", " ".join(texts)).lower()
@@ -154,9 +149,8 @@ def test_terms_of_the_glossary_are_those_of_the_library():
 def test_public_names_are_words_of_the_field():
     own = "look skin crumb sort sent shown told recipe adopt tied lit".split()
     calls = {name: inspect.signature(call).parameters for name, call in public().items()}
-    assert [
-        n for call, given in calls.items() for n in (call, *given) if {*re.split(r"[._]", n)} & {*own}
-    ] == []
+    names = [n for call, given in calls.items() for n in (call, *given)]
+    assert [n for n in names if {*re.split(r"[._]", n)} & {*own}] == []
 
 
 def test_commands_on_pages_are_taken_by_the_parser():
@@ -173,12 +167,8 @@ def test_commands_on_pages_are_taken_by_the_parser():
 def test_what_a_page_writes_has_a_name_that_no_other_page_gives_to_something_else():
     stores = {name for code in CODE.values() for name in re.findall(r"store=(\"\S+?\")", code)}
     for name in stores:
-        lines = [
-            line
-            for code in CODE.values()
-            for line in code.splitlines()
-            if f"{name}" in line and "open" not in line
-        ]
+        every = [line for code in CODE.values() for line in code.splitlines()]
+        lines = [line for line in every if name in line and "open" not in line]
         assert len({"".join(re.findall(r"field\.(\w+)\(.*store=", line)) for line in lines}) == 1, lines
     places = [w for code in CODE.values() for w in re.findall(r"workspace=(\"\S+?\")", code)]
     assert stores and len(places) == len(set(places)), "two reconstructions in one workspace"

@@ -9,64 +9,52 @@ import subprocess
 import sys
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from warprrf import tensor_files
-from warprrf.files import (
-    check_seal,
-    partial_path,
-    read_arrays,
-    read_json,
-    write_arrays,
-    write_atomically,
-    write_bytes,
-    write_json,
-    write_text,
-)
+from warprrf import files, tensor_files
 
 
 @pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
-def test_a_failed_write_leaves_the_old_file(tmp_path: Path, error: BaseException) -> None:
+def test_a_failed_write_leaves_the_old_file(tmp_path, error):
     path = tmp_path / "kept.txt"
     path.write_text("old")
 
-    def broken(file: Path) -> None:
+    def broken(file):
         file.write_text("half")
         raise error
 
     with pytest.raises(type(error)):
-        write_atomically(path, broken)
+        files.write_atomically(path, broken)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_the_file_is_written_beside_its_place_under_its_suffix(tmp_path: Path) -> None:
+def test_the_file_is_written_beside_its_place_under_its_suffix(tmp_path):
     path = tmp_path / "new" / "folder" / "field.v2.nc"
-    seen: list[Path] = []
-    write_atomically(
+    seen = []
+    files.write_atomically(
         path, lambda file: (seen.append(file), file.write_bytes(b"data"), path.exists() and 1 / 0)
     )
     assert path.read_bytes() == b"data"
     assert seen[0].parent == path.parent and seen[0].suffix == ".nc" and not seen[0].exists()
 
 
-def test_names_as_long_as_the_system_takes_them_are_written(tmp_path: Path) -> None:
+def test_names_as_long_as_the_system_takes_them_are_written(tmp_path):
     for name in ("ö" * 125 + ".nc", "a." + "b" * 250):
-        write_text(tmp_path / name, "text")
+        files.write_text(tmp_path / name, "text")
         assert (tmp_path / name).read_text() == "text"
 
 
-def test_a_full_disk_is_an_error_that_names_the_file_and_leaves_the_old_one(tmp_path: Path) -> None:
+def test_a_full_disk_is_an_error_that_names_the_file_and_leaves_the_old_one(tmp_path):
     path = tmp_path / "kept.bin"
     path.write_bytes(b"old")
     handler, limit = signal.signal(signal.SIGXFSZ, signal.SIG_IGN), resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limit[1]))
         with pytest.raises(OSError, match=r"kept\.bin"):
-            write_bytes(path, bytes(5000), seal=True)
+            files.write_bytes(path, bytes(5000), seal=True)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
         signal.signal(signal.SIGXFSZ, handler)
@@ -74,10 +62,10 @@ def test_a_full_disk_is_an_error_that_names_the_file_and_leaves_the_old_one(tmp_
 
 
 @pytest.mark.parametrize("mask", [0o022, 0o027, 0o002])
-def test_files_have_the_rights_that_the_umask_leaves(tmp_path: Path, mask: int) -> None:
+def test_files_have_the_rights_that_the_umask_leaves(tmp_path, mask):
     before = os.umask(mask)
     try:
-        write_bytes(tmp_path / "bytes", b"")
+        files.write_bytes(tmp_path / "bytes", b"")
         tensor_files.write(tmp_path / "tensors", {"x": np.zeros(3)}, {})
     finally:
         os.umask(before)
@@ -85,56 +73,54 @@ def test_files_have_the_rights_that_the_umask_leaves(tmp_path: Path, mask: int) 
     assert modes == {"bytes": 0o666 & ~mask, "tensors": 0o666 & ~mask}
 
 
-def test_threads_may_write_one_file(tmp_path: Path) -> None:
+def test_threads_may_write_one_file(tmp_path):
     path = tmp_path / "shared"
     contents = [bytes([k]) * 100_000 for k in range(8)]
     with ThreadPoolExecutor(8) as pool:
-        list(pool.map(lambda k: write_bytes(path, contents[k % 8]), range(200)))
+        list(pool.map(lambda k: files.write_bytes(path, contents[k % 8]), range(200)))
     assert path.read_bytes() in contents and os.listdir(tmp_path) == ["shared"]
 
 
-def test_partial_files_of_killed_processes_are_removed_and_those_of_living_ones_stay(tmp_path: Path) -> None:
+def test_partial_files_of_killed_processes_are_removed_and_those_of_living_ones_stay(tmp_path):
     killed = (
         "import os, sys, time; from pathlib import Path; from warprrf.files import write_atomically;"
         "write_atomically(sys.argv[1], lambda p: (p.write_text('half'), print(p.name, flush=True), time.sleep(60)))"
     )
-    with subprocess.Popen(
-        [sys.executable, "-c", killed, tmp_path / "a.nc"], stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
+    command = [sys.executable, "-c", killed, tmp_path / "a.nc"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         name = process.stdout.readline().strip()
-        write_text(tmp_path / "b.txt", "")
+        files.write_text(tmp_path / "b.txt", "")
         assert sorted(os.listdir(tmp_path)) == sorted([name, "b.txt"])
         process.kill()
     other_machine = f".a.00000000-{process.pid}-00000000.partial.nc"
     (tmp_path / other_machine).touch()
     folder = tmp_path / name.replace(".nc", "")
     (folder / "inside").mkdir(parents=True)
-    write_text(tmp_path / "b.txt", "")
+    files.write_text(tmp_path / "b.txt", "")
     assert sorted(os.listdir(tmp_path)) == sorted([other_machine, "b.txt"])
 
 
-def test_a_path_without_a_name_is_refused() -> None:
+def test_a_path_without_a_name_is_refused():
     with pytest.raises(ValueError, match="path: got ''"):
-        partial_path("")
+        files.partial_path("")
 
 
-def test_text_and_arrays_come_back(tmp_path: Path) -> None:
-    write_text(tmp_path / "a.txt", "größer")
+def test_text_and_arrays_come_back(tmp_path):
+    files.write_text(tmp_path / "a.txt", "größer")
     assert (tmp_path / "a.txt").read_bytes() == "größer".encode()
     held = {"x": np.arange(3), "y": np.eye(2, order="F"), "z": np.array("text"), "none": np.zeros((0, 3))}
     for compress in (True, False):
-        write_arrays(tmp_path / "a.bin", held, compress=compress)
-        found = read_arrays(tmp_path / "a.bin")
+        files.write_arrays(tmp_path / "a.bin", held, compress=compress)
+        found = files.read_arrays(tmp_path / "a.bin")
         assert list(found) == list(held)
         for name, array in held.items():
             np.testing.assert_array_equal(found[name], array)
             assert found[name].dtype == array.dtype
     with pytest.raises(TypeError, match="^x: got an array of Python objects"):
-        write_arrays(tmp_path / "a.bin", {"x": np.array([None])})
+        files.write_arrays(tmp_path / "a.bin", {"x": np.array([None])})
 
 
-def test_arrays_that_state_more_than_they_hold_are_refused(tmp_path: Path) -> None:
+def test_arrays_that_state_more_than_they_hold_are_refused(tmp_path):
     path = tmp_path / "a.npz"
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
@@ -144,28 +130,28 @@ def test_arrays_that_state_more_than_they_hold_are_refused(tmp_path: Path) -> No
         with zipfile.ZipFile(path, "w") as archive:
             archive.writestr("x.npy", content)
         with pytest.raises(ValueError, match=r"a\.npz: damaged, or no NPZ file"):
-            read_arrays(path)
+            files.read_arrays(path)
 
 
-def test_a_seal_is_seen(tmp_path: Path) -> None:
+def test_a_seal_is_seen(tmp_path):
     """What damage does to sealed files, arrays and JSON is in tests/fuzz."""
     path = tmp_path / "a"
     for data in (b"", b"content", bytes(3_000_000)):
-        write_bytes(path, data, seal=True)
-        assert check_seal(path) and path.read_bytes().startswith(data)
-        write_bytes(path, data)
-        assert not check_seal(path)
+        files.write_bytes(path, data, seal=True)
+        assert files.check_seal(path) and path.read_bytes().startswith(data)
+        files.write_bytes(path, data)
+        assert not files.check_seal(path)
     with pytest.raises(FileNotFoundError, match="missing"):
-        check_seal(tmp_path / "missing")
+        files.check_seal(tmp_path / "missing")
     value = {"b": [1, 2.5, 1e-30, None, "ö"], "a": {"c": True}}
     for seal in (True, False):
-        write_json(path, value, seal=seal)
-        assert read_json(path) == value
+        files.write_json(path, value, seal=seal)
+        assert files.read_json(path) == value
 
 
 @pytest.mark.parametrize("text", ["[5]", "5", "", "{", "[" * 100_000, '{"a": NaN}', '{"a": 1e999}', "\xff"])
-def test_json_that_is_no_mapping_of_finite_numbers_is_refused(tmp_path: Path, text: str) -> None:
+def test_json_that_is_no_mapping_of_finite_numbers_is_refused(tmp_path, text):
     path = tmp_path / "a.json"
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(ValueError, match=r"a\.json: "):
-        read_json(path)
+        files.read_json(path)

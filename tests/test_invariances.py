@@ -15,11 +15,7 @@ from rooms import EXACT, FIGURES, LAWS, ROUNDED, most_db, rms_change_db, total_c
 
 import warprrf as wr
 
-NOT_EVERY_TIME = {
-    "shifted by 1e3 m",
-    "in float32",
-    *(f"noise of 1e{k} m" for k in (-8, -7, -4)),
-}
+NOT_EVERY_TIME = {"shifted by 1e3 m", "in float32", *(f"noise of 1e{k} m" for k in (-8, -7, -4))}
 EVERY = [law for law in LAWS if law not in NOT_EVERY_TIME]
 FEW = [
     "shifted by 1e3 m", "turned by five columns", "turned askew", "scaled by 2", "in another order", "reversed winding",

@@ -64,23 +64,16 @@ def run(*words):
 
 def test_the_office_s_places_are_in_its_air_before_and_behind_the_glass(place):
     places = np.loadtxt(place / "places.csv", delimiter=",", skiprows=1)
-    assert (
-        len(places) == 40 and not ((places[:, 0] > 5) & (places[:, 1] > 3.5)).any()
-    )  # the corner that is cut out
+    assert len(places) == 40
+    assert not ((places[:, 0] > 5) & (places[:, 1] > 3.5)).any()  # the corner that is cut out
     assert (places[:, 0] > 6.5).any() and wr.Scene.load(place / "office.obj").is_free(BEHIND_GLASS).all()
 
 
 def test_a_horn_and_a_power_meter_make_a_field_that_is_right_where_nobody_measured(place):
     field = wr.RadioField.load(place / "field.safetensors")
     assert field.report["chains"]["horn"]["gain_db"] == pytest.approx(CHAIN_DB, abs=0.6)
-    run(
-        "evaluate",
-        place / "field.safetensors",
-        place / "truth.nc",
-        "-o",
-        place / "figures.json",
-        "--no-lookups",
-    )
+    words = "evaluate {0}/field.safetensors {0}/truth.nc -o {0}/figures.json --no-lookups"
+    run(*words.format(place).split())
     figures = json.loads((place / "figures.json").read_text())["bistatic"]
     assert figures["receivers"] == 5 and figures["psnr_db"] > 24.0 and figures["direction_within_3deg"] > 0.8
     truth = wr.SpectrumDataset.load(place / "truth.nc")
@@ -90,25 +83,14 @@ def test_a_horn_and_a_power_meter_make_a_field_that_is_right_where_nobody_measur
 
 
 def test_the_page_opens_with_all_of_it(place):
-    things = ["office.obj", "field.safetensors", "truth.nc", "horn.csv"]
-    words = [
-        *things,
-        "receive-pattern=20",
-        "--frequency",
-        str(CARRIER_HZ),
-        "--noise-floor-db",
-        "-150",
-        "--port",
-        "8210",
-    ]
-    command = [sys.executable, "-m", "warprrf", "view", *words, "--no-browser"]
-    with subprocess.Popen(
-        command, cwd=place, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as page:
+    things = "office.obj field.safetensors truth.nc horn.csv receive-pattern=20"
+    options = f"--frequency {CARRIER_HZ} --noise-floor-db -150 --port 8210 --no-browser"
+    command = [sys.executable, *f"-m warprrf view {things} {options}".split()]
+    said = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    with subprocess.Popen(command, cwd=place, **said) as page:
         try:
-            address = next(
-                filter(None, (re.search(r"http://127\.0\.0\.1:\d+\S*", line) for line in page.stdout))
-            )
+            found = (re.search(r"http://127\.0\.0\.1:\d+\S*", line) for line in page.stdout)
+            address = next(filter(None, found))
             assert b"<html" in urllib.request.urlopen(address[0]).read()
         finally:
             page.terminate()

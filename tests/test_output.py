@@ -1,7 +1,5 @@
 """Long work says how far it is, in one way; commands say it as bars or JSON; Ctrl-C ends them and loses nothing."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -10,7 +8,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,13 +21,13 @@ from warprrf.device import TimeLeft
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+def clock(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     return now
 
 
-def test_time_left_follows_the_recent_rate(clock: list[float]) -> None:
+def test_time_left_follows_the_recent_rate(clock):
     left, said = TimeLeft(), []
     for now, done in ((0, 900), (30, 901), (32, 902), (34, 903), (44, 908), (54, 909)):
         clock[0] = now
@@ -45,7 +42,7 @@ def test_time_left_follows_the_recent_rate(clock: list[float]) -> None:
 
 
 def test_a_log_gets_a_line_every_half_minute_and_a_terminal_one_line_that_moves(clock, monkeypatch):
-    def drawn(terminal: bool) -> str:
+    def drawn(terminal):
         stream = io.StringIO()
         monkeypatch.setattr(stream, "isatty", lambda: terminal)
         monkeypatch.setattr(sys, "stderr", stream)
@@ -57,27 +54,25 @@ def test_a_log_gets_a_line_every_half_minute_and_a_terminal_one_line_that_moves(
         out.error("error: no", 2)
         return stream.getvalue()
 
-    bar = [
-        f"refine:  {90 + k}%|{'#' * 18}  | {900 + 10 * k}/1000 [{end}]"
-        for k, end in ((0, "00:00<?"), (1, "00:40<05:00"))
-    ]
+    ends = "00:00<?", "00:40<05:00"
+    bar = [f"refine:  {90 + k}%|{'#' * 18}  | {900 + 10 * k}/1000 [{end}]" for k, end in enumerate(ends)]
     report = f"report:   0%|{' ' * 20}| 0/2 [00:00<?]"
     assert drawn(False).splitlines() == [*bar, report, "warprrf: error: no"]
     moving = drawn(True)
     assert moving.count("\n") == 3 and moving.count("\r") == 4 and bar[1] in moving  # 901 is drawn there too
 
 
-def events(text: str) -> list[dict[str, Any]]:
+def events(text):
     """Standard output of a command with --json: strict JSON, an object a line, and nothing else."""
 
-    def refuse(word: str) -> None:
+    def refuse(word):
         raise AssertionError(word)
 
     return [json.loads(line, parse_constant=refuse) for line in text.splitlines()]
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def room(tmp_path_factory):
     """A scene, a hundred receivers and what is made of them by the tests below, in order."""
     folder = tmp_path_factory.mktemp("room")
     (folder / "room.xml").write_text(
@@ -123,7 +118,7 @@ def test_json_holds_progress_and_one_result(command, room, monkeypatch, capsys):
     assert figures.items() <= result.items() and (figures or result)
 
 
-def test_every_long_function_tells_how_far_it_is(room: Path) -> None:
+def test_every_long_function_tells_how_far_it_is(room):
     """As do those behind the commands above, and a reconstruction (tests/geometry/test_reconstruction.py)."""
     scene, data = wr.Scene.load(room / "room.xml"), wr.SpectrumDataset.load(room / "x.nc")
     few, places = data.subset(range(12)), data.receivers[90:95]
@@ -167,7 +162,7 @@ def test_errors_are_json_too_and_a_bug_has_a_traceback(room, monkeypatch, capsys
     assert said.err == "a stranger's word\n"
 
 
-def interrupted(words: list[str], when: str, folder: Path, file: str = "*") -> tuple[str, float]:
+def interrupted(words, when, folder, file="*"):
     """What a real process says on SIGINT, sent once it has told ``when`` and made ``file``, and how long it takes to end.
 
     ``file`` is a pattern; a file that is still being written begins with a point, which ``[!.]`` leaves out.
@@ -179,7 +174,6 @@ def interrupted(words: list[str], when: str, folder: Path, file: str = "*") -> t
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     signal.signal(signal.SIGINT, before)
-    assert process.stdout is not None
     for line in process.stdout:
         if when in line:
             break
@@ -237,7 +231,7 @@ sys.exit(cli.run(cli.make_parser("stuck", "", "", [lambda add: add("stuck", stuc
 """
 
 
-def test_ctrl_c_ends_native_code_that_does_not_listen(tmp_path: Path) -> None:
+def test_ctrl_c_ends_native_code_that_does_not_listen(tmp_path):
     (tmp_path / "stuck.py").write_text(STUCK)
     message, took = interrupted(["stuck", "stuck"], '"stuck"', tmp_path)
     assert message == "interrupted; nothing is kept" and 0.9 < took < 3.0

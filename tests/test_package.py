@@ -1,7 +1,5 @@
 """What a stranger meets first: a light import, the public names, a wheel that stands alone, extras that are named."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import inspect
@@ -62,7 +60,7 @@ IMPORT_NAMES = {
 }  # fmt: skip
 
 
-def run(*words: object, cwd: Path | None = None, fails: bool = False) -> str:
+def run(*words, cwd=None, fails=False):
     """What a program writes to standard output; to standard error where it is to fail."""
     command = list(map(str, words))
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=cwd, check=False)
@@ -70,12 +68,12 @@ def run(*words: object, cwd: Path | None = None, fails: bool = False) -> str:
     return (done.stderr if fails else done.stdout).strip()
 
 
-def test_import_loads_no_heavy_package() -> None:
+def test_import_loads_no_heavy_package():
     code = f"import sys, warprrf; print([m for m in {HEAVY!r} if m in sys.modules])"
     assert run(sys.executable, "-c", code, cwd=ROOT) == "[]"
 
 
-def test_public_names_are_there_and_flat_ones_few() -> None:
+def test_public_names_are_there_and_flat_ones_few():
     assert [name for name in PUBLIC if not operator.attrgetter(name)(warprrf)] == []
     assert {name.split(".")[0] for name in PUBLIC} <= set(dir(warprrf))
     assert sum(not inspect.ismodule(getattr(warprrf, name)) for name in dir(warprrf)) <= 26
@@ -88,7 +86,7 @@ LAZY = sorted((ROOT / "warprrf").rglob("__init__.pyi"))
 
 
 @pytest.mark.parametrize("stub", LAZY, ids=lambda file: file.parent.name)
-def test_every_name_of_a_stub_is_what_it_says_and_help_lists_it(stub: Path) -> None:
+def test_every_name_of_a_stub_is_what_it_says_and_help_lists_it(stub):
     """Once all modules are imported too: a module of a package hides what the package's `__getattr__` would find."""
     package = importlib.import_module(".".join(stub.parent.relative_to(ROOT).parts))
     imports = [node for node in ast.parse(stub.read_text()).body if isinstance(node, ast.ImportFrom)]
@@ -104,8 +102,8 @@ REQUIRED = re.compile(r'require\("([\w.]+)", extra="(\w+)"\)')
 
 
 @pytest.mark.parametrize("package", WRAPPED)
-def test_heavy_package_is_wrapped_by_one_module(package: str) -> None:
-    def used(text: str) -> bool:
+def test_heavy_package_is_wrapped_by_one_module(package):
+    def used(text):
         nodes = [n for n in ast.walk(ast.parse(text)) if isinstance(n, (ast.Import, ast.ImportFrom))]
         named = [re.match(rf"(import|from) {package}\b", ast.unparse(node)) for node in nodes]
         return any(named) or f'require("{package}' in text
@@ -114,7 +112,7 @@ def test_heavy_package_is_wrapped_by_one_module(package: str) -> None:
     assert len(users) <= 1, users
 
 
-def test_required_extras_exist_and_bring_the_package() -> None:
+def test_required_extras_exist_and_bring_the_package():
     wrong, found = [], 0
     for file in sorted((ROOT / "warprrf").rglob("*.py")):
         for module, extra in REQUIRED.findall(file.read_text()):
@@ -125,7 +123,7 @@ def test_required_extras_exist_and_bring_the_package() -> None:
     assert wrong == [] and found > 20
 
 
-def test_constraints_pin_every_requirement_exactly() -> None:
+def test_constraints_pin_every_requirement_exactly():
     lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if line and line[0] != "#"]
     pinned = {}
     for line in lines:
@@ -139,7 +137,7 @@ def test_constraints_pin_every_requirement_exactly() -> None:
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def wheel(tmp_path_factory):
     pytest.importorskip("hatchling")
     folder = tmp_path_factory.mktemp("wheel")
     build = "-m pip wheel -q --no-deps --no-build-isolation -w".split()
@@ -147,7 +145,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return next(folder.glob("warprrf-*.whl"))
 
 
-def test_wheel_is_typed_licensed_and_holds_only_the_package(wheel: Path) -> None:
+def test_wheel_is_typed_licensed_and_holds_only_the_package(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     assert "warprrf/py.typed" in names
     assert any(name.endswith("licenses/LICENSE") for name in names)
@@ -158,10 +156,10 @@ def test_wheel_is_typed_licensed_and_holds_only_the_package(wheel: Path) -> None
     assert wheel.stat().st_size < 730e3  # code alone
 
 
-def _core_files() -> list[Path]:
+def _core_files():
     """Top-level files and folders of the core dependencies, theirs included, in this environment."""
     todo, seen = [Requirement(r) for r in PROJECT["dependencies"]], set()
-    found: set[Path] = set()
+    found = set()
     while todo:
         name = canonicalize_name(todo.pop().name)
         if name in seen:
@@ -169,9 +167,8 @@ def _core_files() -> list[Path]:
         seen.add(name)
         distribution = metadata.distribution(name)
         root = Path(str(distribution.locate_file("")))
-        found |= {
-            root / f.parts[0] for f in distribution.files or () if f.parts[0] not in ("..", "__pycache__")
-        }
+        first = {f.parts[0] for f in distribution.files or ()} - {"..", "__pycache__"}
+        found |= {root / name for name in first}
         for line in distribution.requires or ():
             requirement = Requirement(line)
             if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
@@ -179,7 +176,7 @@ def _core_files() -> list[Path]:
     return sorted(found)
 
 
-def test_wheel_works_in_a_fresh_environment_without_extras(wheel: Path, tmp_path: Path) -> None:
+def test_wheel_works_in_a_fresh_environment_without_extras(wheel, tmp_path):
     """A new environment gets the wheel and the core dependencies (linked, not downloaded), and no extra."""
     fresh, core = tmp_path / "venv", tmp_path / "core"
     run(sys.executable, "-m", "venv", fresh)
@@ -191,14 +188,13 @@ def test_wheel_works_in_a_fresh_environment_without_extras(wheel: Path, tmp_path
     purelib = run(*alone, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))")
     (Path(purelib) / "core.pth").write_text(f"{core}\n")
 
-    def python(code: str, **how: bool) -> str:
+    def python(code, **how):
         return run(*alone, "-c", code, cwd=tmp_path, **how)
 
     assert python(f"import importlib.util as u; print([m for m in {WRAPPED!r} if u.find_spec(m)])") == "[]"
     names = sorted({name.split(".")[0] for name in PUBLIC})
-    assert str(fresh) in python(
-        f"import warprrf as wr; [getattr(wr, n) for n in {names!r}]; print(wr.__file__)"
-    )
+    every = f"import warprrf as wr; [getattr(wr, n) for n in {names!r}]; print(wr.__file__)"
+    assert str(fresh) in python(every)
     assert len(TEN_LINES.strip().splitlines()) == 10
     score = "print(wr.evaluate(spectra.split(10)[1], field.spectrum)['psnr_db'], spectrum.path_gain.sum())"
     psnr_db, path_gain = (float(word) for word in python(TEN_LINES + score).split()[-2:])

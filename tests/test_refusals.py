@@ -15,15 +15,9 @@ ENDS = {"transmitter": TX, "receivers": RECEIVERS[:1], "frequency_hz": F}
 
 
 def readings(**changes):
-    given = {
-        "transmitters": TX,
-        "receivers": RECEIVERS[0],
-        "power": [1e-9, 1e-9],
-        "frequency_hz": F,
-        "floor": 1e-15,
-    }
+    given = {"transmitters": TX, "receivers": RECEIVERS[0], "frequency_hz": F, "floor": 1e-15}
     turned = {"arrival": [[1.0, 0.0], [1.0, 1.0]], "receive_pattern": wr.horn(0.2)}
-    return wr.Readings(**(given | turned | changes))
+    return wr.Readings(**(given | turned | {"power": [1e-9, 1e-9]} | changes))
 
 
 @pytest.mark.parametrize(

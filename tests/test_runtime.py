@@ -1,7 +1,5 @@
 """Warp starts without a word on a machine without a GPU, and works where its cache of kernels cannot be written."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -14,7 +12,7 @@ from places import ROOT
 from warprrf import device
 
 
-def _started(cache: Path) -> subprocess.CompletedProcess[str]:
+def _started(cache):
     code = (
         "from warprrf.device import resolve; import warp; resolve('cpu'); print(warp.config.kernel_cache_dir)"
     )
@@ -24,12 +22,12 @@ def _started(cache: Path) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
-def test_nothing_is_said_at_a_start_without_a_gpu(tmp_path: Path) -> None:
+def test_nothing_is_said_at_a_start_without_a_gpu(tmp_path):
     done = _started(tmp_path)
     assert done.stderr == "" and done.stdout.startswith(str(tmp_path))
 
 
-def test_kernels_go_to_a_temporary_folder_where_the_cache_cannot_be_written(tmp_path: Path) -> None:
+def test_kernels_go_to_a_temporary_folder_where_the_cache_cannot_be_written(tmp_path):
     (tmp_path / "file").touch()
     done = _started(tmp_path / "file" / "cache")
     for word in ("UserWarning: kernel cache: ", str(tmp_path / "file" / "cache"), "WARP_CACHE_PATH"):
@@ -45,7 +43,7 @@ def test_a_module_that_cannot_be_kept_in_the_cache_is_compiled_elsewhere(monkeyp
     class Module:
         folders: tuple[str, ...] = ()
 
-        def load(self, device: str, block_dim: int) -> None:
+        def load(self, device, block_dim):
             self.folders += (wp.config.kernel_cache_dir,)
             if len(self.folders) == 1:
                 raise PermissionError(13, "Permission denied", str(tmp_path))
@@ -57,10 +55,9 @@ def test_a_module_that_cannot_be_kept_in_the_cache_is_compiled_elsewhere(monkeyp
     assert first == str(tmp_path) and Path(second).is_dir() and "warprrf-kernels-" in second
 
 
-def test_other_words_on_standard_error_are_kept(capfd: pytest.CaptureFixture[str]) -> None:
+def test_other_words_on_standard_error_are_kept(capfd):
     with device._without_cuda_warning():
-        os.write(
-            2, b"before\nWarp CUDA warning: Could not find or load the NVIDIA CUDA driver. None.\nafter\n"
-        )
+        warning = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver. None.\n"
+        os.write(2, b"before\n" + warning + b"after\n")
     os.write(2, b"later\n")
     assert capfd.readouterr().err == "before\nafter\nlater\n"

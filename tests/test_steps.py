@@ -1,30 +1,25 @@
 """Steps keep what is finished, redo what changed, go on where a killed attempt was, and count its time."""
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from warprrf import steps as module
 from warprrf.files import write_text
-from warprrf.steps import Attempt, Steps, digest
+from warprrf.steps import Steps, digest
 
 
 def _ask(folder, made, value=1, *, given=0, version=1, fresh=False):
     """The step's value; ``made`` gets it where it is made."""
 
-    def make(attempt: Attempt) -> dict[str, float]:
+    def make(attempt):
         made.append(value)
         write_text(folder / "out.txt", "text")
         return {"value": value, "gain": 0.5}
@@ -33,7 +28,7 @@ def _ask(folder, made, value=1, *, given=0, version=1, fresh=False):
         return int(steps.run("one", make, version=version, inputs=[given], outputs=["out.txt"])["value"])
 
 
-REDONE: dict[str, dict[str, Any] | Callable[[str], str] | None] = {
+REDONE = {
     "another input": {"given": 1},
     "another version": {"version": 2},
     "from the beginning": {"fresh": True},
@@ -47,8 +42,8 @@ REDONE: dict[str, dict[str, Any] | Callable[[str], str] | None] = {
 
 
 @pytest.mark.parametrize("change", REDONE)
-def test_a_finished_step_is_done_again_only_when_something_changed(tmp_path: Path, change: str) -> None:
-    made: list[int] = []
+def test_a_finished_step_is_done_again_only_when_something_changed(tmp_path, change):
+    made = []
     assert [_ask(tmp_path, made, 1), _ask(tmp_path, made, 2)] == [1, 1] and made == [1]
     how = REDONE[change]
     if how is None:
@@ -59,18 +54,18 @@ def test_a_finished_step_is_done_again_only_when_something_changed(tmp_path: Pat
     assert _ask(tmp_path, made, 3, **(how if isinstance(how, dict) else {})) == 3 and made == [1, 3]
 
 
-def test_a_step_that_does_not_write_its_output_is_an_error_and_stays_unfinished(tmp_path: Path) -> None:
+def test_a_step_that_does_not_write_its_output_is_an_error_and_stays_unfinished(tmp_path):
     with Steps(tmp_path) as steps:
         with pytest.raises(RuntimeError, match="without writing gone.txt"):
             steps.run("one", lambda attempt: {}, version=1, inputs=[], outputs=["gone.txt"])
         assert not json.loads((tmp_path / ".steps/one.json").read_text())["finished"]
 
 
-def test_scratch_stays_with_its_inputs_until_the_step_is_finished(tmp_path: Path) -> None:
-    seen: list[bool] = []
+def test_scratch_stays_with_its_inputs_until_the_step_is_finished(tmp_path):
+    seen = []
 
-    def attempt_with(value: int, fail: bool) -> None:
-        def make(attempt: Attempt) -> dict[str, int]:
+    def attempt_with(value, fail):
+        def make(attempt):
             seen.append((attempt.folder / "half.txt").exists())
             (attempt.folder / "half.txt").write_text("half")
             if fail:
@@ -87,11 +82,11 @@ def test_scratch_stays_with_its_inputs_until_the_step_is_finished(tmp_path: Path
     assert not (tmp_path / ".steps/one").exists()
 
 
-def test_arrays_are_kept_by_key_and_made_again_when_damaged(tmp_path: Path) -> None:
-    made: list[int] = []
+def test_arrays_are_kept_by_key_and_made_again_when_damaged(tmp_path):
+    made = []
 
-    def ask(value: int) -> dict[str, np.ndarray]:
-        def make() -> dict[str, np.ndarray]:
+    def ask(value):
+        def make():
             made.append(value)
             return {"gain": np.full((2, 3), value, np.float32), "flag": np.array(True)}
 
@@ -112,7 +107,7 @@ def test_arrays_are_kept_by_key_and_made_again_when_damaged(tmp_path: Path) -> N
     assert made == [1, 2, 2, 2]
 
 
-def test_digest_follows_names_and_content_of_files_not_dates(tmp_path: Path) -> None:
+def test_digest_follows_names_and_content_of_files_not_dates(tmp_path):
     folder = tmp_path / "photos"
     folder.mkdir()
     (folder / "a.jpg").write_bytes(b"one")
@@ -137,8 +132,8 @@ class _Other(_Config):
     """Equal in all but the class."""
 
 
-def test_digest_tells_values_apart_and_equal_ones_not() -> None:
-    different: list[object] = [
+def test_digest_tells_values_apart_and_equal_ones_not():
+    different = [
         1, 1.0, "1", True, None, b"1", [1], [[1]], {"1": 1}, [1, 2], ["1", 2], [[1], 2], [1, [2]], float("nan"),
         np.zeros(4), np.zeros((2, 2)), np.zeros(4, np.float32), np.zeros(2), _Config(), _Other(), _Config(rate=0.2),
     ]  # fmt: skip
@@ -153,8 +148,8 @@ def test_digest_tells_values_apart_and_equal_ones_not() -> None:
         digest(object())
 
 
-def _slow(folder: str) -> None:
-    def make(attempt: Attempt) -> dict[str, int]:
+def _slow(folder):
+    def make(attempt):
         for step in range(1000):
             time.sleep(0.02)
             attempt.progress("slow", step, 1000)
@@ -165,7 +160,7 @@ def _slow(folder: str) -> None:
         steps.run("slow", make, version=1, inputs=[1])
 
 
-def test_a_killed_attempt_is_continued_and_its_time_counted(tmp_path: Path) -> None:
+def test_a_killed_attempt_is_continued_and_its_time_counted(tmp_path):
     process = multiprocessing.get_context("spawn").Process(target=_slow, args=(str(tmp_path),))
     process.start()
     state = tmp_path / ".steps/slow.json"
@@ -174,13 +169,12 @@ def test_a_killed_attempt_is_continued_and_its_time_counted(tmp_path: Path) -> N
     while recorded < 0.2 and time.monotonic() < deadline:
         time.sleep(0.02)
         recorded = json.loads(state.read_text())["seconds"] if state.exists() else 0.0
-    assert process.pid is not None
     os.kill(process.pid, signal.SIGKILL)
     process.join()
-    told: list[tuple[str, int, int]] = []
+    told = []
     with Steps(tmp_path, progress=lambda *news: told.append(news)) as steps:
 
-        def make(attempt: Attempt) -> dict[str, int]:
+        def make(attempt):
             attempt.progress("slow", 1000, 1000)
             return {}
 
@@ -192,7 +186,7 @@ def test_a_killed_attempt_is_continued_and_its_time_counted(tmp_path: Path) -> N
     assert told == [("slow", 1000, 1000)]
 
 
-def test_two_jobs_do_not_share_a_folder_unless_told_to(tmp_path: Path) -> None:
+def test_two_jobs_do_not_share_a_folder_unless_told_to(tmp_path):
     with Steps(tmp_path), pytest.raises(ValueError, match="another process is at work"), Steps(tmp_path):
         pass
     with Steps(tmp_path, shared=True), Steps(tmp_path, shared=True):

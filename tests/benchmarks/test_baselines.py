@@ -1,9 +1,5 @@
 """Learned baselines on a handful of tiny spectra: they learn, and repeat themselves bit by bit."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -22,7 +18,7 @@ SMALL = nerf2.NeRF2Options(far_m=8.0, rays=128, samples=8, depth=3, width=32, sk
 FITS = {"nerf2": (nerf2.fit_nerf2, SMALL, 250), "cgan": (fit_cgan, CGANOptions(batch=4, channels=8), 60)}
 
 
-def spectra(count: int = 12) -> SpectrumDataset:
+def spectra(count=12):
     """A glow around the transmitter's direction, weaker with distance, above a gradient from floor to ceiling."""
     rng = np.random.default_rng(0)
     receivers = rng.uniform([0.5, 0.5, 1.0], [3.5, 3.5, 2.0], (count, 3))
@@ -40,13 +36,13 @@ def spectra(count: int = 12) -> SpectrumDataset:
     )  # fmt: skip
 
 
-def fit(name: str, data: SpectrumDataset, steps: int | None = None, seed: int = 0) -> Any:
+def fit(name, data, steps=None, seed=0):
     how, options, enough = FITS[name]
     return how(data, options, Training(steps or enough, seed, "cpu"))
 
 
 @pytest.mark.parametrize("name", FITS)
-def test_loss_falls_and_the_constant_is_beaten_on_held_out_receivers(name: str) -> None:
+def test_loss_falls_and_the_constant_is_beaten_on_held_out_receivers(name):
     train, test = spectra().split(9)
     found = fit(name, train)
     assert np.mean(found.losses[-10:]) < 0.5 * np.mean(found.losses[:10]) and found.size_bytes > 1000
@@ -58,7 +54,7 @@ def test_loss_falls_and_the_constant_is_beaten_on_held_out_receivers(name: str) 
 
 
 @pytest.mark.parametrize("name", FITS)
-def test_a_seed_repeats_bit_by_bit_and_another_one_differs(name: str) -> None:
+def test_a_seed_repeats_bit_by_bit_and_another_one_differs(name):
     train, test = spectra().split(4)
     first, again, other = (fit(name, train, 6, seed) for seed in (3, 3, 4))
     assert first.losses == again.losses
@@ -66,28 +62,28 @@ def test_a_seed_repeats_bit_by_bit_and_another_one_differs(name: str) -> None:
     assert not np.array_equal(first.image(test.receivers[0]), other.image(test.receivers[0]))
 
 
-def test_a_loss_that_is_no_number_stops_the_training() -> None:
+def test_a_loss_that_is_no_number_stops_the_training():
     with pytest.raises(RuntimeError, match="loss: got nan at step 2"):
         learn(lambda i: float("nan") if i == 2 else 1.0, Training(9))
 
 
-def test_a_ray_is_the_sum_of_what_its_points_send_through_those_before_them() -> None:
+def test_a_ray_is_the_sum_of_what_its_points_send_through_those_before_them():
     """NeRF2's renderer against complex numbers, point by point."""
     options = nerf2.NeRF2Options(far_m=6.0, samples=5, depth=2, width=8, octaves=2)
     network = nerf2.build(options, 1)
     origin, source = np.random.default_rng(2).normal(size=(2, 3)).astype(np.float32)
     toward = np.array([0.6, 0.0, 0.8], np.float32)
-    asked: list[Any] = []
+    asked = []
     for name in ("attenuation", "signal"):
         network[name].register_forward_hook(lambda _, __, out: asked.append(out.detach().numpy()[0]))
     rays = (torch.from_numpy(v)[None] for v in (origin, toward))
     shown = float(nerf2.render(network, options, *rays, torch.from_numpy(source)).detach()[0])
     attenuation, signal = (a.astype(np.float64) for a in asked)
 
-    def positive(x: float) -> float:
+    def positive(x):
         return abs(x if x > 0 else 0.01 * x)
 
-    def angle(x: float) -> float:
+    def angle(x):
         return 2 * np.pi / (1 + np.exp(-x))
 
     t = np.linspace(0.0, 6.0, 5)

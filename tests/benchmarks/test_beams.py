@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from places import LOBBY
 
 import warprrf as wr
 from benchmarks.beams import OFFSETS_HZ, Links
@@ -12,13 +11,11 @@ PLACES = np.array([[10.0, 9.0, 1.5], [7.0, 8.5, 1.2]])
 
 
 @pytest.fixture(scope="module")
-def lobby():
-    """Scene, spectra of two receivers, and their true channels."""
-    scene = wr.Scene.load(LOBBY / "scene.xml")
-    ds = wr.simulate(
-        scene, transmitter=(13.6, 11.2, 2.5), receivers=PLACES, frequency_hz=300e9, shape=(30, 60)
-    )
-    links = Links(scene, ds, seed=3)
+def lobby(lobby_scene):
+    """Spectra of two receivers, and their true channels."""
+    link = {"transmitter": (13.6, 11.2, 2.5), "receivers": PLACES, "frequency_hz": 300e9}
+    ds = wr.simulate(lobby_scene, **link, shape=(30, 60))
+    links = Links(lobby_scene, ds, seed=3)
     return ds, [links.link(place) for place in PLACES]
 
 

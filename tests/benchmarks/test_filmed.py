@@ -1,7 +1,5 @@
 """The film's reference and its score, on frames of a box drawn in closed form."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,9 +36,8 @@ def cameras():
 def film(cameras, tmp_path_factory):
     folder = tmp_path_factory.mktemp("film")
     camera = cameras[0]
-    np.savetxt(
-        folder / "camera-intrinsics.txt", [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
-    )
+    lens = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+    np.savetxt(folder / "camera-intrinsics.txt", lens)
     for k, c in enumerate(cameras):
         pose = np.linalg.inv(c.world_to_camera)
         pose[:3] = TILT.T @ pose[:3]

@@ -1,7 +1,5 @@
 """Experiments are rows of fits: whole once on a small room."""
 
-from __future__ import annotations
-
 from small_room import small_room
 
 from benchmarks import bistatic, fits

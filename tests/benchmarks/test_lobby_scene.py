@@ -1,9 +1,5 @@
 """The lobby: closed solids in a room of the stated size, committed files that the script builds, cameras where they say."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from places import LOBBY
@@ -13,15 +9,9 @@ from benchmarks.lobby.photos import read_poses
 from benchmarks.lobby.scene import ROOM, SOLIDS, build
 from warprrf.geometry.mesh_files import read_mesh
 from warprrf.geometry.splats.camera import Camera
-from warprrf.rf.scene import Scene
 
 
-@pytest.fixture(scope="module")
-def scene() -> Scene:
-    return Scene.load(LOBBY / "scene.xml")
-
-
-def test_the_air_has_the_volume_of_the_room_less_its_furniture(scene: Scene) -> None:
+def test_the_air_has_the_volume_of_the_room_less_its_furniture(lobby_scene):
     # Furniture does not overlap itself beyond the few centimetres it is sunk in: the prisms' volumes inside the room
     # follow from their profiles (shoelace formula).
     solid_volume = 0.0
@@ -30,12 +20,12 @@ def test_the_air_has_the_volume_of_the_room_less_its_furniture(scene: Scene) -> 
             x, y = np.array(solid.profile).T
             solid_volume += 0.5 * abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) * (solid.high - solid.low)
     points = np.random.default_rng(0).uniform(*ROOM, (20_000, 3))
-    share = scene.is_free(points, device="cpu").mean()
+    share = lobby_scene.is_free(points, device="cpu").mean()
     # Monte Carlo: three deviations are 0.5 % of the room; sunk parts are another 0.3 %.
     assert share == pytest.approx(1 - solid_volume / float(np.prod(ROOM[1] - ROOM[0])), abs=0.008)
 
 
-def test_the_committed_files_are_what_the_script_builds(tmp_path: Path) -> None:
+def test_the_committed_files_are_what_the_script_builds(tmp_path):
     images = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
     assert build(tmp_path).read_text() == (LOBBY / "scene.xml").read_text()
     for solid in SOLIDS:
@@ -50,7 +40,7 @@ def test_the_committed_files_are_what_the_script_builds(tmp_path: Path) -> None:
         assert np.mean(np.abs(ours.astype(int) - theirs) > 2) < 1e-3
 
 
-def test_mitsuba_sees_what_the_mesh_says_at_every_pixel(scene: Scene) -> None:
+def test_mitsuba_sees_what_the_mesh_says_at_every_pixel(lobby_scene):
     pytest.importorskip("mitsuba", reason="mitsuba is not installed")
     from benchmarks.lobby.photos import render_positions
 
@@ -58,7 +48,7 @@ def test_mitsuba_sees_what_the_mesh_says_at_every_pixel(scene: Scene) -> None:
     camera = Camera.pinhole(64, 48, fx=39.5, fy=39.5, cx=32, cy=24, world_to_camera=pose)
     theirs = render_positions(LOBBY / "scene.xml", camera, spp=16).reshape(-1, 3)
     directions = camera.directions().reshape(-1, 3)
-    ours = scene.mesh.cast(np.tile(camera.position, (len(directions), 1)), directions, device="cpu")
+    ours = lobby_scene.mesh.cast(np.tile(camera.position, (len(directions), 1)), directions, device="cpu")
     # A pixel's mean point lies within a pixel (1/39.5 rad) of its centre's; a wrong axis is metres off.
     error = np.linalg.norm(theirs - ours.point, axis=1) / ours.t
     assert np.median(error) < 0.3 / 39.5 and np.mean(error < 3 / 39.5) > 0.9

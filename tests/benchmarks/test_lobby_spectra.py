@@ -3,31 +3,24 @@
 import json
 
 import numpy as np
-import pytest
 from places import LOBBY
 
 from benchmarks.lobby import spectra
 from warprrf.rf.exact import ExactEngine
-from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.dataset_files import COMPACT_DELAY_STEP_S
 from warprrf.rf.spectra.spectrum import to_db
 
 
-@pytest.fixture(scope="module")
-def scene():
-    return Scene.load(LOBBY / "scene.xml")
-
-
-def test_the_sample_is_60_and_100_of_the_plan_and_subsets_start_its_ordering(scene):
-    who, kept = spectra.plan(scene), json.loads((LOBBY / "receivers.json").read_text())
+def test_the_sample_is_60_and_100_of_the_plan_and_subsets_start_its_ordering(lobby_scene):
+    who, kept = spectra.plan(lobby_scene), json.loads((LOBBY / "receivers.json").read_text())
     np.testing.assert_array_equal(who.receivers, kept["receivers_m"])
     assert who.role.tolist() == kept["role"] and who.sample.tolist() == kept["sample"]
     order = who.receivers[who.role == "train"]
     for name in spectra.FILES.values():
         ds = SpectrumDataset.load(LOBBY / name)
         np.testing.assert_array_equal(ds.receivers, who.receivers[who.sample])
-        seen = scene.mesh.visible(np.array(spectra.TRANSMITTER), ds.receivers)
+        seen = lobby_scene.mesh.visible(np.array(spectra.TRANSMITTER), ds.receivers)
         np.testing.assert_array_equal(ds.line_of_sight, seen)
         for n in (10, 25, 60):
             train, test = ds.split(n)
@@ -35,12 +28,11 @@ def test_the_sample_is_60_and_100_of_the_plan_and_subsets_start_its_ordering(sce
             assert len(test) == 100 and np.count_nonzero(~test.line_of_sight) >= 30
 
 
-def test_the_exact_file_is_what_the_engine_computes(scene):
+def test_the_exact_file_is_what_the_engine_computes(lobby_scene):
     ds = SpectrumDataset.load(LOBBY / spectra.FILES["exact"])
     link = {"transmitter": ds.transmitter, "frequency_hz": ds.frequency_hz}
-    got = ExactEngine(scene, **link, shape=ds.shape, beam_sigma_rad=ds.beam_sigma_rad).receive(
-        ds.receivers[7]
-    )
+    engine = ExactEngine(lobby_scene, **link, shape=ds.shape, beam_sigma_rad=ds.beam_sigma_rad)
+    got = engine.receive(ds.receivers[7])
     np.testing.assert_allclose(to_db(got.path_gain, ds.floor), ds.path_gain_db[7], atol=0.03)
     same = ~(np.abs(got.delay_s - ds.delay_s[7]) > COMPACT_DELAY_STEP_S)
     assert same.mean() > 0.999  # two paths may be equally strong to rounding

@@ -1,7 +1,5 @@
 """A measured place: rivals find the law that made the links, noise of means is that of their halves."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -24,9 +22,8 @@ def made():
 
 
 def test_a_wall_is_crossed_where_it_hides_the_other_end(made):
-    assert (
-        made.behind == ~flat.scene().mesh.visible(made.senders, made.receivers)
-    ).all() and made.behind.any()
+    seen = flat.scene().mesh.visible(made.senders, made.receivers)
+    assert (made.behind == ~seen).all() and made.behind.any()
 
 
 @pytest.mark.parametrize("name", ["multi-wall (COST 231)", "multi-wall, exponent fitted"])

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from views import pinhole
 
 from benchmarks.photos import psnr, recoloured, score
-from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import Blending
 from warprrf.geometry.splats.render import render
@@ -27,7 +27,7 @@ def test_a_rendering_beside_its_own_photo_is_exact_and_what_nothing_covers_is_a_
         np.c_[rng.uniform([-2, -2], [0, 2], (400, 2)), np.full(400, 3.0)], np.tile([1.0, 0, 0, 0], (400, 1)),
         np.tile([0.2, 0.2, 0.01], (400, 1)), np.full(400, 0.9), rng.normal(size=(400, 1, 3)),
     )  # fmt: skip
-    camera = Camera.pinhole(64, 48, fx=48, fy=48, cx=32, cy=24, world_to_camera=np.eye(4))
+    camera = pinhole(64, 48, focal=48)
     photo = np.clip(render(wall, camera, device="cpu", blending=Blending()).features, 0, 1)
     found = score(wall, camera, photo, "cpu")
     assert found["psnr_db_as_is"] > 60 and found["ssim"] > 0.99

@@ -1,12 +1,7 @@
 """The main job on a few tiny photos and spectra of a small room, with the true mesh in place of the reconstruction."""
 
-from __future__ import annotations
-
 import json
 import re
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +18,7 @@ KEYS = ("psnr_db", "ssim", "rmse_db", "direction_within_3deg", "tof_error_median
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def data(tmp_path_factory):
     """A small room, and four photos of 64 x 48 pixels that show noise."""
     images = pytest.importorskip("PIL.Image")
     folder = small_room(tmp_path_factory.mktemp("lobby"))
@@ -33,9 +28,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
         views[f"v{k}.jpg"] = {"world_to_camera": pose.tolist()}
         for sub in ("photos", "photos_noise"):
             (folder / sub).mkdir(exist_ok=True)
-            images.fromarray(rng.integers(100, 140, (48, 64, 3)).astype(np.uint8)).save(
-                folder / sub / f"v{k}.jpg"
-            )
+            pixels = rng.integers(100, 140, (48, 64, 3)).astype(np.uint8)
+            images.fromarray(pixels).save(folder / sub / f"v{k}.jpg")
     lens = {"width": 64, "height": 48, "fx": 40.0, "fy": 40.0, "cx": 32.0, "cy": 24.0}
     write_json(folder / "poses_true.json", {**lens, "views": views})
     write_json(folder / "photos.json", {"photos": list(views), "held_out": list(views)[1:3]})
@@ -43,7 +37,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _true_geometry(lobby: pipeline.Lobby, attempt: Any) -> dict[str, Any]:
+def _true_geometry(lobby, attempt):
     out, mesh = lobby.job.out, lobby.place.scene.mesh
     cameras = pipeline.read_poses(lobby.data / "poses_true.json")
     photos = {name: lobby.data / "photos" / name for name in cameras}
@@ -58,29 +52,25 @@ def _true_geometry(lobby: pipeline.Lobby, attempt: Any) -> dict[str, Any]:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def small() -> Iterator[None]:
+def small():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline.Lobby, "geometry", _true_geometry)
         patch.setattr(pipeline, "REDUCED", SIZES)
         yield
 
 
-def whole(out: Path, data: Path, **job: Any) -> dict[str, Any]:
+def whole(out, data, **job):
     options = pipeline.Options(data=str(data), reduced=True)
     return execute(pipeline.BENCHMARKS["lobby"], options, Job(out, device="cpu", **job))
 
 
 @pytest.fixture(scope="module")
-def finished(
-    data: Path, small: None, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, dict[str, Any]]:
+def finished(data, small, tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "whole"
     return out, whole(out, data)
 
 
-def test_report_holds_every_figure_and_its_page_needs_no_other_file(
-    finished: tuple[Path, dict[str, Any]],
-) -> None:
+def test_report_holds_every_figure_and_its_page_needs_no_other_file(finished):
     out, found = finished
     assert json.loads((out / "report.json").read_text()) == found
     assert [key for key, *_ in pipeline.page.FIGURES if not isinstance(found[key], float)] == []
@@ -97,11 +87,11 @@ def test_report_holds_every_figure_and_its_page_needs_no_other_file(
 
 
 def test_second_run_computes_nothing_and_a_killed_one_ends_with_the_same_figures(
-    finished: tuple[Path, dict[str, Any]], data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    finished, data, tmp_path, monkeypatch
+):
     out, first = finished
 
-    def kill(stage: str, done: int, total: int) -> None:
+    def kill(stage, done, total):
         if stage == "fit" and done > 8:
             raise KeyboardInterrupt
 

@@ -24,19 +24,16 @@ def test_errors_of_a_map_that_is_two_decibels_too_strong_where_blocked():
     assert empty["rms_db"] == pytest.approx(20.0)  # an empty cell has the lowest level
 
 
-def test_both_maps_of_the_lobby_agree_where_the_transmitter_is_seen():
+def test_both_maps_of_the_lobby_agree_where_the_transmitter_is_seen(lobby_scene):
     sionna_or_skip()
-    scene = wr.Scene.load(LOBBY / "scene.xml")
     ds = wr.SpectrumDataset.load(LOBBY / "spectra_sionna.nc")
-    field = BistaticField.prior(scene, ds)
+    field = BistaticField.prior(lobby_scene, ds)
     ours = field.radio_map(1.5, 1.5, bounds=[0.0, 0.0, 15.0, 12.0], shape=(10, 20))
-    gain = solver(scene, ours, field.frequency_hz)
+    gain = solver(lobby_scene, ours, field.frequency_hz)
     few, many, reference = (gain(samples, k) for k, samples in enumerate((1_000, 100_000, 400_000)))
     places = ours.positions.reshape(-1, 3)
-    air = scene.is_free(places, clearance_m=1.1).reshape(ours.free.shape) & ours.free
-    seen = scene.mesh.visible(np.broadcast_to(ours.transmitter, places.shape).copy(), places).reshape(
-        air.shape
-    )
+    air = lobby_scene.is_free(places, clearance_m=1.1).reshape(ours.free.shape) & ours.free
+    seen = lobby_scene.mesh.visible(ours.transmitter, places).reshape(air.shape)
     # With line of sight the rest is worth a decibel, whatever the materials are taken for.
     assert errors(ours.total_path_gain, reference, air, seen)["rms_seen_db"] < 1.5
     noise = [errors(values, reference, air, seen)["rms_db"] for values in (few, many)]

@@ -1,17 +1,12 @@
 """One runner: options are the command's, figures go to files."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass
-from pathlib import Path
-
-import pytest
 
 from benchmarks import __main__ as command
 from benchmarks.report import Report
-from benchmarks.runner import Benchmark, Job, option
+from benchmarks.runner import Benchmark, option
 
 
 @dataclass(frozen=True)
@@ -25,16 +20,14 @@ class _Options:
     hidden: float = 0.5
 
 
-def _run(options: _Options, job: Job) -> Report:
+def _run(options, job):
     if options.count < 0:
         raise ValueError("count: got a negative number,\n expected one of at least 0")
     figures = {"options": vars(options), "seed": job.seed, "value": math.nan, "count": options.count}
     return Report("nothing", figures, "some text")
 
 
-def test_options_of_the_command_reach_the_benchmark_and_its_figures_the_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_options_of_the_command_reach_the_benchmark_and_its_figures_the_files(tmp_path, monkeypatch, capsys):
     one = Benchmark("nothing", _Options, _run, "examples:")
     monkeypatch.setitem(command.NAMES, "nothing", ("nowhere", "measures nothing"))
     monkeypatch.setattr(command, "benchmark", lambda name: one)
@@ -46,6 +39,5 @@ def test_options_of_the_command_reach_the_benchmark_and_its_figures_the_files(
     assert (tmp_path / "nothing.md").read_text() == "some text\n"
     assert "nothing.md" in capsys.readouterr().out
     assert command.main(["nothing", "--out", str(tmp_path), "--count", "-1", "--quiet"]) == 2
-    assert capsys.readouterr().err == (
-        "python -m benchmarks: error: count: got a negative number, expected one of at least 0\n"
-    )
+    told = "error: count: got a negative number, expected one of at least 0\n"
+    assert capsys.readouterr().err == f"python -m benchmarks: {told}"

@@ -31,11 +31,8 @@ def test_a_room_too_large_by_3_cm_is_3_cm_off_in_distance_but_not_in_normal():
 
 def test_a_missing_wall_is_missed_and_incomplete():
     whole = score.score_mesh(room(without=(0, 1)), room(), CAMERAS, device="cpu").figures
-    seen = room().cast(
-        np.concatenate([np.broadcast_to(c.position, (4800, 3)) for c in CAMERAS]),
-        np.concatenate([c.directions().reshape(-1, 3) for c in CAMERAS]),
-        device="cpu",
-    )
+    rays = np.concatenate([c.directions().reshape(-1, 3) for c in CAMERAS])
+    seen = room().cast(np.repeat([c.position for c in CAMERAS], 4800, axis=0), rays, device="cpu")
     share = np.mean(seen.face < 2)
     assert whole["mesh_missed"] == pytest.approx(share, abs=0.02)
     assert whole["mesh_complete"] == pytest.approx(1 - share, abs=0.03)

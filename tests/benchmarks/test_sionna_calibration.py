@@ -1,10 +1,6 @@
 """Calibration with Sionna RT's own gradients on a small room whose materials are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,17 +13,14 @@ from benchmarks.baselines.sionna_calibration import Calibration, calibrate_sionn
 from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
 
 
-def test_calibration_lowers_the_error_and_finds_what_scatters(tmp_path: Path) -> None:
+def test_calibration_lowers_the_error_and_finds_what_scatters(tmp_path):
     folder = small_room(tmp_path)
     train = wr.SpectrumDataset.load(folder / "spectra.nc").split(4)[0]
     true = wr.Scene.load(folder / "scene.xml")
     truth = [m.scattering_coefficient(300e9) for m in true.materials]
-    wrong = true.with_materials(
-        [replace(m, scattering=0.5 * s) for m, s in zip(true.materials, truth, strict=True)]
-    )
-    found = calibrate_sionna(
-        wrong, train, Calibration(seconds=60.0, most_steps=12, samples=20_000, rate=0.5), device="cpu"
-    )
+    halved = [replace(m, scattering=0.5 * s) for m, s in zip(true.materials, truth, strict=True)]
+    effort = Calibration(seconds=60.0, most_steps=12, samples=20_000, rate=0.5)
+    found = calibrate_sionna(true.with_materials(halved), train, effort, device="cpu")
     assert len(found.losses) == 12
     assert np.mean(found.losses[-4:]) < 0.7 * np.mean(found.losses[:4])
     walls = next(k for k, m in enumerate(true.materials) if m.name == "concrete")
@@ -39,7 +32,7 @@ def test_calibration_lowers_the_error_and_finds_what_scatters(tmp_path: Path) ->
     recorded = []
 
     class Engine(SionnaEngine):
-        def _read(self, paths: Any) -> Any:
+        def _read(self, paths):
             recorded.append(any(drjit.grad_enabled(part) for part in paths.a))
             return super()._read(paths)
 

@@ -16,7 +16,7 @@ BLUE_SRGB = np.array(BLUE) / 255.0
 
 
 @pytest.mark.parametrize("make", [room_glb, room_gltf])
-def test_instances_of_a_gltf_scene_stand_in_their_places_z_up(make, tmp_path: Path) -> None:
+def test_instances_of_a_gltf_scene_stand_in_their_places_z_up(make, tmp_path):
     mesh = wr.Mesh.load(make(tmp_path))
     # y-up 4 x 3 x 5 becomes 4 wide, 5 deep, 3 high
     np.testing.assert_allclose(mesh.bounds, [[-2, -2.5, -1.5], [2, 2.5, 1.5]], atol=1e-6)
@@ -29,16 +29,13 @@ def test_instances_of_a_gltf_scene_stand_in_their_places_z_up(make, tmp_path: Pa
     # a mirror turns corners about, and winding with them: both face the file's z
     np.testing.assert_allclose(mesh.face_normals[wood], [[0.0, -1.0, 0.0]] * 4, atol=1e-6)
     np.testing.assert_allclose(mesh.face_colours[wood], [BLUE_SRGB] * 4, atol=1e-3)
-
-
-def test_the_factor_of_a_gltf_material_is_linear_light(tmp_path: Path) -> None:
-    mesh = wr.Mesh.load(room_glb(tmp_path))
+    # the factor of a material is linear light
     walls = mesh.face_label == mesh.labels.index("itu_concrete")
-    linear = 128 / 255
-    np.testing.assert_allclose(mesh.face_colours[walls], 1.055 * linear ** (1 / 2.4) - 0.055, atol=1e-3)
+    grey = 1.055 * (128 / 255) ** (1 / 2.4) - 0.055
+    np.testing.assert_allclose(mesh.face_colours[walls], grey, atol=1e-3)
 
 
-def test_an_axis_that_is_asked_for_is_taken(tmp_path: Path) -> None:
+def test_an_axis_that_is_asked_for_is_taken(tmp_path):
     path = room_glb(tmp_path)
     as_it_stands = wr.Mesh.load(path, up="z").vertices
     np.testing.assert_allclose(np.ptp(as_it_stands, axis=0), [4, 3, 5], atol=1e-6)
@@ -48,7 +45,7 @@ def test_an_axis_that_is_asked_for_is_taken(tmp_path: Path) -> None:
         assert np.linalg.det(np.linalg.lstsq(as_it_stands, axes.vertices, rcond=None)[0]) == pytest.approx(1)
 
 
-def test_objects_of_an_obj_file_keep_material_and_texture(tmp_path: Path) -> None:
+def test_objects_of_an_obj_file_keep_material_and_texture(tmp_path):
     content = read_mesh(obj_with_materials(tmp_path))
     np.testing.assert_array_equal(content.faces, [[0, 1, 2], [0, 2, 3], [0, 1, 3]])
     assert content.material_names == ("Wood_01", "Paint") and content.object_names == ("floor", "wall")
@@ -56,7 +53,7 @@ def test_objects_of_an_obj_file_keep_material_and_texture(tmp_path: Path) -> Non
     np.testing.assert_allclose(content.face_colours, [BLUE_SRGB, BLUE_SRGB, [0.9, 0.1, 0.2]], atol=1e-3)
 
 
-def test_names_of_an_obj_file_stay_where_its_materials_are_missing(tmp_path: Path) -> None:
+def test_names_of_an_obj_file_stay_where_its_materials_are_missing(tmp_path):
     path = obj_with_materials(tmp_path)
     (tmp_path / "square.mtl").unlink()
     with pytest.warns(UserWarning, match=r"square\.obj needs the file 'square\.mtl'"):
@@ -68,21 +65,21 @@ def test_names_of_an_obj_file_stay_where_its_materials_are_missing(tmp_path: Pat
     ("unit", "metres"), [("mm", 0.001), ("cm", 0.01), ("m", 1), ("in", 0.0254), ("ft", 0.3048)]
 )
 @pytest.mark.parametrize("encoding", ["stl", "stl_ascii"])
-def test_units_are_metres_afterwards(unit, metres, encoding, tmp_path: Path) -> None:
+def test_units_are_metres_afterwards(unit, metres, encoding, tmp_path):
     trimesh.creation.box((40.0, 30.0, 25.0)).export(tmp_path / "box.stl", file_type=encoding)
     mesh = wr.Mesh.load(tmp_path / "box.stl", unit=unit)
     np.testing.assert_allclose(np.ptp(mesh.bounds, axis=0), np.array([40, 30, 25]) * metres)
     assert len(mesh.vertices) == 8 and mesh.is_closed  # STL stores 36
 
 
-def test_a_room_in_millimetres_taken_for_metres_is_said(tmp_path: Path) -> None:
+def test_a_room_in_millimetres_taken_for_metres_is_said(tmp_path):
     trimesh.creation.box((9000.0, 5000.0, 2500.0)).export(tmp_path / "box.stl")
     with pytest.warns(UserWarning, match=r"box\.stl is 9e\+03 m in size.*unit="):
         wr.Mesh.load(tmp_path / "box.stl")
 
 
 @pytest.mark.parametrize("encoding", ["binary", "ascii"])
-def test_colours_of_ply_vertices_are_those_of_faces(encoding, tmp_path: Path) -> None:
+def test_colours_of_ply_vertices_are_those_of_faces(encoding, tmp_path):
     box = trimesh.creation.box((4.0, 3.0, 2.5))
     box.visual.vertex_colors = np.tile([*RED, 255], (8, 1))
     (tmp_path / "box.ply").write_bytes(box.export(file_type="ply", encoding=encoding))
@@ -90,7 +87,7 @@ def test_colours_of_ply_vertices_are_those_of_faces(encoding, tmp_path: Path) ->
     np.testing.assert_allclose(mesh.face_colours, [np.array(RED) / 255.0] * 12, atol=1e-5)
 
 
-def test_colours_and_names_travel_with_a_mesh(tmp_path: Path) -> None:
+def test_colours_and_names_travel_with_a_mesh(tmp_path):
     mesh = wr.Mesh.load(room_glb(tmp_path))
     wr.Reconstruction.from_files(mesh=mesh).save(tmp_path / "kept")
     for other in (pickle.loads(pickle.dumps(mesh)), wr.Reconstruction.load(tmp_path / "kept").mesh):
@@ -99,7 +96,7 @@ def test_colours_and_names_travel_with_a_mesh(tmp_path: Path) -> None:
         assert other.labels == mesh.labels
 
 
-def test_a_simplified_mesh_keeps_its_shape_colours_and_names(tmp_path: Path) -> None:
+def test_a_simplified_mesh_keeps_its_shape_colours_and_names(tmp_path):
     pytest.importorskip("open3d", reason="Open3D is an extra")
     ball = trimesh.creation.icosphere(subdivisions=4, radius=2.0)
     upper = ball.triangles_center[:, 2] > 0
@@ -114,7 +111,7 @@ def test_a_simplified_mesh_keeps_its_shape_colours_and_names(tmp_path: Path) -> 
     np.testing.assert_allclose(mesh.face_colours[clear], expected[clear], atol=1e-5)
 
 
-def test_numbered_pages_of_a_scan_are_no_materials(tmp_path: Path) -> None:
+def test_numbered_pages_of_a_scan_are_no_materials(tmp_path):
     path = obj_with_materials(tmp_path)
     for name in ("square.obj", "square.mtl"):
         text = (tmp_path / name).read_text()
@@ -125,7 +122,7 @@ def test_numbered_pages_of_a_scan_are_no_materials(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["glb", "obj"])
-def test_a_picture_that_materials_share_is_decoded_once(kind, tmp_path: Path, monkeypatch) -> None:
+def test_a_picture_that_materials_share_is_decoded_once(kind, tmp_path, monkeypatch):
     if kind == "glb":
         path = changed_glb(room_glb(tmp_path), lambda h: h.update(materials=h["materials"][1:] * 2))
     else:
@@ -146,9 +143,7 @@ def test_a_picture_that_materials_share_is_decoded_once(kind, tmp_path: Path, mo
         (room_gltf, "model.gltf", "gltf_buffer_0.bin", "..%2Fgltf_buffer_0.bin"),
     ],
 )
-def test_files_outside_the_folder_are_read_only_if_that_is_asked_for(
-    make, names, name, outside, tmp_path: Path
-) -> None:
+def test_files_outside_the_folder_are_read_only_if_that_is_asked_for(make, names, name, outside, tmp_path):
     folder = tmp_path / "model"
     folder.mkdir()
     path = make(folder)
@@ -168,28 +163,27 @@ def test_files_outside_the_folder_are_read_only_if_that_is_asked_for(
         (lambda h: h["meshes"][0]["primitives"][0].update(mode=6), "fans"),
     ],
 )
-def test_a_gltf_header_that_does_not_fit_its_data_is_refused(change, told: str, tmp_path: Path) -> None:
+def test_a_gltf_header_that_does_not_fit_its_data_is_refused(change, told, tmp_path):
     path = changed_glb(room_glb(tmp_path), change)
     with pytest.raises(ValueError, match=rf"room\.glb.*({told})"):
         wr.Mesh.load(path)
 
 
-def test_lines_of_a_gltf_file_are_no_triangles(tmp_path: Path) -> None:
+def test_lines_of_a_gltf_file_are_no_triangles(tmp_path):
     path = changed_glb(room_glb(tmp_path), lambda h: h["meshes"][0]["primitives"][0].update(mode=1))
     assert len(wr.Mesh.load(path).faces) == 4
 
 
 @pytest.mark.parametrize("most", [10, 15])
-def test_a_small_file_that_makes_many_triangles_is_refused(most: int, tmp_path: Path, monkeypatch) -> None:
+def test_a_small_file_that_makes_many_triangles_is_refused(most, tmp_path, monkeypatch):
     monkeypatch.setattr(gltf_files, "LARGEST_FACES", most)  # 12 and 2 are made, 2 of them stand there twice
     with pytest.raises(ValueError, match=rf"room\.glb.*more than {most} triangles"):
         wr.Mesh.load(room_glb(tmp_path))
 
 
-def test_vertices_at_one_place_become_one_in_the_file_s_order(tmp_path: Path) -> None:
-    (tmp_path / "two.obj").write_text(
-        "v 1 0 0\nv -0 0 0\nv 0 1 0\nv 0 -0 0\nv 1 0 0\nv 0 0 1\nf 1 2 3\nf 4 5 6\n"
-    )
+def test_vertices_at_one_place_become_one_in_the_file_s_order(tmp_path):
+    text = "v 1 0 0\nv -0 0 0\nv 0 1 0\nv 0 -0 0\nv 1 0 0\nv 0 0 1\nf 1 2 3\nf 4 5 6\n"
+    (tmp_path / "two.obj").write_text(text)
     content = load_mesh(tmp_path / "two.obj", MeshOptions())
     np.testing.assert_array_equal(content.vertices, [[1, 0, 0], [0, 0, 0], [0, 1, 0], [0, 0, 1]])
     np.testing.assert_array_equal(content.faces, [[0, 1, 2], [1, 0, 3]])
@@ -197,9 +191,8 @@ def test_vertices_at_one_place_become_one_in_the_file_s_order(tmp_path: Path) ->
 
 def test_a_ply_of_triangles_and_few_other_polygons_is_read(tmp_path):
     """Its rows differ in length, so that they are walked one by one, far beyond what a byte counts."""
-    grid = np.stack(np.meshgrid(np.arange(12.0), np.arange(12.0), [0.0], indexing="ij"), axis=-1).reshape(
-        -1, 3
-    )
+    x, y = np.divmod(np.arange(144.0), 12)
+    grid = np.column_stack([x, y, 0 * x])
     corner = np.array([12 * i + j for i in range(11) for j in range(11)])
     faces = [list(f) for k in corner for f in ((k, k + 12, k + 13), (k, k + 13, k + 1))]
     faces[-2:] = [[corner[-1], corner[-1] + 12, corner[-1] + 13, corner[-1] + 1]]

@@ -127,11 +127,8 @@ def test_a_long_gentle_bend_is_not_one_plane():
     k = np.arange(2000)
     f = np.concatenate([np.column_stack([k, k + 1, k + 2002]), np.column_stack([k, k + 2002, k + 2001])])
     patches = planar_patches(Mesh(v, f))
-    corner = patches.mesh.triangles
-    gap = (
-        np.einsum("fki,fi->fk", corner, patches.normal[patches.face_patch])
-        - patches.offset[patches.face_patch][:, None]
-    )
+    normal, offset = patches.normal[patches.face_patch], patches.offset[patches.face_patch]
+    gap = np.einsum("fki,fi->fk", patches.mesh.triangles, normal) - offset[:, None]
     assert np.abs(gap).max() < 2 * patches.tolerance_m < 4e-5
     assert len(patches) > 50
 
@@ -153,12 +150,13 @@ def test_contains_covers_a_patch_without_seams_and_nothing_else():
 def test_given_planes_keep_their_side():
     v, f = box_mesh((0, 0, 0), (1, 1, 1))
     found = planar_patches(Mesh(v, f))
-    given = PlanarPatches.from_planes(
-        found.mesh, found.face_patch, found.normal, found.offset, tolerance_m=0.02
-    )
+
+    def of_planes(count):
+        planes = found.normal[:count], found.offset[:count]
+        return PlanarPatches.from_planes(found.mesh, found.face_patch, *planes, tolerance_m=0.02)
+
+    given = of_planes(6)
     assert not given.two_sided and given.tolerance_m == 0.02
     np.testing.assert_allclose(given.area, 1.0)
     with pytest.raises(ValueError, match="face_patch"):
-        PlanarPatches.from_planes(
-            found.mesh, found.face_patch, found.normal[:3], found.offset[:3], tolerance_m=0.02
-        )
+        of_planes(3)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from radio_scenes import box_mesh, joined
 from scipy.spatial.transform import Rotation
-from trimesh.creation import icosphere
 
+from benchmarks.engine.rays import bumpy_sphere
 from warprrf.device import resolve
 from warprrf.geometry import rays as raysearch
 from warprrf.geometry.mesh import Mesh
@@ -27,14 +27,6 @@ def where(request):
     return {"backend": request.param, "device": "cpu"}
 
 
-def sphere(radius=5.0, bumps=0.3):
-    """A closed bumpy sphere about the origin: every vertex is seen from the middle."""
-    ball = icosphere(subdivisions=4)
-    x, y, z = ball.vertices.T
-    r = radius + bumps * np.sin(5 * np.arccos(z)) * np.cos(7 * np.arctan2(y, x))
-    return Mesh(r[:, None] * ball.vertices, ball.faces)
-
-
 def directions(n, seed=0):
     d = np.random.default_rng(seed).standard_normal((n, 3))
     return d / np.linalg.norm(d, axis=1, keepdims=True)
@@ -49,7 +41,7 @@ def box_exit(origin, d, low, high):
 
 def test_rays_at_vertices_and_edges_of_a_closed_mesh_do_not_escape(where):
     """Nor are they stopped elsewhere by faces that come twice or have no area."""
-    clean, rng = sphere(), np.random.default_rng(1)
+    clean, rng = bumpy_sphere(5_000), np.random.default_rng(1)
     dirt = np.concatenate([clean.faces[::9], clean.faces[::7, [0, 0, 1]]])
     mesh = Mesh(clean.vertices, np.concatenate([dirt, clean.faces]))
     assert mesh.is_closed
@@ -66,9 +58,10 @@ def test_rays_at_vertices_and_edges_of_a_closed_mesh_do_not_escape(where):
 
 
 def test_an_open_mesh_is_not_recast(where):
-    mesh = Mesh(sphere().vertices, sphere().faces[:-1])
+    whole = bumpy_sphere(5_000)
+    mesh = Mesh(whole.vertices, whole.faces[:-1])
     assert not mesh.is_closed
-    hole = sphere().triangles[-1].mean(axis=0)
+    hole = whole.triangles[-1].mean(axis=0)
     assert mesh.cast([0, 0, 0], hole, **where).face[0] == -1
 
 
@@ -101,9 +94,8 @@ def test_a_receiver_on_a_surface_meets_the_next_surface(where):
     d = directions(n, seed=6)
     d[np.arange(n), axis] = np.abs(d[np.arange(n), axis]) * (1 - 2 * side)
     steep = np.abs(d[np.arange(n), axis]) > 1e-3
-    t = box_exit(
-        p, d, *ROOM
-    )  # -0 and tiny distances to the own wall cannot arise: the ray leads away from it
+    # -0 and tiny distances to the own wall cannot arise: the ray leads away from it.
+    t = box_exit(p, d, *ROOM)
     hit = room.cast(p @ turn.T + [3.0, -2.0, 1.0], d @ turn.T, **where)
     np.testing.assert_allclose(hit.t[steep], t[steep], rtol=1e-9)
 
@@ -157,9 +149,8 @@ def test_sight_is_that_of_both_back_ends_and_of_rays(blockers):
     assert (seen != expected).mean() < 1e-4
     length = np.linalg.norm(b - a, axis=1)
     hit = mesh.cast(a[1500:], (b - a)[1500:], backend="warp", device="cpu")
-    assert (
-        expected[1500:] != (hit.t >= length[1500:] - 1e-4)
-    ).mean() < 1e-3  # but for surfaces at the very ends
+    free = hit.t >= length[1500:] - 1e-4
+    assert (expected[1500:] != free).mean() < 1e-3  # but for surfaces at the very ends
 
 
 @no_embree
@@ -167,7 +158,8 @@ def test_sight_is_that_of_both_back_ends_and_of_rays(blockers):
 def test_many_rays_meet_what_each_meets_alone(length):
     """Bit by bit, of whatever length, missing, or at a surface; both back ends see the same."""
     count = 47
-    mesh, rng = Mesh(sphere().vertices, sphere().faces[::2]), np.random.default_rng(15)
+    whole, rng = bumpy_sphere(5_000), np.random.default_rng(15)
+    mesh = Mesh(whole.vertices, whole.faces[::2])
     origin, d = rng.uniform(-2, 2, (count, 3)), length * directions(count, seed=16)
     origin[::3] = mesh.triangles[: (count + 2) // 3].mean(axis=1)
     found = mesh.cast(origin, d, backend="embree", device="cpu")
@@ -225,15 +217,14 @@ def test_points_stand_whatever_is_cast_later(where):
         mesh.cast(d, o, **where)
     for o, d, hit in zip(origin, toward, hits, strict=True):
         unit = d / np.linalg.norm(d, axis=1, keepdims=True)
-        np.testing.assert_allclose(
-            hit.point, o + box_exit(o, unit, *ROOM)[:, None] * unit, rtol=0, atol=1e-11
-        )
+        wall = o + box_exit(o, unit, *ROOM)[:, None] * unit
+        np.testing.assert_allclose(hit.point, wall, rtol=0, atol=1e-11)
         assert ((hit.normal * unit).sum(axis=1) > 0).all()  # those of walls, outward
         np.testing.assert_allclose(np.abs(hit.normal).max(axis=1), 1.0)
 
 
 def test_segments_too_long_for_float32_are_judged_and_those_too_long_for_float64_refused(where):
-    mesh, outward = sphere(), directions(35, seed=21)
+    mesh, outward = bumpy_sphere(5_000), directions(35, seed=21)
     start = np.where(np.arange(35)[:, None] % 2, 1.0, 9.0) * outward
     start[::7] = 1e17 * outward[::7]
     for length in (1e16, 1e25, 1e60):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fuzz.answers import differs, leaves
 from places import LOBBY
 from radio_scenes import box_mesh
 from scipy.spatial.transform import Rotation
@@ -58,10 +59,8 @@ def test_cells_that_no_photo_sees_get_no_discs():
 
 def made(workspace, photos=VIEWS, **options):
     """A reconstruction of photos of the lobby, and what its progress told."""
-    told, given = (
-        [],
-        {"known_positions": surveyed(), "held_out": VIEWS[4:5], "config": SMALL, "device": "cpu"},
-    )
+    told = []
+    given = {"known_positions": surveyed(), "held_out": VIEWS[4:5], "config": SMALL, "device": "cpu"}
     photos = [LOBBY / "photos" / n for n in photos]
     rec = reconstruct(photos, workspace=workspace, progress=lambda *row: told.append(row), **given | options)
     return rec, told
@@ -80,16 +79,15 @@ def whole(tmp_path_factory):
     return workspace, rec
 
 
-def test_ten_photos_become_gaussians_mesh_and_patches(whole):
+def test_ten_photos_become_gaussians_mesh_and_patches(whole, lobby_scene):
     rec = whole[1]
     assert len(rec.gaussians) > 1000 and len(rec.cameras) == 10 and rec.held_out == (VIEWS[4],)
     assert rec.scale_rms_m < 0.03 and rec.metric
     # Against the true room: the floor is at z = 0, and it is the largest thing that these photos see.
     level = rec.patches.normal[:, 2] > 0.99
     assert np.abs(rec.patches.offset[level]).min() < 0.02
-    truth = wr.Scene.load(LOBBY / "scene.xml").mesh
     centres = rec.mesh.triangles.mean(axis=1)
-    assert np.median(truth.distance(centres)) < 0.03
+    assert np.median(lobby_scene.mesh.distance(centres)) < 0.03
     assert rec.patches.area.sum() > 0.5 * rec.mesh.areas.sum()
     for k in range(5):
         corners = rec.mesh.triangles[rec.patches.faces(k)]
@@ -134,15 +132,10 @@ def test_a_saved_reconstruction_is_the_same(whole, tmp_path):
     rec = whole[1]
     rec.save(tmp_path)
     read = Reconstruction.load(tmp_path)
-    for name in ("means", "quaternions", "scales", "opacities", "sh"):
-        np.testing.assert_array_equal(getattr(read.gaussians, name), getattr(rec.gaussians, name))
-    np.testing.assert_array_equal(read.mesh.triangles, rec.mesh.triangles)
-    assert list(read.cameras) == list(rec.cameras) and read.scale_rms_m == rec.scale_rms_m
-    for name, camera in rec.cameras.items():
-        np.testing.assert_array_equal(read.cameras[name].world_to_camera, camera.world_to_camera)
-        assert read.cameras[name].fx == camera.fx
-    np.testing.assert_array_equal(read.patches.face_patch, rec.patches.face_patch)
-    np.testing.assert_array_equal(read.patches.offset, rec.patches.offset)
+    assert list(read.cameras) == list(rec.cameras)
+    for part in ("gaussians", "mesh", "patches", "cameras", "scale_rms_m"):
+        kept = leaves(getattr(rec, part))
+        assert kept and not differs(leaves(getattr(read, part)), kept), part
 
 
 def test_a_file_of_an_older_format_says_what_to_do(tmp_path):
@@ -196,15 +189,11 @@ def seen():
     rng = np.random.default_rng(0)
     box = planar_patches(Mesh(*box_mesh([0, 0, 0], [2, 3, 1])))
     splats = discs_on_mesh(box.mesh, 300)
-    splats = replace(
-        splats,
-        sh=0.2 * rng.standard_normal((len(splats), 16, 3)),
-        scales=[0.09, 0.05, 0.02] + 0 * splats.scales,
-    )
+    sh = 0.2 * rng.standard_normal((len(splats), 16, 3))
+    splats = replace(splats, sh=sh, scales=[0.09, 0.05, 0.02] + 0 * splats.scales)
     cameras = {f"{k}.jpg": look([4 + k, 3 - 2 * k, 1 + k * k], [1, 1.5, 0.5]) for k in range(3)}
-    return Reconstruction(
-        splats, box.mesh, cameras, patches=box, guessed=("scale: nobody measured one", "plain")
-    )
+    guessed = ("scale: nobody measured one", "plain")
+    return Reconstruction(splats, box.mesh, cameras, patches=box, guessed=guessed)
 
 
 def test_a_moved_reconstruction_looks_the_same_from_its_moved_cameras(seen):
@@ -225,9 +214,8 @@ def test_a_moved_reconstruction_looks_the_same_from_its_moved_cameras(seen):
 
 def test_surveyed_cameras_bring_a_reconstruction_into_their_frame(seen):
     turn = Rotation.from_rotvec([0.0, 0.0, 1.1]).as_matrix()
-    back = seen.transformed(scale=0.4, rotation=turn, shift=[9, 9, 9]).aligned(
-        {name: camera.position for name, camera in seen.cameras.items()}
-    )
+    known = {name: camera.position for name, camera in seen.cameras.items()}
+    back = seen.transformed(scale=0.4, rotation=turn, shift=[9, 9, 9]).aligned(known)
     np.testing.assert_allclose(back.mesh.vertices, seen.mesh.vertices, atol=1e-9)
     assert back.metric and back.scale_rms_m < 1e-9 and back.guessed == ("plain",)
     with pytest.raises(ValueError, match=r"known_positions: got 2"):

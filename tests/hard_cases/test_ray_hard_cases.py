@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rays_by_definition import brute_hits, gaussians
+from rays_by_definition import brute_hits, expect_hits, gaussians
 
 from warprrf.geometry.splats.gaussian_rays import GaussianRays
 from warprrf.geometry.splats.rasterizer import RADIO
@@ -68,17 +68,15 @@ def test_ten_micrometres_at_ten_metres_and_a_kilometre_away():
 def test_a_hundred_metres_wide_gaussian_beside_a_millimetre_one():
     g = gaussians([[0, 0, 50], [3, 0, 0]], [[100] * 3, [1e-3] * 3])
     rays = GaussianRays(g)
-    found = rays.hits([0, 0, 0], [[1, 1e-5, 0], [1, 0, 1e-3], [1, 1e-2, 0]], 2)
-    for ray, direction in enumerate([[1, 1e-5, 0], [1, 0, 1e-3], [1, 1e-2, 0]]):
-        rows, _ = brute_hits(g, np.zeros(3), np.array(direction), 2, RADIO)
-        assert found.index[ray, : len(rows)].tolist() == [row[0] for row in rows]
+    directions = np.array([[1, 1e-5, 0], [1, 0, 1e-3], [1, 1e-2, 0]])
+    expected = [brute_hits(g, np.zeros(3), direction, 2, RADIO) for direction in directions]
+    expect_hits(rays.hits([0, 0, 0], directions, 2), expected)
 
 
 def test_an_axis_parallel_ray_along_a_box_s_side_is_not_lost():
     g = gaussians(scales=[0.1] * 3, opacities=1.0)
-    y = (
-        0.1 * np.sqrt(2 * np.log(1 / RADIO.alpha_min)) * (1 - 1e-9)
-    )  # just inside the ellipsoid: alpha just counts
+    # Just inside the ellipsoid: alpha just counts.
+    y = 0.1 * np.sqrt(2 * np.log(1 / RADIO.alpha_min)) * (1 - 1e-9)
     found = GaussianRays(g).hits([[0, y, 0], [0, -y, 0], [0, 1.001 * y, 0]], [1, 0, 0], 1)
     assert found.index[:, 0].tolist() == [0, 0, -1]
 

@@ -22,6 +22,14 @@ def look(position, target, width=64, height=48, f=40.0):
     return Camera.pinhole(width, height, fx=f, fy=f, cx=width / 2, cy=height / 2, world_to_camera=pose)
 
 
+def pinhole(width=33, height=33, *, focal=30.0, position=(0.0, 0.0, 0.0)):
+    """A pinhole camera that looks along +z, y down; its middle is the axis."""
+    pose = np.eye(4)
+    pose[:3, 3] = -np.asarray(position)
+    centre = {"cx": width / 2, "cy": height / 2}
+    return Camera.pinhole(width, height, fx=focal, fy=focal, **centre, world_to_camera=pose)
+
+
 def range_in_box(camera, low, high):
     """Distance along every pixel's ray to the inside of a box that the camera is in, shape ``(height, width)``."""
     d = camera.directions()

@@ -29,9 +29,8 @@ def asked(
 @pytest.mark.parametrize("frequency_hz", [make.CARRIER_HZ, make.CARRIER_HZ + 1e6, 140e9])
 def test_an_answer_is_the_fields_own_at_the_carrier_that_is_asked(field, frequency_hz):
     found = asked(field, frequency_hz=frequency_hz)
-    own = (
-        field.at_frequency(140e9) if frequency_hz == 140e9 else field
-    )  # within a slider's step it is the field's
+    # Within a slider's step it is the field's.
+    own = field.at_frequency(140e9) if frequency_hz == 140e9 else field
     np.testing.assert_array_equal(found.spectrum.path_gain, own.spectrum(RECEIVER).path_gain)
     np.testing.assert_array_equal(found.paths[0].gain, own.paths(RECEIVER, max_paths=200).gain)
     assert found.total_db == pytest.approx(10 * np.log10(own.spectrum(RECEIVER).total_path_gain))
@@ -96,11 +95,8 @@ def test_truth_is_told_only_where_it_was_measured(field):
     assert answers.measured_here(ds, ds.receivers[2] + [0.0, 0.02, 0.0]) is None
     assert answers.measured_here(None, ds.receivers[2]) is None
     wrong = answers.errors(ds[2], ds[2])
-    assert (
-        wrong["direction_deg"] == pytest.approx(0, abs=0.1)
-        and wrong["total_db"] == 0
-        and wrong["psnr_db"] > 100
-    )
+    assert wrong["direction_deg"] == pytest.approx(0, abs=0.1)
+    assert wrong["total_db"] == 0 and wrong["psnr_db"] > 100
 
 
 def test_readings_made_of_a_fields_own_paths_have_no_error_but_the_one_put_in(field):
@@ -119,9 +115,8 @@ def test_what_is_learned_of_surfaces_is_shown_on_them(field):
     surface, p = field.surface, field.parameters
     smooth = np.exp(p.log_mirror) / (np.exp(p.log_mirror) + p.weight.sum(axis=1))
     height_m = 1e-3 * room.learned(field, "roughness")
-    np.testing.assert_allclose(
-        np.exp(-((4 * np.pi * height_m / field.wavelength_m) ** 2)), smooth[surface.group], rtol=1e-6
-    )
+    loss = np.exp(-((4 * np.pi * height_m / field.wavelength_m) ** 2))
+    np.testing.assert_allclose(loss, smooth[surface.group], rtol=1e-6)
     gamma = (1 - np.sqrt(1 + np.exp(p.log_excess))) / (1 + np.sqrt(1 + np.exp(p.log_excess)))
     wanted = 10 * np.log10(np.exp(p.log_mirror) * gamma**2)
     np.testing.assert_allclose(room.learned(field, "reflection"), wanted[surface.group], atol=0.05)

@@ -4,6 +4,7 @@ import io
 import resource
 import shutil
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -19,9 +20,8 @@ import warprrf as wr
 from warprrf.viewer import answers
 
 CHROMIUM = (shutil.which("chromium"), shutil.which("chromedriver"))
-browsed = pytest.mark.skipif(
-    None in CHROMIUM, reason="needs Chromium and its driver (apt: chromium chromium-driver)"
-)
+NEEDED = "needs Chromium and its driver (apt: chromium chromium-driver)"
+browsed = pytest.mark.skipif(None in CHROMIUM, reason=NEEDED)
 FLAGS = (
     "--headless=new", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
     "--window-size=1200,800",
@@ -62,6 +62,31 @@ def _until(done, seconds):
         time.sleep(0.2)
 
 
+@contextmanager
+def _beside(page, address):
+    """Another page, in a tab of its own."""
+    here = page.current_window_handle
+    page.switch_to.new_window("tab")
+    page.get(address)
+    yield
+    page.close()
+    page.switch_to.window(here)
+
+
+@pytest.fixture
+def found(viewer):
+    """The answer at ``RECEIVER``."""
+    viewer.receiver = RECEIVER
+    return viewer.wait()
+
+
+def _survey(viewer, ask):
+    """The viewer's survey, when it has done what ``ask`` names."""
+    getattr(viewer._survey, ask)()
+    viewer._page.wait()
+    return viewer._survey
+
+
 def _picture(page):
     """The page's canvas and panel as colours (H, W, 3)."""
     return np.asarray(Image.open(io.BytesIO(page.get_screenshot_as_png())).convert("RGB"), dtype=float)
@@ -99,13 +124,9 @@ def test_an_address_that_is_none_is_refused():
 
 
 def test_errors_at_measured_places_are_listed_worst_first(viewer):
-    ds, survey = viewer.subject.spectra, viewer._survey
-    survey.errors()
-    viewer._page.wait()
-    wanted = [
-        answers.errors(viewer.subject.field.spectrum(r), ds[k])["psnr_db"] for k, r in enumerate(ds.receivers)
-    ]
-    listed = [float(button.label.split()[0]) for button in survey.listed]
+    ds, field = viewer.subject.spectra, viewer.subject.field
+    wanted = [answers.errors(field.spectrum(r), ds[k])["psnr_db"] for k, r in enumerate(ds.receivers)]
+    listed = [float(button.label.split()[0]) for button in _survey(viewer, "errors").listed]
     np.testing.assert_allclose(listed, np.sort(wanted)[: len(listed)], atol=0.06)
 
 
@@ -116,8 +137,7 @@ def test_at_another_carrier_fields_are_carried_over_and_not_compared_with_what_w
     viewer._channel.carrier.value = 140.0
     assert viewer.wait().frequency_hz == 140e9 and "carried over to 140 GHz" in viewer.message
     assert [image[0] for image in viewer._channel.images] == ["spectrum"]
-    viewer._survey.errors()
-    viewer._page.wait()
+    _survey(viewer, "errors")
     assert f"expected that of what was measured, {make.CARRIER_HZ / 1e9:g} GHz" in viewer.message
     viewer._channel.carrier.value = make.CARRIER_HZ / 1e9
     assert viewer.wait().frequency_hz == make.CARRIER_HZ and "carried over" not in viewer.message
@@ -125,12 +145,10 @@ def test_at_another_carrier_fields_are_carried_over_and_not_compared_with_what_w
 
 def test_the_map_lies_on_the_floor_with_its_scale(viewer):
     viewer._survey.height.value = 1000.0
-    viewer._survey.map()
-    viewer._page.wait()
+    _survey(viewer, "map")
     assert "height: got 1000.0 m" in viewer.message
     viewer._survey.height.value = 1.5
-    viewer._survey.map()
-    viewer._page.wait()
+    _survey(viewer, "map")
     handle = viewer._page.scene.get_handle_by_name("/map")
     assert handle.position[2] == pytest.approx(0.03, abs=1e-4), viewer.message
     low, high = viewer.subject.mesh.bounds
@@ -139,18 +157,14 @@ def test_the_map_lies_on_the_floor_with_its_scale(viewer):
 
 
 def test_places_to_measure_next_are_those_that_the_field_suggests(viewer):
-    survey, field = viewer._survey, viewer.subject.field
-    survey.suggest()
-    viewer._page.wait()
+    survey, field = _survey(viewer, "suggest"), viewer.subject.field
     assert len(survey.listed) == 3, viewer.message
     first = np.array([float(x) for x in survey.listed[0].label[5:-2].split(",")])
     places = survey.candidates(field)
     np.testing.assert_allclose(first, places[field.suggest(places, 1)[0]], atol=0.006)
 
 
-def test_a_click_on_a_path_chooses_it_and_one_beside_all_does_not(viewer):
-    viewer.receiver = RECEIVER
-    found = viewer.wait()
+def test_a_click_on_a_path_chooses_it_and_one_beside_all_does_not(viewer, found):
     listed, rays = answers.strongest(found.paths, 5), viewer._rays
     kind = [str(p.kind[k]) for p, k in listed]
     assert kind[0] == "los" and rays.label.startswith("los ")
@@ -170,19 +184,15 @@ def test_a_notebook_shows_the_page(viewer, page, tmp_path):
     shown = DisplayFormatter().format(viewer)[0]["text/html"]
     assert viewer.url in shown and viewer.url.startswith("http://127.0.0.1:")
     (tmp_path / "cell.html").write_text(shown)
-    before, here = len(viewer.clients), page.current_window_handle
-    page.switch_to.new_window("tab")
-    page.get(f"file://{tmp_path / 'cell.html'}")
-    _until(lambda: len(viewer.clients) == before + 1, 60)
-    page.close()
-    page.switch_to.window(here)
+    before = len(viewer.clients)
+    with _beside(page, f"file://{tmp_path / 'cell.html'}"):
+        _until(lambda: len(viewer.clients) == before + 1, 60)
     _until(lambda: len(viewer.clients) == before, 60)
 
 
 @browsed
-def test_pointing_at_a_ring_in_the_spectrum_tells_its_path(viewer, page):
-    viewer.receiver = RECEIVER
-    (paths,) = viewer.wait().paths
+def test_pointing_at_a_ring_in_the_spectrum_tells_its_path(found, page):
+    (paths,) = found.paths
     kind, gain, delay, *_ = answers.described(paths, int(paths.power.argmax()))
     _until(lambda: page.find_elements(By.CSS_SELECTOR, ".wr .mark"), 60)
     time.sleep(1)  # the last drag's figures are replaced by these
@@ -194,25 +204,19 @@ def test_pointing_at_a_ring_in_the_spectrum_tells_its_path(viewer, page):
 
 
 @browsed
-def test_a_saved_page_shows_the_room_and_its_figures_without_a_server(viewer, page, tmp_path):
+def test_a_saved_page_shows_the_room_and_its_figures_without_a_server(viewer, found, page, tmp_path):
     def drawn():
         try:
             return _picture(page)[:, : page.get_window_size()["width"] // 2].std() > 5.0
         except TimeoutException:  # a busy machine draws its first frame in software for many seconds
             return False
 
-    viewer.receiver = RECEIVER
-    viewer.wait()
     viewer.save(tmp_path / "page.html")
-    here = page.current_window_handle
-    page.switch_to.new_window("tab")
-    page.get(f"file://{tmp_path / 'page.html'}")
-    _until(lambda: page.find_elements(By.TAG_NAME, "canvas"), 60)
-    _until(drawn, 120)
-    assert "path gain" in page.find_element(By.CSS_SELECTOR, "p.wr").text
-    assert page.find_element(By.CSS_SELECTOR, ".wr img").get_property("naturalWidth") == make.SHAPE[1]
-    page.close()
-    page.switch_to.window(here)
+    with _beside(page, f"file://{tmp_path / 'page.html'}"):
+        _until(lambda: page.find_elements(By.TAG_NAME, "canvas"), 60)
+        _until(drawn, 120)
+        assert "path gain" in page.find_element(By.CSS_SELECTOR, "p.wr").text
+        assert page.find_element(By.CSS_SELECTOR, ".wr img").get_property("naturalWidth") == make.SHAPE[1]
 
 
 @browsed
@@ -231,15 +235,12 @@ def test_share_gives_the_browser_the_page_and_the_picture_as_files(viewer, page,
 
 
 @browsed
-def test_a_drag_in_the_browser_changes_spectrum_and_picture(viewer, page):
-    viewer.receiver = RECEIVER
-    viewer.wait()
+def test_a_drag_in_the_browser_changes_spectrum_and_picture(viewer, found, page):
     time.sleep(3)
     before, start = _panel(page), viewer.receiver
     x, y = _pixel(viewer, page, viewer.receiver + [0.35, 0.0, 0.0])  # the arrow along x
-    _at(page, x, y).click_and_hold().move_by_offset(40, 0).pause(0.3).move_by_offset(
-        20, 0
-    ).release().perform()
+    held = _at(page, x, y).click_and_hold()
+    held.move_by_offset(40, 0).pause(0.3).move_by_offset(20, 0).release().perform()
     _until(lambda: not np.allclose(viewer.receiver, start), 30)
     found = viewer.wait()
     np.testing.assert_array_equal(found.receiver, viewer.receiver)
@@ -247,9 +248,8 @@ def test_a_drag_in_the_browser_changes_spectrum_and_picture(viewer, page):
 
 
 @browsed
-def test_a_click_in_the_browser_chooses_the_path_under_it(viewer, page):
-    viewer.receiver = RECEIVER
-    listed = answers.strongest(viewer.wait().paths, 5)
+def test_a_click_in_the_browser_chooses_the_path_under_it(viewer, found, page):
+    listed = answers.strongest(found.paths, 5)
     time.sleep(2)
     assert viewer._rays.label.startswith("los ")
     paths, k = next(path for path in listed if path[0].kind[path[1]] == "mirror")
@@ -295,8 +295,5 @@ def _pixel(viewer, page, point):
     turn = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
     local = turn.T @ (np.asarray(point) - camera.position)
     canvas = page.find_element(By.TAG_NAME, "canvas").rect
-    focal = 0.5 * canvas["height"] / np.tan(0.5 * camera.fov)
-    return (
-        int(canvas["x"] + 0.5 * canvas["width"] + focal * local[0] / local[2]),
-        int(canvas["y"] + 0.5 * canvas["height"] + focal * local[1] / local[2]),
-    )
+    x, y = 0.5 * canvas["height"] / np.tan(0.5 * camera.fov) * local[:2] / local[2]
+    return int(canvas["x"] + 0.5 * canvas["width"] + x), int(canvas["y"] + 0.5 * canvas["height"] + y)

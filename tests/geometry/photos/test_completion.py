@@ -39,9 +39,8 @@ def made(folder, shown, places, turn=None, config=CONFIG):
     flat = wr.Gaussians(g.means, g.quaternions, g.scales, g.opacities, np.zeros((len(g), 1, 3)))
     flat.save_ply(folder / "g.ply")
     model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(model="PINHOLE", width=96, height=72, params=[50, 50, 46.5, 38], camera_id=1)
-    )
+    lens = pycolmap.Camera(model="PINHOLE", width=96, height=72, params=[50, 50, 46.5, 38], camera_id=1)
+    model.add_camera_with_trivial_rig(lens)
     for k, (place, ahead) in enumerate((place, ahead) for place in places for ahead in AROUND):
         camera = look((place + 0.3 * ahead * [1, 1, 0]) @ turn, (place + 1.3 * ahead) @ turn)
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(camera.rotation), camera.world_to_camera[:3, 3])

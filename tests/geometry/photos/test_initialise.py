@@ -93,12 +93,10 @@ def test_planes_go_as_far_as_photos_show_them_and_take_fine_discs_where_these_ar
 
 
 def test_compared_photos_differ_in_direction():
-    cameras = [look([2.0, 0.02 * k, 1.0], [0, 0, 0.0]) for k in range(10)] + [
-        look([0, 2.0, 1.0], [0, 0, 0.0])
-    ]
-    chosen = sweep.choose_views(
-        np.zeros((1, 3)), np.array([0.0, 0, 1]), np.ones((1, 11), dtype=bool), cameras
-    )
+    eyes = [*([2.0, 0.02 * k, 1.0] for k in range(10)), [0, 2.0, 1.0]]
+    cameras = [look(eye, [0, 0, 0.0]) for eye in eyes]
+    shown = np.ones((1, 11), dtype=bool)
+    chosen = sweep.choose_views(np.zeros((1, 3)), np.array([0.0, 0, 1]), shown, cameras)
     used = chosen[chosen >= 0]
     line = np.array([cameras[c].position for c in used])
     line /= np.linalg.norm(line, axis=1, keepdims=True)
@@ -135,9 +133,8 @@ def test_a_thin_screen_does_not_cut_the_floor_it_stands_on():
 def test_nearly_level_weak_planes_become_level_and_tilted_ones_stay():
     rng = np.random.default_rng(0)
     sizes, noise = np.repeat([2.0, 0.2, 1.0], [900, 40, 60]), np.repeat([0.003, 0.004, 0.001], [900, 40, 60])
-    flat = np.column_stack(
-        [sizes[:, None] * rng.uniform(-1, 1, (1000, 2)), noise * rng.standard_normal(1000)]
-    )
+    across = sizes[:, None] * rng.uniform(-1, 1, (1000, 2))
+    flat = np.column_stack([across, noise * rng.standard_normal(1000)])
     strong, weak, tilted = flat[:900, [2, 0, 1]], flat[900:940], flat[940:]
     slope = np.array([np.sin(0.04), 0, np.cos(0.04)])
     tilted[:, 2] -= tilted[:, 0] * np.tan(0.04)

@@ -6,16 +6,8 @@ from places import LOBBY
 from scipy.ndimage import map_coordinates
 from views import lobby_cameras
 
-from warprrf.geometry.photos import sfm
+from warprrf.geometry.photos import photo_files, sfm
 from warprrf.geometry.photos.config import ReconstructionConfig
-from warprrf.geometry.photos.photo_files import (
-    cameras_of,
-    check_photos,
-    find_photos,
-    photo_facts,
-    read_mask,
-    read_photo,
-)
 from warprrf.geometry.photos.sparse import align_to_known
 from warprrf.geometry.photos.undistort import Lens, lenses_in_use, pinhole_of, write_undistorted
 
@@ -104,18 +96,16 @@ def test_a_pixel_shows_the_direction_that_its_camera_says(model, bends, orientat
     direction = directions(model, 160, 120, [*focal, 78.0, 61.0, *bends])
 
     def shown(a, b):
-        return np.stack(
-            [0.5 + 0.4 * np.sin(3 * a), 0.5 + 0.4 * np.cos(3 * b), 0.5 + 0.4 * np.sin(2 * a + b)], axis=-1
-        )
+        return 0.5 + 0.4 * np.stack([np.sin(3 * a), np.cos(3 * b), np.sin(2 * a + b)], axis=-1)
 
     save(tmp_path / "a.png", (255 * shown(*np.moveaxis(direction, -1, 0))).round(), orientation)
-    facts = photo_facts(tmp_path / "a.png")
+    facts = photo_files.photo_facts(tmp_path / "a.png")
     assert facts.turns == {1: 0, 6: 1, 3: 2, 8: 3}[orientation]
     for most in (10**6, 9000):
         write_undistorted(tmp_path / "a.png", tmp_path / "out" / "a.png", lens, most)
         flat = pinhole_of(lens, np.eye(4), facts.turns, most)
         assert flat.width * flat.height <= 1.02 * most
-        found = read_photo(tmp_path / "out" / "a.png")
+        found = photo_files.read_photo(tmp_path / "out" / "a.png")
         assert found.shape == (flat.height, flat.width, 3)
         d = flat.directions()  # the world has the axes of the photo as stored
         expected = shown(d[..., 0] / d[..., 2], d[..., 1] / d[..., 2])
@@ -125,7 +115,7 @@ def test_a_pixel_shows_the_direction_that_its_camera_says(model, bends, orientat
 def test_photos_stored_mirrored_are_refused(tmp_path):
     save(tmp_path / "a.png", GREY, 2)
     with pytest.raises(ValueError, match=r"a\.png has EXIF orientation 2, expected 1, 3, 6 or 8"):
-        photo_facts(tmp_path / "a.png")
+        photo_files.photo_facts(tmp_path / "a.png")
 
 
 def test_photos_are_reduced_and_never_enlarged():
@@ -142,13 +132,9 @@ def test_photos_of_one_camera_share_a_lens_wherever_they_lie(tmp_path):
         save(tmp_path / folder / "a.jpg", GREY, camera=("Maker", "Phone"))
         save(tmp_path / folder / "b.jpg", np.rot90(GREY), camera=("Maker", "Phone"))
         save(tmp_path / folder / "c.jpg", GREY)
-    found = cameras_of(find_photos(tmp_path))
-    assert found == [
-        ["hall/a.jpg", "lounge/a.jpg"],
-        ["hall/b.jpg", "lounge/b.jpg"],
-        ["hall/c.jpg"],
-        ["lounge/c.jpg"],
-    ]
+    shared = [[f"hall/{name}.jpg", f"lounge/{name}.jpg"] for name in "ab"]
+    found = photo_files.cameras_of(photo_files.find_photos(tmp_path))
+    assert found == [*shared, ["hall/c.jpg"], ["lounge/c.jpg"]]
 
 
 def test_features_are_not_found_where_a_mask_is_black(through_a_lens):
@@ -163,7 +149,7 @@ def test_features_are_not_found_where_a_mask_is_black(through_a_lens):
 
 def test_masks_are_bent_with_their_photos(through_a_lens):
     sparse = through_a_lens[2]
-    ignored = read_mask(sparse.photos["view_005.jpg"])
+    ignored = photo_files.read_mask(sparse.photos["view_005.jpg"])
     camera = sparse.cameras["view_005.jpg"]
     assert ignored.shape == (camera.height, camera.width)
     seen = sparse.lenses["view_005.jpg"]
@@ -172,19 +158,19 @@ def test_masks_are_bent_with_their_photos(through_a_lens):
     column = round(camera.fx * edge + camera.cx)
     middle = ignored[camera.height // 2]
     assert middle[: column - 2].all() and not middle[column + 3 :].any()
-    assert read_mask(sparse.photos["view_004.jpg"]) is None
+    assert photo_files.read_mask(sparse.photos["view_004.jpg"]) is None
 
 
 def test_masks_that_fit_no_photo_are_named(tmp_path):
     for name in ("a.png", "b.png", "c.png"):
         save(tmp_path / name, GREY)
     save(tmp_path / "a.mask.png", GREY[:, :20])
-    assert list(find_photos(tmp_path)) == ["a.png", "b.png", "c.png"]
+    assert list(photo_files.find_photos(tmp_path)) == ["a.png", "b.png", "c.png"]
     with pytest.raises(ValueError, match=r"a\.png .*its mask is 20 x 30, expected 40 x 30"):
-        check_photos(find_photos(tmp_path))
+        photo_files.check_photos(photo_files.find_photos(tmp_path))
     save(tmp_path / "d.mask.png", GREY)
     with pytest.raises(ValueError, match=r"1 masks are of no photo: d\.mask\.png"):
-        find_photos(tmp_path)
+        photo_files.find_photos(tmp_path)
 
 
 def test_photos_in_their_own_workspace_are_not_overwritten(through_a_lens):
@@ -204,13 +190,12 @@ def test_photos_of_two_sizes_are_posed_together_and_a_mask_that_is_gone_is_forgo
     Image.fromarray(grey).save(mask)
     config = ReconstructionConfig(max_features=1500, lens="SIMPLE_PINHOLE")
     found = sfm.structure_from_motion(tmp_path, workspace=tmp_path / "work", config=config)
-    assert (
-        list(find_photos(tmp_path)) == names == list(found.cameras)
-    )  # and none of the workspace beside them
+    # And none of the workspace beside them.
+    assert list(photo_files.find_photos(tmp_path)) == names == list(found.cameras)
     large, small = found.lenses[names[1]], found.lenses[names[0]]
     assert len(lenses_in_use(found.lenses)) == 2
     assert large.fx == pytest.approx(FOCAL, rel=0.03) and small.fx == pytest.approx(0.8 * FOCAL, rel=0.03)
-    np.testing.assert_array_equal(read_mask(found.photos["view_001.jpg"]), grey == 0)
+    np.testing.assert_array_equal(photo_files.read_mask(found.photos["view_001.jpg"]), grey == 0)
     mask.unlink()
     again = sfm.structure_from_motion(tmp_path, workspace=tmp_path / "work", config=config)
-    assert read_mask(again.photos["view_001.jpg"]) is None
+    assert photo_files.read_mask(again.photos["view_001.jpg"]) is None

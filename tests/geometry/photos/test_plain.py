@@ -108,7 +108,6 @@ def test_a_plain_cell_gives_way_to_points_on_a_plane_and_to_lines_of_sight():
     sight = np.repeat(through + [0, 2.0, 0], 2, axis=0), np.repeat(through - [0, 2.0, 0], 2, axis=0)
     ours, plain = with_plain([poster], [wall], points, sight)
     kept = np.zeros((20, 20), dtype=bool)
-    kept[4:7, 4:7] = kept[15, 15] = (
-        True  # its point and what lies round it; and where the wall is seen through
-    )
+    # Its point and what lies round it; and where the wall is seen through.
+    kept[4:7, 4:7] = kept[15, 15] = True
     assert (ours.occupied == kept).all() and (plain.occupied == ~kept).all() and plain.plain

@@ -1,9 +1,6 @@
 """Poses and depth that are known already: read, matched with photos, triangulated from, fused."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,26 +26,24 @@ QUICK = ReconstructionConfig(
 )  # fmt: skip
 
 
-def camera_to_world(camera: wr.Camera, opengl: bool = True) -> list[list[float]]:
+def camera_to_world(camera, opengl=True):
     return (np.linalg.inv(camera.world_to_camera) @ np.diag([1, -1, -1, 1] if opengl else [1] * 4)).tolist()
 
 
-def frames(names: list[str] = NAMES, folder: str = "images/") -> list[dict[str, object]]:
-    return [
-        {"file_path": folder + name, "transform_matrix": camera_to_world(camera)}
-        for name, camera in lobby_cameras(names).items()
-    ]
+def frames(names=NAMES, folder="images/"):
+    cameras = lobby_cameras(names).items()
+    return [{"file_path": folder + name, "transform_matrix": camera_to_world(c)} for name, c in cameras]
 
 
-def written(folder: Path, **values: object) -> Path:
+def written(folder, **values):
     path = folder / "transforms.json"
     path.write_text(json.dumps({**LENS, "frames": frames(), **values}))
     return path
 
 
 @pytest.fixture(scope="module")
-def truth() -> wr.Mesh:
-    return wr.Scene.load(LOBBY / "scene.xml").mesh
+def truth(lobby_scene):
+    return lobby_scene.mesh
 
 
 def test_transforms_hold_the_cameras_that_were_written(tmp_path):
@@ -60,6 +55,8 @@ def test_transforms_hold_the_cameras_that_were_written(tmp_path):
         assert (lens.model, lens.fx, lens.cy, lens.straight) == ("PINHOLE", 395.0, 240.0, True)
         half = own.of_size(name, 320, 240)  # photos made smaller
         assert (half.width, half.fx, half.cx, half.cy) == (320, 197.5, 160.0, 120.0)
+        with pytest.raises(ValueError, match="stored with 480 x 640 pixels, its lens is given for 640 x 480"):
+            own.of_size(name, 480, 640)
 
 
 @pytest.mark.parametrize(
@@ -104,22 +101,15 @@ def test_bad_transforms_are_named(tmp_path, change, message):
 
 def test_frames_are_matched_with_photos_by_as_much_of_their_names_as_it_takes(tmp_path):
     photos = ["a/0001.jpg", "a/0002.jpg", "b/0001.jpg", "b/r_3.png"]
+    names = ["./a/0001.jpg", "x/b/0001.jpg", "0002.jpg", "./train/r_3", "a/0009.jpg"]
     with pytest.warns(UserWarning, match="1 of 5 poses have no photo and are left out: a/0009.jpg"):
-        found = match_photos(
-            ["./a/0001.jpg", "x/b/0001.jpg", "0002.jpg", "./train/r_3", "a/0009.jpg"], photos
-        )
+        found = match_photos(names, photos)
     assert found == {"a/0001.jpg": "./a/0001.jpg", "a/0002.jpg": "0002.jpg", "b/0001.jpg": "x/b/0001.jpg",
                      "b/r_3.png": "./train/r_3"}  # fmt: skip
     with pytest.raises(ValueError, match="both poses of the photo"):
         match_photos(["a/0002.jpg", "0002.jpg"], photos)
     with pytest.raises(ValueError, match="0 of 1 poses have a photo"):
         match_photos(["0001.jpg"], photos)  # which of the two?
-
-
-def test_photos_of_another_shape_than_their_lens_are_refused(tmp_path):
-    camera = next(iter(read_poses(written(tmp_path)).values()))
-    with pytest.raises(ValueError, match="stored with 480 x 640 pixels, its lens is given for 640 x 480"):
-        camera.of_size("a.jpg", 480, 640)
 
 
 @pytest.fixture(scope="module")
@@ -148,20 +138,19 @@ def test_points_of_a_colmap_model_are_taken_as_they_are(triangulated, tmp_path):
     folder, sparse = triangulated
     cameras = sfm.read_known(folder / "w" / "sfm" / "model")
     known = KnownPoses(cameras, folder / "w" / "sfm" / "model", {name: name for name in cameras})
-    stages: list[str] = []
+    stages = []
     again = sfm.structure_from_motion(
         PHOTOS[:5], workspace=tmp_path, poses=KnownPoses({n: cameras[n] for n in NAMES[:5]}, known.model, known.names),
         progress=lambda stage, done, total: stages.append(stage),
     )  # fmt: skip
     assert list(again.cameras) == NAMES[:5] and set(stages) == {"undistorting"}
     assert 0.3 * len(sparse.points) < len(again.points) <= len(sparse.points)
-    np.testing.assert_allclose(
-        again.cameras[NAMES[1]].world_to_camera, sparse.cameras[NAMES[1]].world_to_camera, atol=1e-9
-    )
+    pose, before = (found.cameras[NAMES[1]].world_to_camera for found in (again, sparse))
+    np.testing.assert_allclose(pose, before, atol=1e-9)
 
 
 @pytest.fixture(scope="module")
-def rgbd(tmp_path_factory, truth) -> Path:
+def rgbd(tmp_path_factory, truth):
     """Eight photos of the lobby with poses and the true depth, in a folder as of 7-Scenes."""
     folder = tmp_path_factory.mktemp("rgbd")
     np.savetxt(folder / "camera-intrinsics.txt", [[395.0, 0, 320], [0, 395, 240], [0, 0, 1]])
@@ -194,9 +183,8 @@ def test_depth_that_contradicts_the_poses_is_refused(rgbd, tmp_path):
 
 
 def test_depth_of_frames_that_tell_it_is_found(rgbd, tmp_path):
-    assert list(
-        find_depth(rgbd, ["frame-000001.color.jpg", "frame-000002.jpg", "a/frame-000003.png"]).values()
-    ) == [rgbd / f"frame-00000{k}.depth.png" for k in (1, 2, 3)]
+    found = find_depth(rgbd, ["frame-000001.color.jpg", "frame-000002.jpg", "a/frame-000003.png"])
+    assert list(found.values()) == [rgbd / f"frame-00000{k}.depth.png" for k in (1, 2, 3)]
     with pytest.raises(ValueError, match="holds depth of 0 photos"):
         find_depth(rgbd, ["a.jpg", "b.jpg", "c.jpg"])
     (tmp_path / "d.png").write_bytes((rgbd / "frame-000001.depth.png").read_bytes())

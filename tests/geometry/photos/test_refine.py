@@ -98,9 +98,8 @@ def test_gaussians_near_a_plane_are_pulled_flat_into_it():
     uv = rng.uniform(-0.8, 0.8, (n, 2))
     noisy = np.column_stack([uv, rng.normal(size=n) * 0.01])
     tilt = np.column_stack([np.ones(n), rng.normal(size=(n, 2)) * 0.05, np.zeros(n)])
-    start = Gaussians(
-        noisy, tilt, np.tile([0.06, 0.06, 0.003], (n, 1)), np.full(n, 0.8), rng.normal(size=(n, 1, 3))
-    )
+    scales = np.tile([0.06, 0.06, 0.003], (n, 1))
+    start = Gaussians(noisy, tilt, scales, np.full(n, 0.8), rng.normal(size=(n, 1, 3)))
     cameras = ring_of_cameras(4)
     photos = [np.clip(render(start, c).features, 0, 1) for c in cameras]
     plane = Plane(
@@ -135,9 +134,8 @@ def test_photo_loss_is_l1_and_ssim_and_its_derivative_is_right(lanes):
         image, target, channel_axis=2, data_range=1.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
         full=True,
     )  # fmt: skip
-    assert (
-        np.abs(score - published)[6:-6, 6:-6].max() < 1e-4
-    )  # the border differs: zeros here, mirrored there
+    # The border differs: zeros here, mirrored there.
+    assert np.abs(score - published)[6:-6, 6:-6].max() < 1e-4
     v = rng.normal(size=shape)
     h = 1e-6
     difference = (evaluate(image + h * v)[0] - evaluate(image - h * v)[0]) / (2 * h)
@@ -189,9 +187,8 @@ def test_masked_pixels_take_no_part(problem):
     masks[0][10:30, 20:40] = masks[3][:, :15] = True
     rng = np.random.default_rng(4)
     spoilt = [np.where(m[..., None], rng.random(p.shape), p) for p, m in zip(photos, masks, strict=True)]
-    one, other = (
-        refine(start, PosedPhotos(images, cameras, masks), config=CONFIG) for images in (photos, spoilt)
-    )
+    posed = [PosedPhotos(images, cameras, masks) for images in (photos, spoilt)]
+    one, other = (refine(start, photos, config=CONFIG) for photos in posed)
     assert np.array_equal(one.sh, other.sh) and np.array_equal(one.means, other.means)
 
 

@@ -15,10 +15,11 @@ from warprrf.geometry.photos.photo_files import find_photos, match_names, read_p
 from warprrf.geometry.photos.sparse import SparseModel, align_to_known, fit_similarity, posed_in_words
 from warprrf.geometry.splats.camera import Camera
 
-pytest.importorskip("pycolmap")
+pycolmap = pytest.importorskip("pycolmap")
 Image = pytest.importorskip("PIL.Image")
 
 VIEWS = [f"view_{k:03d}.jpg" for k in range(10)]
+PHOTOS = [LOBBY / "photos" / name for name in VIEWS]
 
 
 def model(rng, names="abcdefgh"):
@@ -36,13 +37,6 @@ def model(rng, names="abcdefgh"):
     )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def lobby():
-    """Ten photos of the walk, and their true positions."""
-    truth = {name: camera.position for name, camera in lobby_cameras(VIEWS).items()}
-    return [LOBBY / "photos" / n for n in VIEWS], truth
-
-
 def made(workspace, photos):
     """The model of photos, and the steps that were taken."""
     stages, config = set(), ReconstructionConfig(max_features=1500)
@@ -53,20 +47,17 @@ def made(workspace, photos):
 
 
 @pytest.fixture(scope="module")
-def posed(lobby, tmp_path_factory):
+def posed(tmp_path_factory):
     workspace = tmp_path_factory.mktemp("sfm")
-    return workspace, made(workspace, lobby[0])[0]
+    return workspace, made(workspace, PHOTOS)[0]
 
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_the_similarity_of_noisy_points_is_that_of_least_squares_and_no_mirror_image(side):
     rng = np.random.default_rng(3)
     source = rng.standard_normal((8, 3))
-    target = (
-        2.5 * source @ Rotation.random(None, rng).as_matrix().T
-        + rng.standard_normal(3)
-        + 0.1 * rng.standard_normal((8, 3))
-    )
+    target = 2.5 * source @ Rotation.random(None, rng).as_matrix().T + rng.standard_normal(3)
+    target += 0.1 * rng.standard_normal((8, 3))
     source *= [1, 1, side]
     scale, turn, shift = fit_similarity(source, target)
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
@@ -112,9 +103,7 @@ def test_what_was_posed_is_said_in_words():
     )
 
 
-def test_models_that_share_a_photo_become_one_and_others_stay_apart(posed, lobby, tmp_path):
-    import pycolmap
-
+def test_models_that_share_a_photo_become_one_and_others_stay_apart(posed, tmp_path):
     folder, options = posed[0] / "sfm", pycolmap.IncrementalPipelineOptions(random_seed=0, num_threads=1)
 
     def part(names):
@@ -129,7 +118,7 @@ def test_models_that_share_a_photo_become_one_and_others_stay_apart(posed, lobby
     for shared, joined in ((1, True), (0, False)):
         first, second = part(VIEWS[:6]), part(VIEWS[6 - shared :])
         second.transform(pycolmap.Sim3d(2.5, pycolmap.Rotation3d([0.1, 0.2, 0.3]), [3.0, -1.0, 2.0]))
-        source = folder / "matches.db", lobby[0][0].parent, options
+        source = folder / "matches.db", PHOTOS[0].parent, options
         both = sfm._joined(pycolmap, first, second, source, tmp_path)
         assert (both is not None) == joined
         if both is not None:
@@ -140,7 +129,7 @@ def test_models_that_share_a_photo_become_one_and_others_stay_apart(posed, lobby
             assert np.abs(moved - known).max() < 0.01 * np.ptp(known, axis=0).max()
 
 
-def test_pieces_that_share_no_view_are_named_and_kept(lobby, tmp_path):
+def test_pieces_that_share_no_view_are_named_and_kept(tmp_path):
     photos = [LOBBY / "photos" / f"view_{k:03d}.jpg" for k in (*range(4, 10), *range(60, 64))]
     with pytest.warns(UserWarning, match="of 10 posed in the largest of 2 pieces"):
         found = made(tmp_path, photos)[0]
@@ -149,23 +138,22 @@ def test_pieces_that_share_no_view_are_named_and_kept(lobby, tmp_path):
     assert set(sfm.read_known(tmp_path / "sfm" / "model-2")) == set(found.pieces[1])
 
 
-def test_poses_of_rendered_photos_agree_with_the_truth_and_straight_photos_are_taken_as_they_are(
-    posed, lobby
-):
-    sparse, truth = posed[1], lobby[1]
+def test_poses_of_rendered_photos_agree_with_the_truth_and_straight_photos_are_taken_as_they_are(posed):
+    sparse = posed[1]
+    truth = {name: camera.position for name, camera in lobby_cameras(VIEWS).items()}
     assert set(sparse.cameras) == set(VIEWS) and sparse.unposed == ()
     aligned = align_to_known(sparse, truth)
     assert aligned.scale_rms_m < 0.03  # ten neighbouring views; the whole walk does better
     assert sparse.cameras[VIEWS[0]].fx == pytest.approx(395, rel=0.03)  # estimated from the images alone
     assert sparse.lenses[VIEWS[0]].model == "SIMPLE_PINHOLE" and sparse.lenses[VIEWS[0]].straight
-    for photo in lobby[0]:
+    for photo in PHOTOS:
         assert sparse.photos[photo.name].read_bytes() == photo.read_bytes()
 
 
-def test_comparing_promising_pairs_alone_poses_every_photo(lobby, tmp_path, monkeypatch):
+def test_comparing_promising_pairs_alone_poses_every_photo(tmp_path, monkeypatch):
     monkeypatch.setattr(sfm, "MAX_EXHAUSTIVE_PAIRS", 1)
     monkeypatch.setattr(sfm, "COARSE_NEIGHBOURS", 4)
-    assert set(made(tmp_path, lobby[0])[0].cameras) == set(VIEWS)
+    assert set(made(tmp_path, PHOTOS)[0].cameras) == set(VIEWS)
 
 
 def test_a_point_projects_to_where_its_photos_saw_it(posed):
@@ -181,9 +169,9 @@ def test_a_point_projects_to_where_its_photos_saw_it(posed):
     assert (sparse.track_length >= 2).all() and sparse.track_start[-1] == len(sparse.track_camera)
 
 
-def test_finished_work_of_the_same_photos_is_reused_and_repeats_itself(posed, lobby, tmp_path):
+def test_finished_work_of_the_same_photos_is_reused_and_repeats_itself(posed, tmp_path):
     workspace, first = posed
-    again, stages = made(workspace, lobby[0])
+    again, stages = made(workspace, PHOTOS)
     assert stages == set()
     np.testing.assert_array_equal(again.points, first.points)
     # Stopped while mapping, with rubbish left behind: the same model comes out of the matches.
@@ -192,18 +180,16 @@ def test_finished_work_of_the_same_photos_is_reused_and_repeats_itself(posed, lo
     scratch = tmp_path / "w" / "sfm" / ".steps" / "model"
     (scratch / "mapping" / "0").mkdir(parents=True)
     (scratch / "matches.db").write_bytes(b"half written")
-    resumed, stages = made(tmp_path / "w", lobby[0])
+    resumed, stages = made(tmp_path / "w", PHOTOS)
     assert stages == {"mapping"}
     np.testing.assert_array_equal(resumed.points, first.points)
     # And of other photos nothing is taken.
-    sparse, stages = made(tmp_path / "w", lobby[0][:6])
+    sparse, stages = made(tmp_path / "w", PHOTOS[:6])
     assert stages == {"features", "matching", "mapping", "undistorting"}
     assert set(sparse.cameras) | set(sparse.unposed) == set(VIEWS[:6])
 
 
 def test_why_a_photo_has_no_pose_is_said(posed):
-    import pycolmap
-
     workspace, sparse = posed
     cameras = {name: camera for name, camera in sparse.cameras.items() if name != VIEWS[4]}
     lost = replace(sparse, cameras=cameras, unposed=(VIEWS[4], "black.jpg"))
@@ -213,8 +199,6 @@ def test_why_a_photo_has_no_pose_is_said(posed):
 
 
 def test_colmap_models_are_read_in_both_formats(posed, tmp_path):
-    import pycolmap
-
     source = pycolmap.Reconstruction(str(posed[0] / "sfm" / "model"))
     (tmp_path / "text").mkdir()
     source.write_text(str(tmp_path / "text"))
@@ -246,12 +230,12 @@ def test_hidden_files_are_no_photos(tmp_path):
     assert list(find_photos(tmp_path)) == ["a.jpg", "b.png", "c.JPG"]
 
 
-def test_photos_that_unfold_to_too_many_pixels_are_named(tmp_path, lobby, monkeypatch):
+def test_photos_that_unfold_to_too_many_pixels_are_named(tmp_path, monkeypatch):
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 640 * 480 // 3)
     with pytest.raises(ValueError, match="3 of 3 files do not read as images: .*decompression bomb"):
-        sfm.structure_from_motion(lobby[0][:3], workspace=tmp_path)
+        sfm.structure_from_motion(PHOTOS[:3], workspace=tmp_path)
     with pytest.raises(ValueError, match="does not read as an image: .*decompression bomb"):
-        read_photo(lobby[0][0])
+        read_photo(PHOTOS[0])
 
 
 def test_photos_without_anything_in_common_are_refused(tmp_path):

@@ -6,16 +6,13 @@ import numpy as np
 import pytest
 import views
 
-from warprrf.geometry.photos.stereo import mended
+from warprrf.geometry.photos import stereo
 from warprrf.geometry.photos.targets import PosedPhotos
 
 look = partial(views.look, width=160, height=120, f=130.0)
 LOW, HIGH = np.array([-2.0, -2.0, 0.0]), np.array([2.0, 2.0, 2.5])
 PLAIN_X = HIGH[0]  # the wall there shows nothing
-
-
-def silent(stage, done, total):
-    pass
+mended = partial(stereo.mended, progress=lambda *told: None)
 
 
 def truth(camera):
@@ -57,18 +54,18 @@ def spoiled(room):
 @pytest.fixture(scope="module")
 def found(room, spoiled):
     cameras, _, photos = room
-    return np.array(mended(spoiled[0], cameras, photos, progress=silent))
+    return np.array(mended(spoiled[0], cameras, photos))
+
+
+def shown_x(room):
+    """x of what every pixel shows."""
+    cameras, true, _ = room
+    return np.array([c.position[0] + t * c.directions()[..., 0] for c, t in zip(cameras, true, strict=True)])
 
 
 def patterned(room):
     """Pixels that show the pattern, a window's width from the plain wall and from the border."""
-    cameras, true, _ = room
-    shown = np.array(
-        [
-            (c.position + t[..., None] * c.directions())[..., 0] < PLAIN_X - 0.3
-            for c, t in zip(cameras, true, strict=True)
-        ]
-    )
+    shown = shown_x(room) < PLAIN_X - 0.3
     shown[:, :8] = shown[:, -8:] = False
     shown[:, :, :8] = shown[:, :, -8:] = False
     return shown
@@ -91,9 +88,7 @@ def test_right_depths_stay_as_they_are(room, spoiled, found):
 
 
 def test_a_plain_wall_keeps_its_depth(room, spoiled, found):
-    cameras, true, _ = room
-    ends = np.array([c.position + t[..., None] * c.directions() for c, t in zip(cameras, true, strict=True)])
-    plain = (ends[..., 0] > PLAIN_X - 1e-6) & ~spoiled[1]
+    plain = (shown_x(room) > PLAIN_X - 1e-6) & ~spoiled[1]
     assert plain.sum() > 5000
     assert (found == np.array(spoiled[0]))[plain].mean() > 0.9
 
@@ -102,12 +97,12 @@ def test_masked_pixels_are_not_mended(room, spoiled):
     cameras, _, photos = room
     masks = [np.ones((120, 160), np.uint8) for _ in cameras]
     hidden = PosedPhotos(photos.images, cameras, masks)
-    result = mended(spoiled[0], cameras, hidden, progress=silent)
+    result = mended(spoiled[0], cameras, hidden)
     np.testing.assert_array_equal(result, spoiled[0])
 
 
 def test_one_photo_or_no_depth_mends_nothing(room, spoiled):
     cameras, _, photos = room
     for maps in (spoiled[0][:1], [np.zeros((120, 160))]):
-        result = mended(maps, cameras[:1], photos.subset([0]), progress=silent)
+        result = mended(maps, cameras[:1], photos.subset([0]))
         np.testing.assert_array_equal(result, maps)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from radio_scenes import box_mesh
 from trimesh.remesh import subdivide_to_size
+from views import pinhole
 
 from warprrf.geometry import pipeline
 from warprrf.geometry.mesh import Mesh
@@ -11,7 +12,9 @@ from warprrf.geometry.photos.cells import occupancy
 from warprrf.geometry.photos.fusion import fuse_depth, fuse_maps
 from warprrf.geometry.planes import Plane, detect_planes, plane_axes
 from warprrf.geometry.scans import find_patches
-from warprrf.geometry.splats.camera import Camera
+
+CAMERA = pinhole(64, 48, focal=50)
+WALL = 2.0 / CAMERA.directions()[..., 2]  # its range, at z = 2
 
 
 def grid_on(plane_normal, offset, size=1.0, step=0.05):
@@ -23,9 +26,8 @@ def grid_on(plane_normal, offset, size=1.0, step=0.05):
 def test_planes_are_found_in_noisy_points_with_outliers():
     rng = np.random.default_rng(2)
     turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
-    truth = [
-        (s * turn[:, k], d) for k, d in ((0, 1.0), (1, 1.5), (2, 2.0)) for s in (1, -1)
-    ]  # a box seen from outside
+    # A box seen from outside.
+    truth = [(s * turn[:, k], d) for k, d in ((0, 1.0), (1, 1.5), (2, 2.0)) for s in (1, -1)]
     points, normals = [], []
     for normal, offset in truth:
         uv = rng.uniform(-1, 1, (700, 2))
@@ -39,9 +41,8 @@ def test_planes_are_found_in_noisy_points_with_outliers():
     assert len(found) == len(truth)
     for k, (normal, offset) in enumerate(truth):
         match = max(found, key=lambda p: p.normal @ normal)
-        assert (
-            np.degrees(np.arccos(min(1.0, match.normal @ normal))) < 0.1
-        )  # 5 mm / 1 m / sqrt(700) is 0.01 degrees
+        # 5 mm / 1 m / sqrt(700) is 0.01 degrees.
+        assert np.degrees(np.arccos(min(1.0, match.normal @ normal))) < 0.1
         assert abs(match.offset - offset) < 1.5e-3
         own = (match.inliers >= 700 * k) & (match.inliers < 700 * (k + 1))
         assert own.mean() > 0.95 and own.sum() > 650
@@ -119,19 +120,15 @@ def test_faces_go_to_the_planes_that_are_given():
 
 
 def test_a_depth_map_with_few_known_pixels_does_not_end_the_fusion():
-    camera = Camera.pinhole(64, 48, fx=50, fy=50, cx=32, cy=24, world_to_camera=np.eye(4))
-    wall = 2.0 / camera.directions()[..., 2]  # at z = 2
-    few = np.zeros_like(wall)
-    few[9:12, 9:12] = wall[9:12, 9:12]
+    few = np.zeros_like(WALL)
+    few[9:12, 9:12] = WALL[9:12, 9:12]
     few[8, 8] = 100.0  # beyond the largest range
-    mesh = fuse_depth([wall, few, wall], [camera] * 3)
+    mesh = fuse_depth([WALL, few, WALL], [CAMERA] * 3)
     assert np.abs(mesh.vertices[:, 2] - 2).max() < 0.01
 
 
 def test_holes_that_stay_open_are_said_to():
-    camera = Camera.pinhole(64, 48, fx=50, fy=50, cx=32, cy=24, world_to_camera=np.eye(4))
-    wall = 2.0 / camera.directions()[..., 2]
-    patches, whole = fuse_maps([camera] * 2, [wall] * 2)
+    patches, whole = fuse_maps([CAMERA] * 2, [WALL] * 2)
     assert len(patches.mesh.faces) and not whole  # one plane is no room
     said = pipeline._said_of_surface(0.1, 0.0, True)
     assert [text.split(":")[0] for text in said] == ["surface", "holes"]

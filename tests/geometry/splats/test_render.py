@@ -3,23 +3,15 @@
 import numpy as np
 import pytest
 from rays_by_definition import blended, cloud
+from views import pinhole
 
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.rasterizer import RADIO, Blending
 from warprrf.geometry.splats.render import blend_weights, render
 
-
-def pinhole(width=64, height=48, position=(0.0, 0.0, -4.0)):
-    pose = np.eye(4)
-    pose[:3, 3] = -np.asarray(position)
-    return Camera.pinhole(
-        width, height, fx=0.6 * width, fy=0.6 * width, cx=width / 2, cy=height / 2, world_to_camera=pose
-    )
-
-
 CAMERAS = {
-    "pinhole": pinhole(),
-    "pinhole inside": pinhole(position=(0.1, 0.2, 0.0)),
+    "pinhole": pinhole(64, 48, focal=38.4, position=(0.0, 0.0, -4.0)),
+    "pinhole inside": pinhole(64, 48, focal=38.4, position=(0.1, 0.2, 0.0)),
     "spherical": Camera.spherical(72, 36, position=(0.1, -0.2, 0.3)),
     "spherical, width no multiple of a tile": Camera.spherical(50, 25, position=(0.4, 0.2, -0.3)),
 }
@@ -53,9 +45,8 @@ def test_blending_weights_rebuild_the_image(camera):
     features = rng.random((200, 3)).astype(np.float32)
     out = render(g, camera, features, blending=RADIO)
     w = blend_weights(g, camera, top_k=200)
-    rebuilt = np.einsum(
-        "hwk,hwkc->hwc", w.weight, features[np.maximum(w.index, 0)] * (w.index >= 0)[..., None]
-    )
+    met = features[np.maximum(w.index, 0)] * (w.index >= 0)[..., None]
+    rebuilt = np.einsum("hwk,hwkc->hwc", w.weight, met)
     assert np.abs(rebuilt - out.features).max() < 2e-4  # one contribution of alpha_min at a cutoff
     assert (np.diff(np.where(w.index >= 0, 1, 0), axis=2) <= 0).all()
     few = blend_weights(g, camera, top_k=3)

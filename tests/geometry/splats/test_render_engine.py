@@ -43,10 +43,9 @@ def image_and_gradients(g, cam, *, channels=3, device="cpu", **options):
     for out in (image.features, image.alpha, image.depth):
         out.grad.assign(rng.normal(size=out.shape))
     seen = adjoint()
-    arrays = (image.features, image.alpha, image.depth, image.dominant, image.peak, seen)
-    return [a.numpy().copy() for a in arrays] + [
-        a.grad.numpy().copy() for a in (*inputs, features, background)
-    ]
+    gradients = [a.grad for a in (*inputs, features, background)]
+    arrays = (image.features, image.alpha, image.depth, image.dominant, image.peak, seen, *gradients)
+    return [a.numpy().copy() for a in arrays]
 
 
 @pytest.mark.parametrize("camera", ["pinhole", "spherical"])
