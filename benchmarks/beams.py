@@ -121,6 +121,7 @@ class Links:
             specular, gain=np.sqrt(rays.power[kept]).astype(complex), tau=rays.length_m[kept] / SPEED_OF_LIGHT,
             theta_r=theta_r, phi_r=phi_r, theta_t=theta_t, phi_t=phi_t, kind=np.full(count, "diffuse", dtype="<U7"),
             vertices=np.full((count, *specular.vertices.shape[1:]), np.nan), valid=np.ones(count, bool), jones=None,
+            interactions=np.zeros((count, specular.vertices.shape[1]), np.int8),
         )  # fmt: skip
         place = np.round(1e6 * np.abs(receiver)).astype(int)
         turns = np.random.default_rng([self.seed, *place]).random(count)
