@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from furnished import RECEIVERS, TX, F, furnished, spectra
+from path_makers import random_directions
 from radio_scenes import RadioScene, SlabMaterial
 from twin_fields import known_field
 
@@ -25,16 +26,10 @@ def room(*, reciprocal: bool) -> RadioScene:
     return furnished(*(replace(m, reciprocal=reciprocal) for m in MATERIALS))
 
 
-def directions(count: int, seed: int) -> np.ndarray:
-    """Unit vectors over the hemisphere about z."""
-    d = np.random.default_rng(seed).normal(size=(count, 3))
-    d[:, 2] = np.abs(d[:, 2])
-    return d / np.linalg.norm(d, axis=1, keepdims=True)
-
-
 @pytest.mark.parametrize("alpha", [0, 1, 4, 12, 30, 200])
 def test_a_reciprocal_lobe_is_symmetric_and_either_kind_scatters_all_that_comes(alpha):
-    a, b = directions(2000, 0), directions(2000, 1)
+    a, b = (random_directions(2000, seed) for seed in (0, 1))
+    a[:, 2], b[:, 2] = np.abs(a[:, 2]), np.abs(b[:, 2])
     cos_mirror = 2.0 * a[:, 2] * b[:, 2] - (a * b).sum(axis=1)
     # f_s cos(theta_i): what the path gain of an element is proportional to
     there, back = (

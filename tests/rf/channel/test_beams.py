@@ -5,19 +5,14 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-import path_makers
 import pytest
-from path_makers import CARRIER, paths_along
+from path_makers import CARRIER, paths_along, random_directions
 
 import warprrf as wr
 from warprrf.rf.channel.beams import signal_over_interference
 from warprrf.rf.spectra.spectrum import pixel_directions
 
 WAVELENGTH_M = 299792458.0 / CARRIER
-
-
-def random_directions(count: int, seed: int = 0) -> np.ndarray:
-    return path_makers.random_directions(count, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize(("rows", "cols"), [(1, 1), (4, 4), (3, 8)])

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from furnished import RECEIVERS, ROOM, TX
+from path_makers import random_directions
 from radio_scenes import joined, mirror_paths
 
 from warprrf.geometry.mesh import Mesh
@@ -20,10 +21,8 @@ RX = RECEIVERS[0]
 def reflected_ways(count: int, mirrors: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Stops (L, k + 2, 3), normals and cosines (L, k, ...) of random chains that obey the law of reflection."""
     rng = np.random.default_rng(seed)
-    normal = rng.normal(size=(count, mirrors, 3))
-    normal /= np.linalg.norm(normal, axis=2, keepdims=True)
-    along = rng.normal(size=(count, 3))
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    normal = random_directions(count * mirrors, rng).reshape(count, mirrors, 3)
+    along = random_directions(count, rng)
     stops, cosine = [-along, np.zeros((count, 3))], []
     for k in range(mirrors):
         height = (along * normal[:, k]).sum(axis=1)

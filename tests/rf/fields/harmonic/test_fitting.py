@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from path_makers import random_directions
 from scipy.special import factorial, lpmv
 
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -187,9 +188,7 @@ def test_a_pixels_weight_is_the_sum_of_its_pairs_and_zero_without_any() -> None:
 def shell(count: int = 250, seed: int = 0) -> Gaussians:
     """Blobs on two shells around the origin: what lies behind shows only through the first."""
     rng = np.random.default_rng(seed)
-    direction = rng.normal(size=(count, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    distance = np.where(np.arange(count) % 2, 2.0, 4.0)
+    direction, distance = random_directions(count, rng), np.where(np.arange(count) % 2, 2.0, 4.0)
     return Gaussians(
         (direction * distance[:, None]).astype(np.float32),
         np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
