@@ -19,8 +19,9 @@ RECTANGLE = '<shape type="rectangle" id="{name}">{inside}</shape>'
 
 
 def written(folder: Path, body: str) -> Path:
+    """The file of a scene's inside, or of a text that begins as files do."""
     path = folder / "scene.xml"
-    path.write_text(f'<scene version="3.0.0">{body}</scene>')
+    path.write_text(body if body.startswith(("<?", "<!")) else f'<scene version="3.0.0">{body}</scene>')
     return path
 
 
@@ -188,6 +189,19 @@ def test_defaults_includes_and_merged_shapes_are_read(tmp_path: Path) -> None:
 
 CUBE = '<shape type="cube"><bsdf id="itu_wood"/>{}</shape>'
 HOSTILE = {
+    "encoding": ('<?xml version="1.0" encoding="no-such"?>', "unknown encoding"),
+    "external entity": (
+        '<!DOCTYPE s [<!ENTITY x SYSTEM "file:///etc/passwd">]>\n<x>&x;</x>',
+        "document type",
+    ),
+    "entities that multiply": (
+        "<!DOCTYPE s [<!ENTITY a '"
+        + "ha" * 50
+        + "'>"
+        + "".join(f"<!ENTITY {b} '{f'&{a};' * 40}'>" for a, b in zip("abcdef", "bcdefg", strict=True))
+        + "]>\n<x>&g;</x>",
+        "document type",
+    ),
     "depth": ("<a>" * 100_000 + "</a>" * 100_000, "nested more than"),
     "a name that grows": (
         '<default name="a" value="0000000000"/>'
