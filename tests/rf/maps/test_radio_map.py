@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.observations import Frame
 from warprrf.rf.maps.links import BeamSearch, directivity, links_of
 from warprrf.rf.maps.radio_map import QUANTITIES, RadioMap, is_free
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_solid_angles
@@ -25,10 +25,7 @@ PLACES = RECEIVERS[[0, 1, 3, 5, 9]]
 
 
 def prior(scene: object, effects: Effects) -> BistaticField:
-    known = SimpleNamespace(
-        transmitter=TX, frequency_hz=F, path_gain=np.zeros((1, *SHAPE)), floor=1e-16, range_db=(-150.0, -90.0),
-        beam_sigma_rad=SIGMA,
-    )  # fmt: skip
+    known = Frame(TX, F, SHAPE, 1e-16, (-150.0, -90.0), SIGMA, None)
     return BistaticField.prior(scene, known, effects=effects)
 
 

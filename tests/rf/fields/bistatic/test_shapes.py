@@ -1,7 +1,8 @@
 """Groups of a mesh without colours or names: what shape alone tells, how scans come in, and what it is worth."""
 
 import numpy as np
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined, tube
+from furnished import ROOM, spectra
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, tube
 from trimesh.remesh import subdivide_to_size
 
 from warprrf.geometry.mesh import Mesh
@@ -12,7 +13,6 @@ from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.tracing.shapes import shape_groups
 from warprrf.rf.tracing.surface import Surface
 
-ROOM = box_mesh([0, 0, 0], [5, 4, 3], inward=True)
 CUPBOARD = box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.2])
 DESK = box_mesh([0.6, 2.6, 0.7], [2.0, 3.3, 0.8])
 
@@ -123,10 +123,7 @@ def test_a_bare_mesh_is_nearly_as_good_as_one_with_names():
     scene = RadioScene(mesh, face_material, materials)
     r = np.random.default_rng(5)
     places = np.column_stack([r.uniform(0.4, 4.6, 14), r.uniform(0.4, 1.4, 14), r.uniform(0.9, 2.0, 14)])
-    ds = exact_spectra(
-        scene, places, transmitter=np.array([4.3, 3.4, 2.3]), frequency_hz=300e9, shape=(24, 48),
-        sigma=np.radians(5.0), sub_pixels=3,
-    )  # fmt: skip
+    ds = spectra(scene, places, transmitter=np.array([4.3, 3.4, 2.3]), sub_pixels=3)
     train, test = ds.subset(range(4)), ds.subset(range(4, 14))
     one = RadioScene(mesh, np.zeros(len(part), int), materials[:1])
 

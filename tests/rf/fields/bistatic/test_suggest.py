@@ -1,8 +1,9 @@
 """Where to measure next, and fields of no measurement."""
 
+import furnished
 import numpy as np
 import pytest
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined
 
 import warprrf as wr
 from warprrf.rf.em.materials import assumed_permittivity
@@ -28,15 +29,7 @@ def scene() -> RadioScene:
 
 
 def spectra(scene: RadioScene, places: np.ndarray) -> wr.SpectrumDataset:
-    return exact_spectra(
-        scene,
-        places,
-        transmitter=TX,
-        frequency_hz=CARRIER_HZ,
-        shape=(24, 48),
-        sigma=np.radians(5.0),
-        sub_pixels=2,
-    )
+    return furnished.spectra(scene, places, transmitter=TX, sub_pixels=2)
 
 
 @pytest.fixture(scope="module")
