@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from warprrf.rf.spectra.spectrum import pixel_solid_angles
 
 PLACES, OTHER = RECEIVERS[:6], TX + [0.4, 0.2, -0.3]
 F = np.linspace(299e9, 301e9, 5)
+MODELS = ["bistatic", "rf3dgs+", "rf3dgs"]
 ARRAYS = {
     "tx_array": wr.PlanarArray(1, 2),
     "rx_array": wr.PlanarArray(3, 1, pattern=wr.horn(0.9)),
@@ -28,7 +30,8 @@ ARRAYS = {
 }
 
 
-def fitted(model: str = "bistatic") -> wr.RadioField:
+@cache
+def fitted(model: str) -> wr.RadioField:
     walls, box = SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5), SlabMaterial("box", 6.0, 0.5, np.inf, 0.8)
     scene = furnished(walls, box)
     ds = spectra(scene, PLACES[:3], shape=(12, 24), sigma=0.15)
@@ -39,7 +42,7 @@ def fitted(model: str = "bistatic") -> wr.RadioField:
 
 @pytest.fixture(scope="module")
 def field() -> wr.RadioField:
-    return fitted()
+    return fitted("bistatic")
 
 
 @pytest.fixture(autouse=True)
@@ -60,10 +63,10 @@ def answers(field: wr.RadioField, folder: Path | None = None, **how: Any) -> lis
     ]  # fmt: skip
 
 
-def test_a_row_is_what_its_link_gets_alone_without_a_receiver_axis(
-    field: wr.RadioField, tmp_path: Path
-) -> None:
-    own, stored = np.array([TX, OTHER, TX, OTHER, OTHER, TX]), {}
+@pytest.mark.parametrize("model", MODELS)
+def test_a_row_is_what_its_link_gets_alone_without_a_receiver_axis(model: str, tmp_path: Path) -> None:
+    field, other = fitted(model), TX if model == "rf3dgs" else OTHER  # which knows its own transmitter alone
+    own, stored = np.array([TX, other, TX, other, other, TX]), {}
     verbs: dict[str, Any] = {
         "spectrum": lambda *at: field.spectrum(*at).path_gain, "links": lambda *at: field.links(*at).total_path_gain,
         "array": lambda *at: field.array_spectrum(at[0], wr.PlanarArray(2, 2), [[1.0, 0, 0]], at[1]),
@@ -73,18 +76,20 @@ def test_a_row_is_what_its_link_gets_alone_without_a_receiver_axis(
         "cfr": lambda at, source, **how: field.cfr(at, F, source, **ARRAYS, **how),
     }  # fmt: skip
     for name, ask in verbs.items():
-        rows, alone, shared = ask(PLACES, own), ask(PLACES[1], OTHER), ask(PLACES[1], own)
+        if name == "array" and model != "bistatic":
+            continue
+        rows, alone, shared = ask(PLACES, own), ask(PLACES[1], other), ask(PLACES[1], own)
         for row in (rows[1], shared[1], shared[3]):  # those of paths are padded
             row = row[: len(alone)] if alone.ndim else row
             np.testing.assert_allclose(row, alone, rtol=1e-5, atol=1e-6 * np.abs(alone).max(), err_msg=name)
         for _ in range(2 if name in ("spectra", "paths", "cfr") else 0):
-            np.testing.assert_array_equal(ask(PLACES[1], OTHER, store=tmp_path / name), alone)
+            np.testing.assert_array_equal(ask(PLACES[1], other, store=tmp_path / name), alone)
         stored[name] = rows
     assert wr.Paths.load(tmp_path / "paths").receiver.shape == (3,)
     np.testing.assert_allclose(
         stored["spectra"], stored["spectrum"], rtol=1e-6, atol=1e-6 * stored["spectrum"].max()
     )
-    np.testing.assert_array_equal(field.paths(PLACES, own, 5).transmitter, own)
+    assert (field.paths(PLACES, own, 5).transmitter == own).all()
     for cfr, *link in zip(stored["cfr"], PLACES, own, strict=True):
         np.testing.assert_allclose(
             cfr, field.paths(*link).cfr(F, **ARRAYS), rtol=1e-5, atol=1e-6 * np.abs(cfr).max()
@@ -116,7 +121,7 @@ def test_every_model_takes_what_the_base_says() -> None:
             assert not {"rx", "tx", "receiver", "transmitters"} & set(names), f
 
 
-@pytest.mark.parametrize("model", ["bistatic", "rf3dgs+", "rf3dgs"])
+@pytest.mark.parametrize("model", MODELS)
 def test_a_field_answers_on_any_grid(model: str) -> None:
     """A pixel's centre has its power per solid angle on every grid that has it; totals of scattering are the room's; floor
     and range are a pixel's."""
