@@ -18,7 +18,6 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.fit import trace
 from warprrf.rf.relevance.model import full_field
 from warprrf.rf.simulate import simulate
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -153,6 +152,12 @@ def test_single_bounces_of_a_field_have_their_rays_lengths(scene: RadioScene, dr
     )
 
 
+def dry_and_humid(field, shape):
+    """Views without air and with it, without mirrors, one ray a pixel."""
+    each = field, field.with_gas()
+    return [one.tracer().on_grid(shape, 1).view(SEEN, Effects(mirrors=0)) for one in each]
+
+
 def powers_by_ray(view: View, name: str, materials: Evaluation) -> np.ndarray:
     """Power of a table's records by the ray that sees them."""
     records = view.tables(Effects())[name]
@@ -163,9 +168,7 @@ def test_scattered_light_seen_in_a_mirror_has_all_three_legs(scene: RadioScene, 
     """And what elements send on evenly has the two from them; with one ray a pixel every ray goes on at mirrors."""
     field = BistaticField.prior(scene, dry)
     mesh, sides = field.surface.mesh, field.surface.side_group
-    views = [
-        one.tracer().on_grid((12, 24), 1).view(SEEN, Effects(mirrors=0)) for one in (field, field.with_gas())
-    ]
+    views = dry_and_humid(field, (12, 24))
     d = views[0].tracer.grid.directions
     first = mesh.cast(SEEN, d)
     normal = mesh.face_normals[first.face]
@@ -192,9 +195,7 @@ def test_light_that_mirrors_throw_has_its_images_length(dry: SpectrumDataset) ->
 
     mesh, part = joined(sheet(0.0, True), sheet(4.0, False))
     field = BistaticField.prior(RadioScene(mesh, part, [SlabMaterial("floor"), SlabMaterial("lid")]), dry)
-    views = [
-        one.tracer().on_grid((16, 32), 1).view(SEEN, Effects(mirrors=0)) for one in (field, field.with_gas())
-    ]
+    views = dry_and_humid(field, (16, 32))
     materials = Evaluation(field.parameters)
 
     def by_image(point: np.ndarray) -> np.ndarray:
@@ -268,14 +269,6 @@ def test_a_fit_takes_the_air_out_of_what_it_learns(
     np.testing.assert_array_equal(again.spectrum(SEEN).path_gain, field.spectrum(SEEN).path_gain)
     bare.save(tmp_path / "bare.safetensors")
     assert RadioField.load(tmp_path / "bare.safetensors").air is None
-
-
-def test_what_was_traced_in_other_air_is_refused(
-    scene: RadioScene, dry: SpectrumDataset, humid: SpectrumDataset
-) -> None:
-    seen = trace(scene, dry.subset([0, 1]))
-    with pytest.raises(ValueError, match="air and rays of this fit"):
-        RadioField.fit(scene, humid.subset([0, 1]), views=seen)
 
 
 def test_relevance_judges_the_air_by_itself(scene: RadioScene, humid: SpectrumDataset) -> None:

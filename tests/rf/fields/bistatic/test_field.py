@@ -8,6 +8,7 @@ import pytest
 from furnished import MATERIALS, RECEIVERS, ROOM, SHAPE, SIGMA, TX, F, spectra
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths, observation
 
+from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.fresnel import fresnel_curves, slab_transmission
 from warprrf.rf.em.materials import itu_material
 from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT
@@ -255,9 +256,13 @@ def test_duplicate_receivers_change_little(scene: RadioScene, data: SpectrumData
     assert np.sqrt(np.mean((a - b) ** 2)) < 0.5
 
 
-def test_what_was_traced_at_other_places_is_refused(scene: RadioScene, data: SpectrumDataset) -> None:
-    with pytest.raises(ValueError, match="views"):
-        RadioField.fit(scene, data.subset([1]), views=trace(scene, data.subset([0])))
+def test_what_was_traced_at_other_places_or_in_other_air_is_refused(
+    scene: RadioScene, data: SpectrumDataset
+) -> None:
+    humid = replace(data.subset([0]), attributes=Air().attributes)
+    for other in (data.subset([1]), humid):
+        with pytest.raises(ValueError, match="views.*air and rays of this fit"):
+            RadioField.fit(scene, other, views=trace(scene, data.subset([0])))
 
 
 def test_the_beam_operator_is_the_beam_of_every_pixel() -> None:
