@@ -338,15 +338,9 @@ def test_a_table_s_file_is_read_as_it_is_meant(tmp_path: Path) -> None:
     assert told[0].filename == __file__
 
 
-@pytest.mark.parametrize(
-    ("frequency_hz", "floor", "told"),
-    [(28, 1e-15, "expected hertz"), (F, 1e-9, "no value above the floor")],
-)
-def test_a_carrier_in_gigahertz_and_powers_all_at_the_floor_are_questioned(
-    frequency_hz: float, floor: float, told: str
-) -> None:
-    with pytest.raises(ValueError, match=told):
-        Readings(TX, RECEIVERS[:2], [1e-9, 1e-9], frequency_hz, floor)
+def test_a_carrier_in_gigahertz_is_questioned() -> None:
+    with pytest.raises(ValueError, match="expected hertz"):
+        Readings(TX, RECEIVERS[:2], [1e-9, 1e-9], 28, 1e-15)
 
 
 def test_a_cell_without_a_chain_is_a_calibrated_reading() -> None:
