@@ -199,8 +199,7 @@ def test_places_round_open_walls_and_lone_boxes_pass_and_in_a_box_do_not():
 
 
 @pytest.mark.parametrize("name", ["box", "box_one_screen", "box_two_screens"])
-def test_sionnas_boxes_of_sheets_are_rooms(name):
-    rt = pytest.importorskip("sionna.rt")
+def test_sionnas_boxes_of_sheets_are_rooms(name, rt):
     scene = wr.Scene.load(getattr(rt.scene, name))
     places = np.random.default_rng(0).uniform([-4.9, -4.9, 0.1], [4.9, 4.9, 4.9], (400, 3))
     assert scene.is_free(places).all()

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sionna_room import sionna_or_skip
 from twin_fields import BLOCKED, MATERIALS, SEES, SHAPE, SIGMA, TX, F, known_field, room
 
 import warprrf as wr
@@ -70,10 +69,7 @@ def test_materials_are_the_fields_own(twin):
         twin.groups[0].material.permittivity(140e9)
 
 
-def test_sionna_opens_the_scene_as_it_is_and_our_loader_sets_the_scattering_patterns_too(twin):
-    sionna_or_skip()
-    import sionna.rt as rt
-
+def test_sionna_opens_the_scene_as_it_is_and_our_loader_sets_the_scattering_patterns_too(twin, rt):
     bare = rt.load_scene(str(twin.xml), merge_shapes=False)
     loaded = wr.interop.load_sionna_scene(twin.xml, frequency_hz=F)
     assert loaded.frequency.numpy()[0] == pytest.approx(F)
@@ -91,8 +87,8 @@ def test_sionna_opens_the_scene_as_it_is_and_our_loader_sets_the_scattering_patt
         wr.interop.load_sionna_scene(twin.xml, frequency_hz=140e9)
 
 
+@pytest.mark.usefixtures("rt")
 def test_sionna_scatters_and_mirrors_as_the_field(twin, field):
-    sionna_or_skip()
     found = spectra(twin, [SEES], engine="sionna", depth=1, samples=400_000).path_gain[0]
     ours = field.spectrum(SEES).path_gain
     assert found.sum() == pytest.approx(ours.sum(), rel=0.01)
