@@ -1,6 +1,7 @@
 """Radio fields: the paper's equations by brute force, their scaling laws, paths, files, and resumed fits."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -203,11 +204,9 @@ def test_gaussians_that_nobody_saw_keep_the_median_gain(
     room: SimpleNamespace, spectra: SimpleNamespace
 ) -> None:
     g = room.gaussians
-    outside = Gaussians(
-        np.concatenate([g.means, [[50.0, 50, 50]]]), np.concatenate([g.quaternions, g.quaternions[:1]]),
-        np.concatenate([g.scales, g.scales[:1]]), np.concatenate([g.opacities, [0.0]]),
-        np.concatenate([g.sh, g.sh[:1]]),
-    )  # fmt: skip
+    parts = (g.means, g.quaternions, g.scales, g.opacities, g.sh)
+    outside = Gaussians(*(np.concatenate([part, part[:1]]) for part in parts))
+    outside.means[-1], outside.opacities[-1] = 50.0, 0.0
     found = HarmonicField.fit(SimpleNamespace(gaussians=outside, mesh=room.mesh), spectra, iterations=3)
     assert not found.layers["gain"][-1].any()
     seen = found.layers["gain"][:-1].any(axis=1)
@@ -217,24 +216,19 @@ def test_gaussians_that_nobody_saw_keep_the_median_gain(
 def test_a_killed_fit_goes_on_and_ends_with_the_same_bits_and_refuses_another_fits_checkpoint(
     room: SimpleNamespace, spectra: SimpleNamespace, tmp_path: Path
 ) -> None:
-    class Killed(Exception):
-        pass
-
     def killer(stage: str, done: int, total: int) -> None:
         if stage == "fit" and done == 70:
-            raise Killed
+            raise KeyboardInterrupt
 
-    file = tmp_path / "fit.safetensors"
-    whole = HarmonicField.fit(room, spectra, iterations=80, batch=4)
-    with pytest.raises(Killed):
-        HarmonicField.fit(room, spectra, iterations=80, batch=4, checkpoint=file, progress=killer)
+    file, steps = tmp_path / "fit.safetensors", []
+    fit = partial(HarmonicField.fit, room, spectra, iterations=80, batch=4)
+    whole = fit()
+    with pytest.raises(KeyboardInterrupt):
+        fit(checkpoint=file, progress=killer)
     with pytest.raises(ValueError, match="another fit|other data"):
-        HarmonicField.fit(room, spectra, iterations=80, batch=4, checkpoint=file, gain="linear")
+        fit(checkpoint=file, gain="linear")
     assert file.exists()
-    steps = []
-    resumed = HarmonicField.fit(
-        room, spectra, iterations=80, batch=4, checkpoint=file, progress=lambda s, d, t: steps.append((s, d))
-    )
+    resumed = fit(checkpoint=file, progress=lambda s, d, t: steps.append((s, d)))
     assert min(d for s, d in steps if s == "fit") == 51
     assert np.array_equal(whole.layers["gain"], resumed.layers["gain"])
     assert whole.report["losses"] == resumed.report["losses"]
