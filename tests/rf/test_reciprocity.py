@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from furnished import RECEIVERS, TX, F, furnished, spectra
 from path_makers import random_directions
-from radio_scenes import RadioScene, SlabMaterial
+from radio_scenes import SlabMaterial
 from twin_fields import known_field
 
 from warprrf.rf.em.fresnel import lobe
@@ -20,10 +20,6 @@ MATERIALS = [
     SlabMaterial("walls", 3.0, 0.5, 0.02, 0.5, "directive", 12),
     SlabMaterial("block", 6.0, 0.5, np.inf, 0.8),
 ]
-
-
-def room(*, reciprocal: bool) -> RadioScene:
-    return furnished(*(replace(m, reciprocal=reciprocal) for m in MATERIALS))
 
 
 @pytest.mark.parametrize("alpha", [0, 1, 4, 12, 30, 200])
@@ -63,7 +59,7 @@ def test_a_fields_scattered_power_is_the_same_both_ways():
 
 
 def test_a_fit_takes_reciprocal_lobes_and_its_file_says_so(tmp_path):
-    scene = room(reciprocal=True)
+    scene = furnished(*(replace(m, reciprocal=True) for m in MATERIALS))
     ds = spectra(scene, RECEIVERS[[0, 5]], shape=(20, 40), sub_pixels=4)
     field = RadioField.fit(scene, ds, quick=True, reciprocal=True)
     field.save(tmp_path / "field.safetensors")

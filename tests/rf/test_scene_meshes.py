@@ -76,11 +76,9 @@ def test_a_field_is_fitted_to_what_a_mesh_file_tells_apart(named: bool, tmp_path
     from warprrf.rf.tracing.surface import Surface
 
     path = painted_room(tmp_path, named)
-    up = "z"
-    mesh, scene = wr.Mesh.load(path, up=up), wr.Scene.load(path, up=up)
-    block = (mesh.triangles.mean(axis=1) > [2.1, 1.1, -1]).all(axis=1) & (
-        mesh.triangles.mean(axis=1) < [3.1, 2.9, 2.9]
-    ).all(axis=1)
+    mesh, scene = wr.Mesh.load(path, up="z"), wr.Scene.load(path, up="z")
+    middle = mesh.triangles.mean(axis=1)
+    block = ((middle > [2.1, 1.1, -1]) & (middle < [3.1, 2.9, 2.9])).all(axis=1)
     for geometry in (mesh, scene, wr.Reconstruction.from_files(mesh=mesh)):
         surface = Surface.of(geometry)
         face = mesh.closest(surface.mesh.triangles.mean(axis=1)).face
