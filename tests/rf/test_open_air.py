@@ -101,9 +101,8 @@ def test_a_ground_alone_is_open_air_and_rooms_are_not_even_with_holes():
     corridors = joined(
         box_mesh([0, 0, 0], [30, 2, 3], inward=True), box_mesh([28, 2, 0], [30, 30, 3], inward=True)
     )[0]
-    assert not is_open_air(
-        Mesh(corridors.vertices, corridors.faces[1:])
-    )  # most of its box has sky, and no ground
+    # Most of its box has sky, and no ground.
+    assert not is_open_air(Mesh(corridors.vertices, corridors.faces[1:]))
 
 
 def test_places_above_the_ground_follow_a_slope():

@@ -143,11 +143,8 @@ def test_only_what_a_closed_surface_holds_is_no_air_however_surfaces_are_wound(s
     places = rng.uniform(LOW + 0.05, HIGH - 0.05, (300, 3))
     parts, solid = [box_mesh(LOW, HIGH, inward=seed % 2 > 0)], np.zeros(len(places), bool)
     for _ in range(rng.integers(0, 4)):
-        low = rng.uniform(LOW, HIGH - 1.6) * [1, 1, rng.integers(2)] - [
-            0,
-            0,
-            0.02,
-        ]  # through the floor a little
+        # Through the floor a little.
+        low = rng.uniform(LOW, HIGH - 1.6) * [1, 1, rng.integers(2)] - [0, 0, 0.02]
         high = low + rng.uniform(0.3, 1.5, 3)
         parts.append(box_mesh(low, high, inward=rng.random() < 0.2))
         solid |= ((places > low) & (places < high)).all(axis=1)

@@ -49,10 +49,8 @@ def test_the_twin_answers_as_the_room_that_the_field_knows(twin, field, receiver
 
 
 def test_materials_are_the_fields_own(twin):
-    assert [group.name for group in twin.groups] == [
-        "walls",
-        "block/top <1>",
-    ]  # by area; no face, no material
+    # By area; no face, no material.
+    assert [group.name for group in twin.groups] == ["walls", "block/top <1>"]
     for group, given, weight in zip(twin.groups, MATERIALS, (0.25, 0.64), strict=False):
         assert group.permittivity.real == pytest.approx(given.relative_permittivity, rel=2e-3)
         assert group.scattering**2 == pytest.approx(weight, rel=2e-3)
@@ -154,9 +152,8 @@ def test_slabs_are_as_thick_as_the_scene_or_the_caller_says_and_else_let_nothing
     assert "block/top <1>" in found.left_out[0] and "walls" not in found.left_out[0]
     assert wr.Scene.load(found.xml).materials[0].thickness_m == pytest.approx(0.02)
     nowhere = replace(unknown, surface=replace(field.surface, thickness_m=np.full(3, np.nan)))
-    alike = replace(
-        nowhere, material=np.array([0, 0, 1])
-    )  # one material is one slab, however little is known
+    # One material is one slab, however little is known.
+    alike = replace(nowhere, material=np.array([0, 0, 1]))
     assert [group.name for group in wr.interop.write_twin(alike, tmp_path / "alike").groups] == ["walls"]
     given = wr.interop.write_twin(unknown, tmp_path / "given", thickness_m={"block/top <1>": 0.3})
     assert [group.thickness_m for group in given.groups] == [0.02, 0.3] and given.left_out == ()

@@ -61,9 +61,8 @@ def test_groups_do_not_depend_on_indices_winding_or_direction():
 
 
 def test_crumbs_join_the_nearest_piece_of_their_part():
-    ledge = box_mesh(
-        [0, 1.0, 1.0], [0.1, 1.3, 1.1]
-    )  # stands in the wall x = 0, linked to it by a corner's edge
+    # Stands in the wall x = 0, linked to it by a corner's edge.
+    ledge = box_mesh([0, 1.0, 1.0], [0.1, 1.3, 1.1])
     mesh, part = joined(ROOM, ledge)
     group, material, _ = groups_of(mesh)
     assert len(set(group[part == 1])) == 1  # a part of crumbs is one group
