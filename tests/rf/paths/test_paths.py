@@ -67,9 +67,8 @@ def test_angles_and_vertices_describe_the_same_polyline():
             np.testing.assert_allclose(paths.departure[r, k], steps[0] / lengths[0], atol=1e-12)
             np.testing.assert_allclose(paths.arrival[r, k], -steps[-1] / lengths[-1], atol=1e-12)
             for a, b in itertools.pairwise(steps / lengths[:, None]):
-                assert (
-                    np.abs(np.abs(a) - np.abs(b)) < 1e-9
-                ).all()  # an axis-aligned mirror only flips a sign
+                # An axis-aligned mirror only flips a sign.
+                assert (np.abs(np.abs(a) - np.abs(b)) < 1e-9).all()
 
 
 def test_swapping_the_ends_keeps_gain_and_delay():
@@ -125,12 +124,3 @@ def test_a_bare_mesh_reflects_perfectly_and_metal_does_almost():
         RadioScene(mesh, np.zeros(2, int), [SlabMaterial(conductivity=1e7, scattering=0.6)]), **ends
     )
     np.testing.assert_allclose(rough.power[1] / metal.power[1], 1 - 0.36, rtol=1e-3)
-
-
-def test_padding_is_marked():
-    mesh, _ = joined(square(1.0))
-    p = trace_paths(
-        mesh, transmitter=[0, 0, 1.0], receivers=[[0.2, 0, 1.5], [0, 9, 1.0]], frequency_hz=F, mirror_order=1
-    )
-    assert p.valid.tolist() == [[True, True], [True, False]]
-    assert p.gain[1, 1] == 0 and np.isnan(p.tau[1, 1]) and p.kind[1, 1] == ""
