@@ -1,8 +1,5 @@
 """Spectra of coherent arrays: what they are, and NeRF2's folders of pictures."""
 
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 from PIL import Image
@@ -12,7 +9,7 @@ from warprrf.rf.channel.arrays import PlanarArray
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     """Four pictures in NeRF2's layout, each with a bright spot; the gateway is turned by 90 degrees about z."""
     (tmp_path / "spectrum").mkdir()
     rows = ["x,y,z"]
@@ -31,7 +28,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_nerf2_folders_are_read_by_their_own_conventions(folder: Path) -> None:
+def test_nerf2_folders_are_read_by_their_own_conventions(folder):
     known = ArraySpectra.load(folder, frequency_hz=920e6)
     assert known.power.shape == (4, 9, 36)
     assert known.power[2, 3, 18] == 1.0
@@ -64,7 +61,7 @@ def test_nerf2_folders_are_read_by_their_own_conventions(folder: Path) -> None:
         (lambda p: Image.new("L", (35, 9)).save(p / "spectrum" / "3.png"), r"3\.png.*first spectrum"),
     ],
 )  # fmt: skip
-def test_broken_folders_name_the_file(folder: Path, break_it: Callable[[Path], None], said: str) -> None:
+def test_broken_folders_name_the_file(folder, break_it, said):
     break_it(folder)
     with pytest.raises((ValueError, FileNotFoundError), match=said):
         ArraySpectra.load(folder, frequency_hz=920e6)
@@ -85,7 +82,7 @@ GOOD = {
         ("directions", 2.0 * hemisphere((5, 7)), "unit vectors"),
     ],
 )
-def test_wrong_arguments_are_named(name: str, value: object, said: str) -> None:
+def test_wrong_arguments_are_named(name, value, said):
     assert len(ArraySpectra(**GOOD).subset([1])) == 1
     with pytest.raises(ValueError, match=said):
         ArraySpectra(**{**GOOD, name: value})

@@ -12,7 +12,7 @@ SHAPE = (10, 20)
 FLOOR = 1e-12
 
 
-def training_set(positions: list[list[float]], gains: list[float]) -> SpectrumDataset:
+def training_set(positions, gains):
     if not gains:
         return SpectrumDataset.empty(transmitter=[9.0, 9.0, 9.0], frequency_hz=1e9, shape=SHAPE)
     found = SpectrumDataset.from_spectra(
@@ -23,7 +23,7 @@ def training_set(positions: list[list[float]], gains: list[float]) -> SpectrumDa
     return replace(found, range_db=(-120.0, -60.0))
 
 
-def test_nearest_copies_gain_and_delay_of_the_nearest_receiver() -> None:
+def test_nearest_copies_gain_and_delay_of_the_nearest_receiver():
     ds = training_set([[0, 0, 0], [5, 0, 0]], [1e-8, 1e-9])
     spectrum = lookups.nearest(ds)([3.0, 0.0, 0.0])
     assert spectrum.path_gain[0, 0] == pytest.approx(1e-9)
@@ -47,14 +47,12 @@ def test_idw_is_the_weighted_mean_of_its_domain_and_a_training_spectrum_at_its_o
     ("gains", "better"),
     [([1e-8, 1e-9, 1e-10], "db"), ([1.0e-8, 5.05e-9, 1.0e-10], "linear")],
 )
-def test_idw_chooses_the_domain_that_predicts_left_out_receivers_better(
-    gains: list[float], better: str
-) -> None:
+def test_idw_chooses_the_domain_that_predicts_left_out_receivers_better(gains, better):
     ds = training_set([[0, 0, 0], [1, 0, 0], [2, 0, 0]], gains)
     assert lookups.idw(ds).note.startswith(f"averaged in {better}")
 
 
-def test_constant_and_mean_are_averages_of_decibels() -> None:
+def test_constant_and_mean_are_averages_of_decibels():
     ds = training_set([[0, 0, 0], [1, 0, 0]], [1e-8, 1e-10])
     ds.path_gain[0, 0] = 1e-7
     level = 10 * np.log10(ds.path_gain + FLOOR)

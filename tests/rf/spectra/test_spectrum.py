@@ -114,7 +114,7 @@ def test_bad_paths_are_refused():
 
 
 @pytest.mark.parametrize("sigma", [np.radians(2.0), np.radians(0.05), 1.2])
-def test_beams_made_at_once_are_those_made_one_by_one(sigma: float) -> None:
+def test_beams_made_at_once_are_those_made_one_by_one(sigma):
     # A pole, and the seam.
     directions = np.concatenate([random_directions(10, 4), [[0, 0, 1], [-1, 1e-9, 0]]])
     together = unit_beams(directions, (30, 60), sigma)

@@ -17,11 +17,11 @@ CUPBOARD = box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.2])
 DESK = box_mesh([0.6, 2.6, 0.7], [2.0, 3.3, 0.8])
 
 
-def groups_of(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def groups_of(mesh):
     return shape_groups(mesh, planar_patches(mesh).face_patch)
 
 
-def as_partition(label: np.ndarray) -> set[frozenset[int]]:
+def as_partition(label):
     return {frozenset(np.flatnonzero(label == k).tolist()) for k in np.unique(label)}
 
 
@@ -80,7 +80,7 @@ def test_tops_of_one_height_mirror_for_the_thing_they_are_of():
     assert surface.patch_group[first] != surface.patch_group[second]
 
 
-def scan(edge_m: float = 0.07, error_m: float = 0.02) -> Mesh:
+def scan(edge_m=0.07, error_m=0.02):
     """The furnished room as a scanner gives it: small faces, vertices with errors, holes."""
     r = np.random.default_rng(3)
     vertices, faces = subdivide_to_size(*ROOM, edge_m)
@@ -126,7 +126,7 @@ def test_a_bare_mesh_is_nearly_as_good_as_one_with_names():
     train, test = ds.subset(range(4)), ds.subset(range(4, 14))
     one = RadioScene(mesh, np.zeros(len(part), int), materials[:1])
 
-    def psnr_db(geometry) -> float:
+    def psnr_db(geometry):
         field = RadioField.fit(geometry, train, sub_pixels=2)
         return evaluate(test, field.spectrum)["psnr_db"]
 
