@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 import warprrf as wr
-from fuzz.place import ANGLES, POINTS, READINGS, TOWARDS, Place
+from fuzz.place import POINTS, READINGS, TOWARDS, Place
 from warprrf.rf.fields import BistaticField, HarmonicField
 from warprrf.rf.fields.bistatic.fit import FitOptions
 from warprrf.rf.fields.harmonic.options import FieldOptions
@@ -33,7 +33,7 @@ FIELDS = (BistaticField, FitOptions, HarmonicField, FieldOptions)
 OPTIONS_OF = ("FitOptions", "FieldOptions")
 """Classes whose options are what is public of them."""
 SERVERS = ("view",)
-"""What starts a server for each call: the law of messages, and tests/viewer, have its refusals."""
+"""What starts a server for each call: tests/viewer has its refusals."""
 SPREADS = ("channel.angular_spread", "channel.coherence_bandwidth", "channel.delay_spread")
 """What is NaN where there is no power, as their documentation says."""
 ABSTRACT = ("RadioField", "BistaticField", "HarmonicField")
@@ -223,14 +223,9 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     # materials and air
     "Material.custom": lambda p: {"name": "stone", "relative_permittivity": 5.0},
     "Air.from_attributes": lambda p: {"attributes": wr.Air().attributes},
-    "Air.transmittance": lambda p: {"length_m": np.array([1.0, 2.0])},
     "em.Band.widened": lambda p: {"low_hz": 1e8, "high_hz": 1e9},
-    "em.itu_material": lambda p: {"itu": "concrete"},
     "em.load_materials": lambda p: {"path": p.folder / "materials.json"},
     "em.lobe": lambda p: {"alpha_r": 4, "cos_incidence": 0.5, "cos_scatter": 0.5, "cos_to_mirror": 0.9},
-    "em.roughness_scattering": lambda p: {"roughness_m": 1e-4},
-    "em.slab_reflection": lambda p: {"permittivity": 5.0 - 0.1j},
-    "em.slab_transmission": lambda p: {"permittivity": 5.0 - 0.1j},
     # measurements
     "Readings.from_table": lambda p: {
         "table": {
@@ -243,7 +238,6 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "Readings": lambda p: READINGS,
     "Readings.load": lambda p: {"path": p.folder / "readings.csv", "frequency_hz": 300e9, "floor": 1e-14},
     "channel.ArraySpectra.load": lambda p: {"path": p.folder / "pictures", "part": "train"},
-    "channel.ArraySpectra.subset": lambda p: {"rows": np.array([0])},
     "SpectrumDataset.deembed": lambda p: {
         "self": p.train.subset([0]), "pattern": np.cos(np.linspace(0, np.pi / 2, 19)) ** 8, "iterations": 20,
         "snapshots": 1, "tolerance": 1e-2,
@@ -283,7 +277,6 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     },
     "RadioMap.load": lambda p: {"path": p.folder / "map.nc"},
     "RadioMap.picture": lambda p: {"path": "map.png"},
-    "RadioMap.plot_values": lambda p: {"quantity": "total_path_gain"},
     "Relevance.load": lambda p: {"path": p.folder / "relevance.json"},
     # channels
     "Paths.as_several": lambda p: {"self": p.paths.row(0)},
@@ -301,12 +294,9 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "Paths.stack": lambda p: {"parts": [p.paths.row(0), p.paths.row(1)]},
     "Paths.taps": lambda p: {"bandwidth_hz": 1e9, "l_min": -2, "l_max": 40, **LINK},
     "Paths.to_sionna": lambda p: {"tx_array": p.array},
-    "channel.Codebook.power": lambda p: {"powers": np.array([1e-9, 1e-10])},
     "channel.Codebook.received": lambda p: {"channel": np.ones((4, 4), complex)},
     "channel.Codebook.superposed": lambda p: {"gains": np.array([1e-5, 1e-5j])},
     "channel.beam_gains": lambda p: {"tx_array": p.codebook, "rx_array": p.array},
-    "channel.angular_spread": lambda p: {"angle": ANGLES},
-    "channel.plane_wave_error": lambda p: {"distance_m": 3.0},
     "channel.precoded_sinr": lambda p: {"weights": np.ones((2, 4), complex) / 2},
     "channel.select_beams": lambda p: {"tx_array": p.codebook, "rx_array": p.array},
     "channel.select_beams_multiuser": lambda p: {"tx_array": p.codebook, "rx_array": p.array, "noise": 1e-12},
@@ -314,7 +304,6 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
         "gains": [np.ones((2, 4)), np.ones((2, 4))], "rx": np.array([0, 1]),
     },
     "channel.steering_codebook": lambda p: {"directions": TOWARDS},
-    "channel.thz_channel": lambda p: {"number": 69},
     "channel.transmit_covariance": lambda p: {"rx_array": p.array, "rx": np.zeros(3, int)},
     # interop
     "interop.SionnaPaths.cfr": lambda p: {"frequencies": np.linspace(-1e9, 1e9, 8)},
@@ -324,9 +313,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "interop.write_deepmimo": lambda p: {"scene": p.scene},
     # metrics
     "metrics.angle_deg": lambda p: {"a": TOWARDS, "b": TOWARDS[::-1].copy()},
-    "metrics.beam_gain_loss_db": lambda p: {"direction": TOWARDS[0]},
     "metrics.rmse_db": lambda p: {"prediction_db": p.path_gain - 100, "truth_db": p.path_gain - 90},
     "metrics.unit_image": lambda p: {"floor": 1e-14, "range_db": (-140.0, -70.0)},
-    "metrics.weighted_median": lambda p: {"values": ANGLES, "weights": np.ones(5)},
 }  # fmt: skip
 """What calls are given in place of what the place has by the names of their arguments."""

@@ -102,9 +102,8 @@ def damage(path: Path, codec: str, edits: tuple[Edit, ...]) -> None:
             tree = unpack(path)
             _edit_tree(tree, name, a, b)
             pack(path, tree)
-        except (
-            Exception
-        ) as error:  # an earlier edit broke it, or whatever writers trip over: there is no such file
+        # An earlier edit broke it, or whatever writers trip over: there is no such file.
+        except Exception as error:
             raise Unfit(str(error)) from error
 
 

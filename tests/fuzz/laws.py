@@ -4,14 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import io
-import os
 import pickle
-import re
-import shutil
-import time
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -27,7 +22,6 @@ from fuzz.answers import differs, leaves
 from fuzz.calls import CLASSES
 from fuzz.files import Edit, Unfit
 from fuzz.place import POINTS, TOWARDS, Place
-from fuzz.values import PLAIN
 from warprrf import cli
 
 
@@ -151,48 +145,6 @@ def _free_places(place: Place, edits: tuple[Edit, ...]) -> str:
     return "; ".join([base, *(text for text, count in bad.items() if count)]) if any(bad.values()) else ""
 
 
-@cache
-def _model(place: Place, name: str) -> wr.RadioField:
-    return wr.RadioField.load(place.folder / f"{name}.safetensors", device="cpu")
-
-
-VERBS: dict[str, Callable[..., Any]] = {
-    "spectrum": lambda field, **k: field.spectrum(**k),
-    "spectra": lambda field, **k: field.spectra(**k),
-    "paths": lambda field, **k: field.paths(**k, max_paths=9),
-    "cfr": lambda field, **k: field.cfr(**k, frequencies_hz=[300e9], diffuse="power", max_paths=9),
-    "links": lambda field, **k: field.links(**k),
-}
-STORED = ("spectra", "paths", "cfr")
-
-
-def _emptied() -> Path:
-    shutil.rmtree("case", ignore_errors=True)
-    Path("case").mkdir()
-    return Path("case")
-
-
-def _one_receiver(place: Place, edits: tuple[Edit, ...]) -> str:
-    """Every verb of every model takes receivers= and transmitter= by these names; one receiver (3,) has no axis."""
-    verb, a, b = edits[0]
-    field = _model(place, ("bistatic", "harmonic", "rf3dgs")[a % 3])
-    more: dict[str, Any] = {"transmitter": TRANSMITTER} if b % 2 else {}
-    keep = b // 2 % 2 and verb in STORED
-    found = []
-    for k, at in enumerate((POINTS[a // 3 % 3], POINTS[a // 3 % 3][None])):
-        store = {"store": _emptied() / f"{k}.nc"} if keep else {}
-        found.append(leaves(VERBS[verb](field, receivers=at, **more, **store)))
-    one, row = found
-    own = [where for where in one if where in row and one[where].shape != row[where].shape[1:]]
-    own = [where for where in own if row[where].shape[:1] == (1,)]
-    if own or one.keys() != row.keys():
-        return f"one receiver has {own[:3] or one.keys() ^ row.keys()} of another shape than a row of one"
-    bad = [
-        w for w in one if not np.allclose(one[w], row[w].reshape(one[w].shape), 1e-5, 1e-30, equal_nan=True)
-    ]
-    return f"one receiver gets other values than a row of one: {bad[:3]}" if bad else ""
-
-
 def _patterns(place: Place, edits: tuple[Edit, ...]) -> str:
     """A pattern that is a function gives what its samples give, wherever one is taken."""
     verb, a, _ = edits[0]
@@ -206,9 +158,9 @@ def _element(pattern: Any) -> wr.PlanarArray:
 
 
 def _kept(place: Place, pattern: Any) -> Any:
-    store = _emptied() / "cfr.nc"
+    Path("cfr.nc").unlink(missing_ok=True)
     return place.field.cfr(
-        POINTS, [300e9], tx_array=_element(pattern), diffuse="power", max_paths=9, store=store
+        POINTS, [300e9], tx_array=_element(pattern), diffuse="power", max_paths=9, store="cfr.nc"
     )
 
 
@@ -228,34 +180,6 @@ PATTERNS: dict[str, Callable[[Place, Any], Any]] = {
         place.train.subset([0]).deembed(pattern=pattern, iterations=10, tolerance=1e-2).path_gain
     ),
 }  # fmt: skip
-
-
-def _powers(place: Place, edits: tuple[Edit, ...]) -> str:
-    """Powers that no passive room can give are told, by who reads them or who fits; those that it can give are not."""
-    kind, a, b = edits[0]
-    source = np.array(TRANSMITTER)
-    at = np.array(place.spectra.receivers[:4])
-    free_db = 20.0 * np.log10(1e-3 / (4.0 * np.pi * np.linalg.norm(at - source, axis=1)))
-    db, wrong = free_db + 0.5, b % 4 > 0
-    if wrong:  # a lost sign; 20 dB and more above free space; dBm of a strong transmitter
-        db = (-db, free_db + 20.0 + a % 30, free_db + 43.0)[b % 4 - 1]
-    if kind == "spectra":
-        gain = np.array(place.train.path_gain[:4], dtype=float)
-        gain *= (10.0 ** (db / 10.0) / gain.sum(axis=(1, 2)))[:, None, None]
-        ds = place.train.subset([0, 1, 2, 3])
-        given = {
-            name: getattr(ds, name) for name in ("receivers", "transmitter", "frequency_hz", "beam_sigma_rad")
-        }
-        said = _told(lambda: _fit(place.scene, wr.SpectrumDataset.from_spectra(path_gain=gain, **given)))
-    else:
-        table = dict(zip(COLUMNS[:6], np.column_stack([np.tile(source, (4, 1)), at]).T, strict=True))
-        setting = {"frequency_hz": 300e9, "floor": 1e-17}
-        table["power_db"] = db
-        said = _told(lambda: _fit(place.scene, wr.Readings.from_table(table, **setting)))
-    told = re.search(r"power|path_gain|path gain", said)
-    if bool(told) == wrong:
-        return ""
-    return f"{kind} of {db.max() - free_db.max():.0f} dB above free space: {said or 'nothing'!r} is said"
 
 
 COLUMNS = (
@@ -320,7 +244,6 @@ def _table(place: Place, edits: tuple[Edit, ...]) -> str:
 
 PICKLED: dict[str, Callable[[Place], Any]] = {
     "horn": lambda place: wr.horn(0.2),
-    "harmonic": lambda place: _model(place, "harmonic"),
     "idw": lambda place: wr.lookups.idw(place.train),
     "constant": lambda place: wr.lookups.constant(place.train),
     "mean": lambda place: wr.lookups.mean(place.train),
@@ -337,48 +260,6 @@ def _pickles(place: Place, edits: tuple[Edit, ...]) -> str:
     return differs(leaves(again), leaves(held)) if type(again) is type(held) else f"a {type(again).__name__}"
 
 
-@cache
-def _viewer(place: Place) -> Any:
-    return wr.view(place.mesh, port=20000 + os.getpid() % 20000)
-
-
-MESSAGES = ("position", "name", "type", "wxyz", "none such")
-
-
-def _messages(place: Place, edits: tuple[Edit, ...]) -> str:
-    """Whatever a page sends, the next drag is answered."""
-    import msgspec
-    import viser
-    from websockets.exceptions import ConnectionClosed
-    from websockets.sync.client import connect
-
-    drag: dict[str, Any] = {
-        "type": "TransformControlsUpdateMessage",
-        "name": "/receiver",
-        "wxyz": [1, 0, 0, 0],
-    }
-    values = [v for v in PLAIN.values() if v != 10**40]
-    wild = drag | {"position": [1.0, 1.0, 1.0]}
-    for name, a, b in edits:
-        value = values[a % len(values)]
-        wild[name] = (value, [value] * 3, {"a": value}, [1.0, 2.0, value])[b % 4]
-    right = np.array([1.0, 1.0, 1.0 + edits[0][1] % 1000 / 1e3])
-    viewer = _viewer(place)
-    host = viewer.url.split("/")[2]
-    page = {"origin": f"http://{host}", "subprotocols": [f"viser-v{viser.__version__}"]}
-    with suppress(ConnectionClosed), connect(f"ws://{host}", **page, max_size=None, max_queue=None) as sender:
-        for message in (wild, drag | {"position": right.tolist()}):
-            sender.send(msgspec.msgpack.encode(message))
-        end = time.monotonic() + 20.0
-        while time.monotonic() < end:
-            if viewer.last is not None and np.array_equal(viewer.last.receiver, right):
-                return ""
-            time.sleep(0.01)
-    _viewer.cache_clear()  # it answers no more
-    viewer.close()
-    return f"after {wild} no drag is answered"
-
-
 COMMANDS = {
     "simulate": "{0}/scene.xml -o x.nc --transmitter 0.8 0.9 2.2 --receivers 1,1,1.5 --shape 6 12",
     "fit": "{0}/scene.xml {0}/spectra.nc -o f.safetensors --quick --train 2",
@@ -389,23 +270,7 @@ COMMANDS = {
     "render": "{0}/bistatic.safetensors --receiver 1 1 1.5 -o r.npz",
     "relevance": "{0}/scene.xml --spectra {0}/spectra.nc --most 1 -o rel.json",
 }  # fmt: skip
-WORDS = (
-    "",
-    "nonsense",
-    "-1",
-    "0",
-    "nan",
-    "1e999",
-    "--none",
-    "=",
-    "1,2",
-    "1,2,3,4",
-    ".",
-    "none.nc",
-    "x" * 300,
-    "\0",
-    "é",
-)
+WORDS = [*"nonsense -1 0 nan 1e999 --none = 1,2 1,2,3,4 . none.nc é".split(), "", "x" * 300, "\0"]
 
 
 def _command(place: Place, edits: tuple[Edit, ...]) -> str:
@@ -434,12 +299,9 @@ def _command(place: Place, edits: tuple[Edit, ...]) -> str:
 LAWS: dict[str, Law] = {
     "rooms": Law(list(rooms.LAWS), _rooms),
     "free places": Law(["none", "sheet", "sheet", "solid"], _free_places),
-    "one receiver": Law(list(VERBS), _one_receiver, 1),
     "patterns": Law(list(PATTERNS), _patterns, 1),
-    "powers": Law(["spectra", "readings"], _powers, 1),
     "table": Law(TABLE, _table),
     "pickles": Law([*CLASSES, *PICKLED], _pickles, 1),
-    "messages": Law(MESSAGES, _messages),
     "command line": Law(list(COMMANDS), _command),
 }
 """By name."""

@@ -30,6 +30,8 @@ GIVEN: dict[str, Any] = {
     "cos_incidence": np.cos(ANGLES / 2), "thickness_m": 0.1, "tau": 1e-8 * ANGLES, "tx": np.array([0, 1]),
     "power": np.array([1e-9, 2e-9, 5e-10, 1e-10, 0.0]), "rows": np.array([0, 2]), "indices": np.array([0, 1]),
     "materials": (wr.Material.conductor(),) * 2, "path": "saved", "home": "folder", "reach_m": 1e-3,
+    "permittivity": 5.0 - 0.1j, "roughness_m": 1e-4, "itu": "concrete", "angle": ANGLES, "distance_m": 3.0, "values": ANGLES,
+    "weights": np.ones(5), "length_m": np.array([1.0, 2.0]), "quantity": "total_path_gain", "powers": np.array([1e-9, 1e-10]),
 }  # fmt: skip
 """What arguments are given, by their names."""
 
@@ -125,10 +127,6 @@ def _uploaded(p: Place) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _unit(p: Place) -> np.ndarray:
-    return wr.metrics.unit_image(p.path_gain, p.spectra.floor, p.spectra.range_db)
-
-
 RNG = np.random.default_rng(0)
 READINGS: dict[str, Any] = {
     "transmitters": TRANSMITTER, "receivers": POINTS[0], "power": np.array([1e-8, 1e-9, 1e-10]), "frequency_hz": 300e9,
@@ -163,7 +161,7 @@ MADE: dict[str, Callable[[Place], Any]] = {
     "map": lambda p: wr.RadioMap.load(p.folder / "map.nc"),
     "relevance": lambda p: wr.Relevance.load(p.folder / "relevance.json"),
     "path_gain": lambda p: np.asarray(p.spectra.path_gain[0], dtype=float),
-    "prediction": _unit,
+    "prediction": lambda p: wr.metrics.unit_image(p.path_gain, p.spectra.floor, p.spectra.range_db),
     "truth": lambda p: p.prediction[::-1].copy(),
     "raster": lambda p: wr.splats.Rasterizer(device="cpu"),
     "uploaded": _uploaded,

@@ -91,16 +91,8 @@ class Trial:
         if isinstance(answer, Exception):
             paths = [changed[name] for name, _ in case.edits if isinstance(changed[name], str)]
             method = case.target.rpartition(".")[2]
-            return refused(
-                answer,
-                [
-                    *given,
-                    *paths,
-                    method,
-                    *calls.PARTS.get(method, ()),
-                    *(["field"] if "self" in changed else []),
-                ],
-            )
+            owner = ["field"] if "self" in changed else []
+            return refused(answer, [*given, *paths, method, *calls.PARTS.get(method, ()), *owner])
         values = {value for _, value in case.edits}
         unknown = case.target in calls.SPREADS and not np.asarray(changed["power"]).any()
         bad = "" if unknown or values & NOT_FINITE else wrong(answer, usual or {})

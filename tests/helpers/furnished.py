@@ -24,6 +24,5 @@ def furnished(*materials):
 
 
 def spectra(scene, receivers=RECEIVERS, **options):
-    """Spectra of ``receivers``."""
     given = {"transmitter": TX, "frequency_hz": F, "shape": SHAPE, "sigma": SIGMA} | options
     return exact_spectra(scene, receivers, **given)

@@ -8,8 +8,9 @@ from warprrf.rf.spectra.spectrum import angles_from_directions
 CARRIER = 287.28e9
 
 
-def random_directions(count, rng):
-    d = rng.normal(size=(count, 3))
+def random_directions(count, seed=0):
+    """Unit vectors of a seed or a generator."""
+    d = np.random.default_rng(seed).normal(size=(count, 3))
     return d / np.linalg.norm(d, axis=1, keepdims=True)
 
 

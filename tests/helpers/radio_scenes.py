@@ -84,7 +84,6 @@ def exact_spectra(scene, receivers, *, transmitter, frequency_hz, shape, sigma, 
 
 
 def object_faces(scene, name):
-    """Indices of the faces of one object."""
     return np.flatnonzero(scene.face_object == scene.object_names.index(name))
 
 

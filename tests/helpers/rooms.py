@@ -152,7 +152,6 @@ def moved(
 
 
 def shifted(*metres: float) -> Change:
-    """Somewhere else."""
     return moved(Rotation.identity(), shift=metres)
 
 

@@ -20,6 +20,16 @@ def sionna_or_skip():
     return SionnaEngine
 
 
+def placed(rt, live, transmitter, receivers, array=None):
+    """A scene of Sionna's with a transmitter and receivers, of one element of both polarisations unless told."""
+    one = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="VH")
+    live.tx_array = live.rx_array = array or one
+    live.add(rt.Transmitter("tx", position=[float(x) for x in transmitter]))
+    for k, point in enumerate(receivers):
+        live.add(rt.Receiver(f"rx{k}", position=[float(x) for x in point]))
+    return live
+
+
 def write_xml(folder, parts):
     """Named parts, each of an ITU material and its vertices and faces, as PLY files and the XML that Sionna reads."""
     shapes = ""

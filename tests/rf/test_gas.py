@@ -4,7 +4,6 @@ At 380.2 GHz, on a line of water vapour, standard air takes 0.3 dB a metre: enou
 """
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.fit import trace
 from warprrf.rf.relevance.model import full_field
 from warprrf.rf.simulate import simulate
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -27,7 +25,6 @@ from warprrf.rf.spectra.spectrum import to_db
 from warprrf.rf.tracing.model import SETS, Effects, Parameters
 from warprrf.rf.tracing.records import Evaluation
 from warprrf.rf.tracing.surface import Surface
-from warprrf.rf.tracing.tracer import View
 
 F = 380.2e9
 WAVELENGTH = SPEED_OF_LIGHT / F
@@ -38,7 +35,7 @@ BLOCKED, SEEN = RECEIVERS[0], RECEIVERS[4]
 SINGLE = replace(SETS["single"], residual=False)
 
 
-def spectra(scene: RadioScene, **options: object) -> SpectrumDataset:
+def spectra(scene, **options):
     return simulate(
         scene, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=np.radians(5.0), floor=1e-14,
         **({"receivers": RECEIVERS} | options),
@@ -46,28 +43,28 @@ def spectra(scene: RadioScene, **options: object) -> SpectrumDataset:
 
 
 @pytest.fixture(scope="module")
-def dry(scene: RadioScene) -> SpectrumDataset:
+def dry(scene):
     return spectra(scene)
 
 
 @pytest.fixture(scope="module")
-def humid(scene: RadioScene) -> SpectrumDataset:
+def humid(scene):
     return spectra(scene, gas=True)
 
 
-def passed(length_m: np.ndarray | float) -> np.ndarray:
+def passed(length_m):
     return 10.0 ** (-LOSS * np.asarray(length_m) / 10.0)
 
 
-def friis(place: np.ndarray) -> float:
+def friis(place):
     return (WAVELENGTH / (4.0 * np.pi * np.linalg.norm(place - TX))) ** 2
 
 
-def engine(scene: RadioScene, gas: object) -> ExactEngine:
+def engine(scene, gas):
     return ExactEngine(scene, transmitter=TX, frequency_hz=F, shape=SHAPE, gas=gas)
 
 
-def test_line_of_sight_is_friis_times_gas_and_mirrors_have_their_images_length(scene: RadioScene) -> None:
+def test_line_of_sight_is_friis_times_gas_and_mirrors_have_their_images_length(scene):
     distance = np.linalg.norm(SEEN - TX)
     with_air, without = engine(scene, True), engine(scene, False)
     direct = with_air.mirrors.trace(SEEN, 0).with_gas(with_air.air).power.sum()
@@ -79,7 +76,7 @@ def test_line_of_sight_is_friis_times_gas_and_mirrors_have_their_images_length(s
     assert with_air.receive(SEEN).path_gain.sum() == pytest.approx(expected, rel=1e-9)
 
 
-def test_every_scattered_path_has_its_own_length(scene: RadioScene) -> None:
+def test_every_scattered_path_has_its_own_length(scene):
     with_air, without = engine(scene, True).diffuse(BLOCKED), engine(scene, False).diffuse(BLOCKED)
     np.testing.assert_array_equal(with_air.direction, without.direction)
     point = TX + without.departure
@@ -88,9 +85,7 @@ def test_every_scattered_path_has_its_own_length(scene: RadioScene) -> None:
     np.testing.assert_allclose(with_air.power, without.power * passed(length), rtol=1e-12)
 
 
-def test_off_is_off_and_files_say_which(
-    scene: RadioScene, dry: SpectrumDataset, humid: SpectrumDataset, tmp_path: Path
-) -> None:
+def test_off_is_off_and_files_say_which(scene, dry, humid, tmp_path):
     some: dict = {"receivers": RECEIVERS[:2], "workspace": tmp_path}
     off = spectra(scene, gas=False, **some)
     np.testing.assert_array_equal(off.path_gain, dry.path_gain[:2])
@@ -106,7 +101,7 @@ def test_off_is_off_and_files_say_which(
     assert SpectrumDataset.load(tmp_path / "on.nc").air == thick == on.subset([1, 0]).air
 
 
-def test_sionnas_paths_lose_by_their_delay(tmp_path: Path) -> None:
+def test_sionnas_paths_lose_by_their_delay(tmp_path):
     from sionna_room import sionna_or_skip, write_scene
 
     sionna = sionna_or_skip()
@@ -123,7 +118,7 @@ def test_sionnas_paths_lose_by_their_delay(tmp_path: Path) -> None:
     np.testing.assert_allclose(on.power, off.power * passed(off.length_m), rtol=1e-9)
 
 
-def test_a_field_of_line_of_sight_is_friis_times_gas(scene: RadioScene, humid: SpectrumDataset) -> None:
+def test_a_field_of_line_of_sight_is_friis_times_gas(scene, humid):
     field = BistaticField.prior(scene, humid, effects=Effects(mirrors=0, scatterings=0))
     assert field.air == AIR
     distance = np.linalg.norm(SEEN - TX)
@@ -137,7 +132,7 @@ def test_a_field_of_line_of_sight_is_friis_times_gas(scene: RadioScene, humid: S
     assert bare == pytest.approx(expected / passed(distance), rel=1e-5)
 
 
-def test_single_bounces_of_a_field_have_their_rays_lengths(scene: RadioScene, dry: SpectrumDataset) -> None:
+def test_single_bounces_of_a_field_have_their_rays_lengths(scene, dry):
     field = BistaticField.prior(scene, dry, effects=replace(SINGLE, mirrors=2))
     humid = field.with_gas()
     view = field.view(BLOCKED)
@@ -153,19 +148,23 @@ def test_single_bounces_of_a_field_have_their_rays_lengths(scene: RadioScene, dr
     )
 
 
-def powers_by_ray(view: View, name: str, materials: Evaluation) -> np.ndarray:
+def dry_and_humid(field, shape):
+    """Views without air and with it, without mirrors, one ray a pixel."""
+    each = field, field.with_gas()
+    return [one.tracer().on_grid(shape, 1).view(SEEN, Effects(mirrors=0)) for one in each]
+
+
+def powers_by_ray(view, name, materials):
     """Power of a table's records by the ray that sees them."""
     records = view.tables(Effects())[name]
     return np.bincount(records.ray, records.powers(materials), minlength=len(view.hits.face))
 
 
-def test_scattered_light_seen_in_a_mirror_has_all_three_legs(scene: RadioScene, dry: SpectrumDataset) -> None:
+def test_scattered_light_seen_in_a_mirror_has_all_three_legs(scene, dry):
     """And what elements send on evenly has the two from them; with one ray a pixel every ray goes on at mirrors."""
     field = BistaticField.prior(scene, dry)
     mesh, sides = field.surface.mesh, field.surface.side_group
-    views = [
-        one.tracer().on_grid((12, 24), 1).view(SEEN, Effects(mirrors=0)) for one in (field, field.with_gas())
-    ]
+    views = dry_and_humid(field, (12, 24))
     d = views[0].tracer.grid.directions
     first = mesh.cast(SEEN, d)
     normal = mesh.face_normals[first.face]
@@ -182,22 +181,20 @@ def test_scattered_light_seen_in_a_mirror_has_all_three_legs(scene: RadioScene, 
         assert np.abs(10.0 * np.log10(ratio)).max() < 0.06 * LOSS
 
 
-def test_light_that_mirrors_throw_has_its_images_length(dry: SpectrumDataset) -> None:
+def test_light_that_mirrors_throw_has_its_images_length(dry):
     """Under a lid above a floor each is lit by the other's image: what a ray sees of that, and what elements get."""
 
-    def sheet(z: float, up: bool) -> tuple[np.ndarray, np.ndarray]:
+    def sheet(z, up):
         corners = np.array([[-4.0, -4, z], [4, -4, z], [4, 4, z], [-4, 4, z]])
         faces = np.array([[0, 1, 2], [0, 2, 3]])
         return corners, faces if up else faces[:, ::-1]
 
     mesh, part = joined(sheet(0.0, True), sheet(4.0, False))
     field = BistaticField.prior(RadioScene(mesh, part, [SlabMaterial("floor"), SlabMaterial("lid")]), dry)
-    views = [
-        one.tracer().on_grid((16, 32), 1).view(SEEN, Effects(mirrors=0)) for one in (field, field.with_gas())
-    ]
+    views = dry_and_humid(field, (16, 32))
     materials = Evaluation(field.parameters)
 
-    def by_image(point: np.ndarray) -> np.ndarray:
+    def by_image(point):
         lid = point[:, 2:] > 2.0
         return np.linalg.norm(point - np.where(lid, TX * [1, 1, -1], TX * [1, 1, -1] + [0, 0, 8.0]), axis=1)
 
@@ -215,7 +212,7 @@ def test_light_that_mirrors_throw_has_its_images_length(dry: SpectrumDataset) ->
     np.testing.assert_allclose(after[lit] / before[lit], passed(by_image(centre[lit])), rtol=0.02)
 
 
-def test_two_and_three_bounces_in_a_sphere_have_the_chords_lengths() -> None:
+def test_two_and_three_bounces_in_a_sphere_have_the_chords_lengths():
     """Chords of a sphere of radius R that a Lambertian surface sees are distributed as c / (2 R^2), and of them
     exp(-a c) has the mean (1 - exp(-2 a R) (1 + 2 a R)) / (2 a^2 R^2); without air the sphere integrates."""
     radius = 2.0
@@ -234,7 +231,7 @@ def test_two_and_three_bounces_in_a_sphere_have_the_chords_lengths() -> None:
     thrice = replace(field, effects=replace(field.effects, scatterings=3))
     receiver = np.array([-0.02, 0.0, 0.0])
 
-    def further(one: BistaticField) -> float:
+    def further(one):
         return float(one.path_gains(one.view(receiver)).by_ray(["E"]).sum())
 
     two = further(field.with_gas()) / further(field)
@@ -250,9 +247,7 @@ def test_two_and_three_bounces_in_a_sphere_have_the_chords_lengths() -> None:
     np.testing.assert_allclose(kept, parameters.scattered_share[0], rtol=0.015)
 
 
-def test_a_fit_takes_the_air_out_of_what_it_learns(
-    scene: RadioScene, dry: SpectrumDataset, humid: SpectrumDataset, tmp_path: Path
-) -> None:
+def test_a_fit_takes_the_air_out_of_what_it_learns(scene, dry, humid, tmp_path):
     train = humid.subset(np.arange(6))
     field = RadioField.fit(scene, train, effects=SINGLE)
     test = np.arange(6, 8)
@@ -270,15 +265,7 @@ def test_a_fit_takes_the_air_out_of_what_it_learns(
     assert RadioField.load(tmp_path / "bare.safetensors").air is None
 
 
-def test_what_was_traced_in_other_air_is_refused(
-    scene: RadioScene, dry: SpectrumDataset, humid: SpectrumDataset
-) -> None:
-    seen = trace(scene, dry.subset([0, 1]))
-    with pytest.raises(ValueError, match="air and rays of this fit"):
-        RadioField.fit(scene, humid.subset([0, 1]), views=seen)
-
-
-def test_relevance_judges_the_air_by_itself(scene: RadioScene, humid: SpectrumDataset) -> None:
+def test_relevance_judges_the_air_by_itself(scene, humid):
     field = BistaticField.prior(scene, humid)
     full = full_field(
         field, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=field.beam_sigma_rad, device=None
@@ -287,9 +274,7 @@ def test_relevance_judges_the_air_by_itself(scene: RadioScene, humid: SpectrumDa
 
 
 @pytest.mark.parametrize("line_of_sight", [None, "explicit"])
-def test_a_harmonic_field_has_its_lengths_in_the_law(
-    scene: RadioScene, dry: SpectrumDataset, line_of_sight: str | None
-) -> None:
+def test_a_harmonic_field_has_its_lengths_in_the_law(scene, dry, line_of_sight):
     field = RadioField.fit(
         scene, dry.subset([0, 1]), model="rf3dgs+", iterations=2, line_of_sight=line_of_sight
     )
@@ -307,9 +292,7 @@ def test_a_harmonic_field_has_its_lengths_in_the_law(
         assert paths.air == AIR
 
 
-def test_a_harmonic_fit_starts_from_gains_without_air(
-    scene: RadioScene, dry: SpectrumDataset, humid: SpectrumDataset
-) -> None:
+def test_a_harmonic_fit_starts_from_gains_without_air(scene, dry, humid):
     chosen = np.arange(6)
     fields = [RadioField.fit(scene, ds.subset(chosen), model="rf3dgs+", iterations=60) for ds in (dry, humid)]
     assert fields[1].air == AIR
@@ -318,9 +301,7 @@ def test_a_harmonic_fit_starts_from_gains_without_air(
     assert np.sqrt(np.mean((there - here) ** 2)) < 0.5 * np.sqrt(np.mean((there - with_air) ** 2))
 
 
-def test_a_field_without_lengths_keeps_the_air_that_it_learned(
-    scene: RadioScene, humid: SpectrumDataset
-) -> None:
+def test_a_field_without_lengths_keeps_the_air_that_it_learned(scene, humid):
     field = RadioField.fit(scene, humid.subset([0, 1]), model="rf3dgs", iterations=2)
     assert field.air == AIR
     assert field.with_gas(AIR).air == AIR

@@ -91,22 +91,18 @@ def test_courts_bridges_and_canopies_are_in_the_open():
         assert not under_a_roof(mesh, np.array([place])).any()
 
 
-def test_a_ground_alone_is_open_air():
+def test_a_ground_alone_is_open_air_and_rooms_are_not_even_with_holes():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert is_open_air(Mesh(*GROUND))
-
-
-def test_rooms_are_not_open_air_even_with_holes():
     vertices, faces = box_mesh([0, 0, 0], [6, 5, 3], inward=True)
     assert not is_open_air(Mesh(vertices, faces))
     assert not is_open_air(Mesh(vertices, faces[1:]))  # half a wall is missing
     corridors = joined(
         box_mesh([0, 0, 0], [30, 2, 3], inward=True), box_mesh([28, 2, 0], [30, 30, 3], inward=True)
     )[0]
-    assert not is_open_air(
-        Mesh(corridors.vertices, corridors.faces[1:])
-    )  # most of its box has sky, and no ground
+    # Most of its box has sky, and no ground.
+    assert not is_open_air(Mesh(corridors.vertices, corridors.faces[1:]))
 
 
 def test_places_above_the_ground_follow_a_slope():

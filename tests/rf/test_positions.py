@@ -143,11 +143,8 @@ def test_only_what_a_closed_surface_holds_is_no_air_however_surfaces_are_wound(s
     places = rng.uniform(LOW + 0.05, HIGH - 0.05, (300, 3))
     parts, solid = [box_mesh(LOW, HIGH, inward=seed % 2 > 0)], np.zeros(len(places), bool)
     for _ in range(rng.integers(0, 4)):
-        low = rng.uniform(LOW, HIGH - 1.6) * [1, 1, rng.integers(2)] - [
-            0,
-            0,
-            0.02,
-        ]  # through the floor a little
+        # Through the floor a little.
+        low = rng.uniform(LOW, HIGH - 1.6) * [1, 1, rng.integers(2)] - [0, 0, 0.02]
         high = low + rng.uniform(0.3, 1.5, 3)
         parts.append(box_mesh(low, high, inward=rng.random() < 0.2))
         solid |= ((places > low) & (places < high)).all(axis=1)
@@ -199,8 +196,7 @@ def test_places_round_open_walls_and_lone_boxes_pass_and_in_a_box_do_not():
 
 
 @pytest.mark.parametrize("name", ["box", "box_one_screen", "box_two_screens"])
-def test_sionnas_boxes_of_sheets_are_rooms(name):
-    rt = pytest.importorskip("sionna.rt")
+def test_sionnas_boxes_of_sheets_are_rooms(name, rt):
     scene = wr.Scene.load(getattr(rt.scene, name))
     places = np.random.default_rng(0).uniform([-4.9, -4.9, 0.1], [4.9, 4.9, 4.9], (400, 3))
     assert scene.is_free(places).all()

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from furnished import RECEIVERS, TX, F, furnished, spectra
-from radio_scenes import RadioScene, SlabMaterial
+from path_makers import random_directions
+from radio_scenes import SlabMaterial
 from twin_fields import known_field
 
 from warprrf.rf.em.fresnel import lobe
@@ -16,25 +17,15 @@ from warprrf.rf.fields.base import RadioField
 WAVELENGTH = SPEED_OF_LIGHT / F
 RX = RECEIVERS[0]
 MATERIALS = [
-    SlabMaterial("walls", 3.0, 0.5, 0.02, 0.5, "directive", 12),
-    SlabMaterial("block", 6.0, 0.5, np.inf, 0.8),
+    SlabMaterial("walls", 3.0, 0.5, 0.02, 0.5, "directive", 12, reciprocal=True),
+    SlabMaterial("block", 6.0, 0.5, np.inf, 0.8, reciprocal=True),
 ]
-
-
-def room(*, reciprocal: bool) -> RadioScene:
-    return furnished(*(replace(m, reciprocal=reciprocal) for m in MATERIALS))
-
-
-def directions(count: int, seed: int) -> np.ndarray:
-    """Unit vectors over the hemisphere about z."""
-    d = np.random.default_rng(seed).normal(size=(count, 3))
-    d[:, 2] = np.abs(d[:, 2])
-    return d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
 @pytest.mark.parametrize("alpha", [0, 1, 4, 12, 30, 200])
 def test_a_reciprocal_lobe_is_symmetric_and_either_kind_scatters_all_that_comes(alpha):
-    a, b = directions(2000, 0), directions(2000, 1)
+    a, b = (random_directions(2000, seed) for seed in (0, 1))
+    a[:, 2], b[:, 2] = np.abs(a[:, 2]), np.abs(b[:, 2])
     cos_mirror = 2.0 * a[:, 2] * b[:, 2] - (a * b).sum(axis=1)
     # f_s cos(theta_i): what the path gain of an element is proportional to
     there, back = (
@@ -68,7 +59,7 @@ def test_a_fields_scattered_power_is_the_same_both_ways():
 
 
 def test_a_fit_takes_reciprocal_lobes_and_its_file_says_so(tmp_path):
-    scene = room(reciprocal=True)
+    scene = furnished(*MATERIALS)
     ds = spectra(scene, RECEIVERS[[0, 5]], shape=(20, 40), sub_pixels=4)
     field = RadioField.fit(scene, ds, quick=True, reciprocal=True)
     field.save(tmp_path / "field.safetensors")

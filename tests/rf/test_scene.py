@@ -1,9 +1,6 @@
 """Scenes: the XML's objects and materials face by face, errors that name what is missing, points in free air."""
 
-from __future__ import annotations
-
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +15,7 @@ from warprrf.rf.scene import Scene
 
 
 @pytest.fixture
-def copy(tmp_path: Path) -> Path:
+def copy(tmp_path):
     for name in ("scene.xml", "materials.json"):
         shutil.copy(LOBBY / name, tmp_path)
     shutil.copytree(LOBBY / "meshes", tmp_path / "meshes")
@@ -26,11 +23,11 @@ def copy(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def lobby() -> Scene:
+def lobby():
     return Scene.load(LOBBY / "scene.xml")
 
 
-def test_each_face_has_the_material_of_its_object(lobby: Scene) -> None:
+def test_each_face_has_the_material_of_its_object(lobby):
     expected = {"floor": "marble", "wall_west": "glass", "gallery": "concrete", "elevator": "metal"}
     for name, material in expected.items():
         used = {lobby.materials[k].name for k in lobby.face_material[object_faces(lobby, name)]}
@@ -41,7 +38,7 @@ def test_each_face_has_the_material_of_its_object(lobby: Scene) -> None:
     np.testing.assert_array_equal(corners, part.vertices[part.faces])
 
 
-def test_air_is_free_and_solids_are_not(lobby: Scene) -> None:
+def test_air_is_free_and_solids_are_not(lobby):
     points = np.array([[7.3, 5.0, 1.5], [9.2, 3.0, 1.5], [3.6, 3.3, 1.0], [7.5, 6.0, -0.1], [7.5, 6.0, 6.0]])
     np.testing.assert_array_equal(lobby.is_free(points), [True, False, False, False, False])
     behind = np.array([[-0.08, 1.38, 0.6]])  # in the west wall, 6 cm from where the sofa ends within it
@@ -50,7 +47,7 @@ def test_air_is_free_and_solids_are_not(lobby: Scene) -> None:
     np.testing.assert_array_equal(lobby.is_free(near, clearance_m=0.3), [False, True])
 
 
-def test_missing_files_and_materials_are_named(copy: Path) -> None:
+def test_missing_files_and_materials_are_named(copy):
     (copy / "meshes" / "desk.ply").rename(copy / "desk.ply")
     with pytest.raises(FileNotFoundError, match=r"'desk'.*desk\.ply"):
         Scene.load(copy / "scene.xml")
@@ -73,22 +70,20 @@ def test_missing_files_and_materials_are_named(copy: Path) -> None:
         ("object_names", ["a", "a"]),
     ],
 )
-def test_a_scene_of_what_does_not_match_is_refused(name: str, value: object) -> None:
+def test_a_scene_of_what_does_not_match_is_refused(name, value):
     wall = Mesh([[0, 0, 0], [1, 0, 0], [0, 0, 1]], [[0, 1, 2]])
     with pytest.raises((ValueError, TypeError), match=f"^{name}: got"):
         Scene(**({"mesh": wall, "materials": [Material.conductor()], "face_material": [0]} | {name: value}))
 
 
-def test_other_materials_are_materials_one_for_each(lobby: Scene) -> None:
+def test_other_materials_are_materials_one_for_each(lobby):
     for wrong in (["marble"] * len(lobby.materials), lobby.materials[:-1]):
         with pytest.raises((ValueError, TypeError), match="^materials"):
             lobby.with_materials(wrong)
 
 
 @pytest.mark.parametrize("how", ["absolute", "upward", "link", "folder that is a link"])
-def test_meshes_outside_the_scenes_folder_are_read_on_request_alone(
-    how: str, copy: Path, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_meshes_outside_the_scenes_folder_are_read_on_request_alone(how, copy, tmp_path_factory):
     away = tmp_path_factory.mktemp("away")
     desk = (copy / "meshes" / "desk.ply").rename(away / "desk.ply")
     names = {"absolute": str(desk), "upward": f"../{away.name}/desk.ply", "link": "meshes/desk.ply"}
@@ -107,24 +102,7 @@ def test_meshes_outside_the_scenes_folder_are_read_on_request_alone(
     assert cli.main(["simulate", *words, "--allow-outside"]) == 0
 
 
-def test_a_scene_whose_folder_is_a_link_is_read(copy: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_a_scene_whose_folder_is_a_link_is_read(copy, tmp_path_factory):
     link = tmp_path_factory.mktemp("links") / "room"
     link.symlink_to(copy)
     assert "desk" in Scene.load(link / "scene.xml").object_names
-
-
-@pytest.mark.parametrize(
-    "head",
-    [
-        '<?xml version="1.0" encoding="no-such"?>',
-        '<!DOCTYPE s [<!ENTITY x SYSTEM "file:///etc/passwd">]>\n<x>&x;</x>',
-        "<!DOCTYPE s [<!ENTITY a '" + "ha" * 50 + "'>"
-        + "".join(f"<!ENTITY {b} '{f'&{a};' * 40}'>" for a, b in zip("abcdef", "bcdefg", strict=True))
-        + "]>\n<x>&g;</x>",
-    ],
-    ids=["encoding", "external entity", "entities that multiply"],
-)  # fmt: skip
-def test_hostile_xml_is_a_value_error(head: str, copy: Path) -> None:
-    (copy / "scene.xml").write_text(head)
-    with pytest.raises(ValueError, match=r"scene\.xml"):
-        Scene.load(copy / "scene.xml")

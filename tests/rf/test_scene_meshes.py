@@ -1,7 +1,5 @@
 """Scenes in mesh files: what materials are by name, and fields that need no more."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -13,7 +11,7 @@ import warprrf as wr
 CARRIER = 60e9
 
 
-def test_materials_of_a_mesh_file_are_known_by_name(tmp_path: Path) -> None:
+def test_materials_of_a_mesh_file_are_known_by_name(tmp_path):
     scene = wr.Scene.load(room_glb(tmp_path))
     assert set(scene.object_names) == {"room", "table", "other table"}
     values = {material.name: material for material in scene.materials}
@@ -23,7 +21,7 @@ def test_materials_of_a_mesh_file_are_known_by_name(tmp_path: Path) -> None:
     assert scene.mesh.face_colours is not None
 
 
-def test_names_that_nobody_knows_load_and_are_named_where_values_are_needed(tmp_path: Path) -> None:
+def test_names_that_nobody_knows_load_and_are_named_where_values_are_needed(tmp_path):
     path = obj_with_materials(tmp_path)
     path.write_text(path.read_text().replace("Wood_01", "Bark"))
     (tmp_path / "square.mtl").write_text("newmtl Bark\nnewmtl Paint\n")
@@ -44,14 +42,14 @@ def test_names_that_nobody_knows_load_and_are_named_where_values_are_needed(tmp_
         wr.Scene.load(path, materials={"Glass": paint})
 
 
-def test_units_belong_to_mesh_files_alone() -> None:
+def test_units_belong_to_mesh_files_alone():
     from places import LOBBY
 
     with pytest.raises(ValueError, match=r"unit, up, simplify: .*scene\.xml is no mesh file"):
         wr.Scene.load(LOBBY / "scene.xml", unit="mm")
 
 
-def painted_room(folder: Path, named: bool) -> Path:
+def painted_room(folder, named):
     """A room of 5 x 4 x 3 m and a block in it, by material or by colour of vertices."""
     parts = []
     for low, high, inward, colour in (
@@ -72,15 +70,13 @@ def painted_room(folder: Path, named: bool) -> Path:
 
 
 @pytest.mark.parametrize("named", [True, False])
-def test_a_field_is_fitted_to_what_a_mesh_file_tells_apart(named: bool, tmp_path: Path) -> None:
+def test_a_field_is_fitted_to_what_a_mesh_file_tells_apart(named, tmp_path):
     from warprrf.rf.tracing.surface import Surface
 
     path = painted_room(tmp_path, named)
-    up = "z"
-    mesh, scene = wr.Mesh.load(path, up=up), wr.Scene.load(path, up=up)
-    block = (mesh.triangles.mean(axis=1) > [2.1, 1.1, -1]).all(axis=1) & (
-        mesh.triangles.mean(axis=1) < [3.1, 2.9, 2.9]
-    ).all(axis=1)
+    mesh, scene = wr.Mesh.load(path, up="z"), wr.Scene.load(path, up="z")
+    middle = mesh.triangles.mean(axis=1)
+    block = ((middle > [2.1, 1.1, -1]) & (middle < [3.1, 2.9, 2.9])).all(axis=1)
     for geometry in (mesh, scene, wr.Reconstruction.from_files(mesh=mesh)):
         surface = Surface.of(geometry)
         face = mesh.closest(surface.mesh.triangles.mean(axis=1)).face
@@ -88,7 +84,7 @@ def test_a_field_is_fitted_to_what_a_mesh_file_tells_apart(named: bool, tmp_path
         assert of_block and of_walls and not of_block & of_walls
 
 
-def test_a_reconstruction_of_a_mesh_alone_saves_loads_and_fits(tmp_path: Path) -> None:
+def test_a_reconstruction_of_a_mesh_alone_saves_loads_and_fits(tmp_path):
     rec = wr.Reconstruction.from_files(mesh=painted_room(tmp_path, named=False))
     rec.save(tmp_path / "kept")
     back = wr.Reconstruction.load(tmp_path / "kept")

@@ -72,9 +72,8 @@ def test_what_cannot_be_taken_over_is_named(rt):
     live = rt.load_scene(rt.scene.simple_wedge)
     radio = live.radio_materials["concrete"]
     radio.scattering_pattern = rt.BackscatteringPattern(alpha_r=3, alpha_i=2, lambda_=0.5)
-    assert (
-        Scene.from_sionna(live).materials[0].scattering == 0.0
-    )  # nothing scatters: its pattern does not count
+    # Nothing scatters: its pattern does not count.
+    assert Scene.from_sionna(live).materials[0].scattering == 0.0
     radio.scattering_coefficient = 0.5
     with pytest.raises(ValueError, match="'concrete'.*BackscatteringPattern.*materials="):
         Scene.from_sionna(live)

@@ -1,9 +1,5 @@
 """Scenes in XML: materials by name, type and reference, transforms and primitives, hostile files; beside Mitsuba."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -18,22 +14,23 @@ F = 3.5e9
 RECTANGLE = '<shape type="rectangle" id="{name}">{inside}</shape>'
 
 
-def written(folder: Path, body: str) -> Path:
+def written(folder, body):
+    """The file of a scene's inside, or of a text that begins as files do."""
     path = folder / "scene.xml"
-    path.write_text(f'<scene version="3.0.0">{body}</scene>')
+    path.write_text(body if body.startswith(("<?", "<!")) else f'<scene version="3.0.0">{body}</scene>')
     return path
 
 
-def loaded(folder: Path, body: str, **options: object) -> Scene:
+def loaded(folder, body, **options):
     return Scene.load(written(folder, body), **options)  # type: ignore[arg-type]
 
 
-def one(folder: Path, bsdf: str, **options: object) -> wr.Material:
+def one(folder, bsdf, **options):
     """The material of a scene of one rectangle, whose bsdf is the first of ``bsdf``."""
     return loaded(folder, bsdf + '<shape type="rectangle"><ref id="it"/></shape>', **options).materials[0]
 
 
-def test_materials_have_the_values_that_the_file_gives(tmp_path: Path) -> None:
+def test_materials_have_the_values_that_the_file_gives(tmp_path):
     itu = one(
         tmp_path,
         '<bsdf type="itu-radio-material" id="it"><string name="type" value="brick"/>'
@@ -63,12 +60,12 @@ def test_materials_have_the_values_that_the_file_gives(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("name", ["mat-itu_glass", "itu_glass", "itu-glass", "glass", "mat-itu_glass.001"])
-def test_plain_and_nested_bsdfs_are_taken_by_their_name(tmp_path: Path, bsdf: str, name: str) -> None:
+def test_plain_and_nested_bsdfs_are_taken_by_their_name(tmp_path, bsdf, name):
     body = bsdf.replace("{}", name) + RECTANGLE.format(name="a", inside=f'<ref id="{name}"/>')
     assert loaded(tmp_path, body).materials[0].itu == "glass"
 
 
-def test_what_nobody_knows_is_named_and_can_be_given(tmp_path: Path) -> None:
+def test_what_nobody_knows_is_named_and_can_be_given(tmp_path):
     with pytest.raises(ValueError, match=r"'shape_0'.*'it'.*concrete.*materials="):
         one(tmp_path, '<bsdf type="diffuse" id="it"/>')
     cork = wr.Material.custom("cork", relative_permittivity=1.7)
@@ -81,7 +78,7 @@ def test_what_nobody_knows_is_named_and_can_be_given(tmp_path: Path) -> None:
         one(tmp_path, '<bsdf type="radio-material" id="it"><float name="thickness" value="thick"/></bsdf>')
 
 
-def test_callers_go_before_tables_and_tables_before_files(tmp_path: Path) -> None:
+def test_callers_go_before_tables_and_tables_before_files(tmp_path):
     from warprrf.files import write_json
     from warprrf.rf.em.materials import table_entry
 
@@ -97,7 +94,7 @@ def test_callers_go_before_tables_and_tables_before_files(tmp_path: Path) -> Non
     assert [m.thickness_m for m in loaded(tmp_path, body, materials={"brick": other}).materials] == [0.5, 0.2]
 
 
-def test_outside_their_bands_materials_hold_on_request_alone(tmp_path: Path) -> None:
+def test_outside_their_bands_materials_hold_on_request_alone(tmp_path):
     body = '<bsdf type="diffuse" id="it"/>'.replace('"it"', '"itu_metal"')
     body += RECTANGLE.format(name="a", inside='<ref id="itu_metal"/>')
     with pytest.raises(ValueError, match=r"metal.*1 to 100 GHz.*extrapolate=True"):
@@ -119,7 +116,7 @@ TRANSFORMS = [
 ]
 
 
-def test_surfaces_stand_where_mitsuba_puts_them(tmp_path: Path) -> None:
+def test_surfaces_stand_where_mitsuba_puts_them(tmp_path):
     sionna_or_skip()
     from warprrf.rf.scene_sionna import select_variant
 
@@ -147,8 +144,8 @@ def test_surfaces_stand_where_mitsuba_puts_them(tmp_path: Path) -> None:
         assert gap.min(axis=1).max() < 1e-5 and gap.min(axis=0).max() < 1e-5, shape.id()
 
 
-def test_solids_keep_their_outer_side_and_primitives_their_size(tmp_path: Path) -> None:
-    def solid(inside: str, kind: str = "cube") -> wr.Mesh:
+def test_solids_keep_their_outer_side_and_primitives_their_size(tmp_path):
+    def solid(inside, kind="cube"):
         return loaded(tmp_path, f'<shape type="{kind}"><bsdf id="itu_wood"/>{inside}</shape>').mesh
 
     for place, volume in (("", 8.0), ('<scale x="-1"/>', 8.0), ('<scale value="0.5"/>', 1.0)):
@@ -172,7 +169,7 @@ def test_solids_keep_their_outer_side_and_primitives_their_size(tmp_path: Path) 
         np.testing.assert_allclose(flat.face_normals, np.tile([0, 0, 1], (len(flat.faces), 1)), atol=1e-12)
 
 
-def test_defaults_includes_and_merged_shapes_are_read(tmp_path: Path) -> None:
+def test_defaults_includes_and_merged_shapes_are_read(tmp_path):
     (tmp_path / "more.xml").write_text(
         '<scene version="3.0.0"><shape type="$kind" id="mesh-far"><bsdf id="itu_wood"/></shape></scene>'
     )
@@ -188,6 +185,19 @@ def test_defaults_includes_and_merged_shapes_are_read(tmp_path: Path) -> None:
 
 CUBE = '<shape type="cube"><bsdf id="itu_wood"/>{}</shape>'
 HOSTILE = {
+    "encoding": ('<?xml version="1.0" encoding="no-such"?>', "unknown encoding"),
+    "external entity": (
+        '<!DOCTYPE s [<!ENTITY x SYSTEM "file:///etc/passwd">]>\n<x>&x;</x>',
+        "document type",
+    ),
+    "entities that multiply": (
+        "<!DOCTYPE s [<!ENTITY a '"
+        + "ha" * 50
+        + "'>"
+        + "".join(f"<!ENTITY {b} '{f'&{a};' * 40}'>" for a, b in zip("abcdef", "bcdefg", strict=True))
+        + "]>\n<x>&g;</x>",
+        "document type",
+    ),
     "depth": ("<a>" * 100_000 + "</a>" * 100_000, "nested more than"),
     "a name that grows": (
         '<default name="a" value="0000000000"/>'
@@ -210,7 +220,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("case", sorted(HOSTILE))
-def test_hostile_and_wrong_files_are_value_errors_that_name_them(tmp_path: Path, case: str) -> None:
+def test_hostile_and_wrong_files_are_value_errors_that_name_them(tmp_path, case):
     body, words = HOSTILE[case]
     with pytest.raises(ValueError, match=rf"(?s)^path: .*scene\.xml.*{words}|^path: .*{words}"):
         loaded(tmp_path, body)

@@ -1,26 +1,23 @@
 """Spectra of coherent arrays: what they are, and NeRF2's folders of pictures."""
 
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
+from PIL import Image
 
 from warprrf.rf.channel.array_spectra import UP, ArraySpectra, hemisphere
 from warprrf.rf.channel.arrays import PlanarArray
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     """Four pictures in NeRF2's layout, each with a bright spot; the gateway is turned by 90 degrees about z."""
-    image = pytest.importorskip("PIL.Image")
     (tmp_path / "spectrum").mkdir()
     rows = ["x,y,z"]
     for k in range(4):
         picture = np.zeros((9, 36), np.uint8)
         picture[3, 9 * k] = 255
         picture[5] = 51
-        image.fromarray(picture).save(tmp_path / "spectrum" / f"{k + 1}.png")
+        Image.fromarray(picture).save(tmp_path / "spectrum" / f"{k + 1}.png")
         rows.append(f"{k + 0.5},1.0,1.5")
     (tmp_path / "tx_pos.csv").write_text("\n".join(rows) + "\n")
     (tmp_path / "gateway_info.yml").write_text(
@@ -31,7 +28,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_nerf2_folders_are_read_by_their_own_conventions(folder: Path) -> None:
+def test_nerf2_folders_are_read_by_their_own_conventions(folder):
     known = ArraySpectra.load(folder, frequency_hz=920e6)
     assert known.power.shape == (4, 9, 36)
     assert known.power[2, 3, 18] == 1.0
@@ -60,21 +57,13 @@ def test_nerf2_folders_are_read_by_their_own_conventions(folder: Path) -> None:
         (lambda p: (p / "gateway_info.yml").write_text("position: [1, nan, 3]\n"), "gateway_info.yml.*position"),
         (lambda p: (p / "spectrum" / "1.png").rename(p / "spectrum" / "0.png"), "named '0'"),
         (lambda p: (p / "spectrum" / "2.png").write_bytes((p / "spectrum" / "1.png").read_bytes()[:50]), "2.png"),
+        (lambda p: Image.new("RGB", (36, 9)).save(p / "spectrum" / "3.png"), r"3\.png.*mode RGB"),
+        (lambda p: Image.new("L", (35, 9)).save(p / "spectrum" / "3.png"), r"3\.png.*first spectrum"),
     ],
 )  # fmt: skip
-def test_broken_folders_name_the_file(folder: Path, break_it: Callable[[Path], None], said: str) -> None:
+def test_broken_folders_name_the_file(folder, break_it, said):
     break_it(folder)
     with pytest.raises((ValueError, FileNotFoundError), match=said):
-        ArraySpectra.load(folder, frequency_hz=920e6)
-
-
-def test_pictures_of_other_kinds_are_refused(folder: Path) -> None:
-    image = pytest.importorskip("PIL.Image")
-    image.new("RGB", (36, 9)).save(folder / "spectrum" / "3.png")
-    with pytest.raises(ValueError, match=r"3\.png.*mode RGB"):
-        ArraySpectra.load(folder, frequency_hz=920e6)
-    image.new("L", (35, 9)).save(folder / "spectrum" / "3.png")
-    with pytest.raises(ValueError, match=r"3\.png.*first spectrum"):
         ArraySpectra.load(folder, frequency_hz=920e6)
 
 
@@ -93,7 +82,7 @@ GOOD = {
         ("directions", 2.0 * hemisphere((5, 7)), "unit vectors"),
     ],
 )
-def test_wrong_arguments_are_named(name: str, value: object, said: str) -> None:
+def test_wrong_arguments_are_named(name, value, said):
     assert len(ArraySpectra(**GOOD).subset([1])) == 1
     with pytest.raises(ValueError, match=said):
         ArraySpectra(**{**GOOD, name: value})

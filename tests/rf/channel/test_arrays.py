@@ -33,17 +33,15 @@ def test_rotation_follows_tr_38901():
 
 
 def test_orientation_towards_points_the_boresight():
-    rng = np.random.default_rng(1)
-    for d in random_directions(20, rng):
+    for d in random_directions(20, 1):
         assert np.allclose(rotation_matrix(orientation_towards(d)) @ [1, 0, 0], d)
 
 
 @pytest.mark.parametrize("pattern", [*PATTERNS, "callable"])
 @pytest.mark.parametrize("polarisation", [None, "cross"])
 def test_turning_array_and_waves_together_changes_nothing(pattern, polarisation):
-    rng = np.random.default_rng(2)
     pattern = (lambda angle: 1.0 + np.cos(angle)) if pattern == "callable" else pattern
-    d = random_directions(50, rng)
+    d = random_directions(50, 2)
     still = PlanarArray(4, 3, pattern=pattern, polarisation=polarisation)
     turn = rotation_matrix([0.3, -1.1, 0.7])
     turned = PlanarArray(4, 3, orientation=turn, pattern=pattern, polarisation=polarisation)
@@ -84,7 +82,7 @@ def test_tr38901_element():
 
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_polarised_field_carries_the_gain(pattern):
-    d = random_directions(200, np.random.default_rng(3))
+    d = random_directions(200, 3)
     for polarisation in ("V", "H", "VH", "cross"):
         a = PlanarArray(1, 1, pattern=pattern, polarisation=polarisation, orientation=(0.3, 0.2, -0.5))
         np.testing.assert_allclose(

@@ -1,13 +1,10 @@
 """Beams: codebooks keep power, a beam steered along its direction gains N, choices follow the paths and the users."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
-import path_makers
 import pytest
-from path_makers import CARRIER, paths_along
+from path_makers import CARRIER, paths_along, random_directions
 
 import warprrf as wr
 from warprrf.rf.channel.beams import signal_over_interference
@@ -16,17 +13,13 @@ from warprrf.rf.spectra.spectrum import pixel_directions
 WAVELENGTH_M = 299792458.0 / CARRIER
 
 
-def random_directions(count: int, seed: int = 0) -> np.ndarray:
-    return path_makers.random_directions(count, np.random.default_rng(seed))
-
-
 @pytest.mark.parametrize(("rows", "cols"), [(1, 1), (4, 4), (3, 8)])
-def test_dft_beams_are_orthonormal(rows: int, cols: int) -> None:
+def test_dft_beams_are_orthonormal(rows, cols):
     weights = wr.channel.dft_codebook(wr.PlanarArray(rows, cols, orientation=(0.3, -0.2, 0.1))).weights
     np.testing.assert_allclose(weights @ weights.conj().T, np.eye(rows * cols), atol=1e-12)
 
 
-def test_dft_beam_looks_along_the_cosines_that_are_stated() -> None:
+def test_dft_beam_looks_along_the_cosines_that_are_stated():
     array = wr.PlanarArray(4, 8)  # axes of the array are those of the world: y across, z up
     book = wr.channel.dft_codebook(array)
     for across, down in itertools.product(range(2, 6), range(1, 3)):
@@ -38,14 +31,14 @@ def test_dft_beam_looks_along_the_cosines_that_are_stated() -> None:
         np.testing.assert_allclose(book.beam(across * 4 + down), book.weights[across * 4 + down], atol=1e-15)
 
 
-def test_steered_beam_gains_the_number_of_elements() -> None:
+def test_steered_beam_gains_the_number_of_elements():
     array = wr.PlanarArray(8, 8, orientation=(1.0, 0.2, -0.3))
     directions = random_directions(20)
     book = wr.channel.steering_codebook(array, 3.0 * directions)
     np.testing.assert_allclose(np.abs(np.diag(book.amplitude(directions))) ** 2, 64.0, rtol=1e-12)
 
 
-def test_beam_focused_on_a_near_point_loses_nothing_and_a_plane_one_does() -> None:
+def test_beam_focused_on_a_near_point_loses_nothing_and_a_plane_one_does():
     array = wr.PlanarArray(64, 64)
     point = np.array([[0.4, 0.05, -0.1]])
     true = array.spherical_response(point[0], WAVELENGTH_M)
@@ -63,7 +56,7 @@ def test_beam_focused_on_a_near_point_loses_nothing_and_a_plane_one_does() -> No
 
 
 @pytest.mark.parametrize("pattern", ["isotropic", "tr38901"])
-def test_received_superposed_and_dense_sums_agree(pattern: str) -> None:
+def test_received_superposed_and_dense_sums_agree(pattern):
     array = wr.PlanarArray(3, 5, spacing=(0.5, 0.7), orientation=(0.4, 0.1, 0.2), pattern=pattern)
     rng = np.random.default_rng(1)
     d, c = random_directions(30), rng.normal(size=30) + 1j * rng.normal(size=30)
@@ -77,7 +70,7 @@ def test_received_superposed_and_dense_sums_agree(pattern: str) -> None:
     np.testing.assert_allclose(dense.power(d, np.abs(c) ** 2), book.power(d, np.abs(c) ** 2), rtol=1e-10)
 
 
-def test_one_path_is_met_by_the_beams_along_it() -> None:
+def test_one_path_is_met_by_the_beams_along_it():
     tx, rx = wr.PlanarArray(8, 8, orientation=(0.3, 0, 0)), wr.PlanarArray(4, 4)
     arrival, departure = random_directions(10, seed=2), random_directions(10, seed=3)
     for a, d in zip(arrival, departure, strict=True):
@@ -89,7 +82,7 @@ def test_one_path_is_met_by_the_beams_along_it() -> None:
         np.testing.assert_allclose(chosen.gain[0], power.max(), rtol=1e-9)
 
 
-def test_batched_paths_choose_as_each_receiver_does_and_best_come_first() -> None:
+def test_batched_paths_choose_as_each_receiver_does_and_best_come_first():
     tx, rx = wr.PlanarArray(4, 4), wr.PlanarArray(4, 2)
     lists = [
         paths_along(random_directions(n, seed=n), random_directions(n, seed=n + 9), np.arange(1.0, n + 1))
@@ -104,7 +97,7 @@ def test_batched_paths_choose_as_each_receiver_does_and_best_come_first() -> Non
         np.testing.assert_allclose(np.sort(gains.ravel())[::-1][:7], alone.gain)
 
 
-def test_spectrum_is_taken_as_powers_at_its_pixels() -> None:
+def test_spectrum_is_taken_as_powers_at_its_pixels():
     shape = (12, 24)
     gain, aod = np.zeros(shape), np.full((*shape, 2), np.nan)
     gain[5, 3], gain[7, 20] = 1e-9, 3e-10
@@ -121,13 +114,13 @@ def test_spectrum_is_taken_as_powers_at_its_pixels() -> None:
         wr.channel.select_beams(wr.Spectrum(path_gain=gain), tx, rx)
 
 
-def test_receiver_without_paths_gets_gain_zero() -> None:
+def test_receiver_without_paths_gets_gain_zero():
     nothing = paths_along(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
     assert wr.channel.select_beams(nothing, wr.PlanarArray(2, 2), wr.PlanarArray(2, 2)).gain[0] == 0.0
     assert wr.channel.select_beams(nothing, rx_array=wr.PlanarArray(2, 2)).gain[0] == 0.0
 
 
-def test_multi_user_choice_is_as_good_as_trying_everything() -> None:
+def test_multi_user_choice_is_as_good_as_trying_everything():
     tx, rx = wr.PlanarArray(2, 3), wr.PlanarArray(1, 2)
     users = [
         paths_along(
@@ -144,7 +137,7 @@ def test_multi_user_choice_is_as_good_as_trying_everything() -> None:
     np.testing.assert_allclose(np.log2(1.0 + found.sinr).sum(), best, rtol=1e-12)
 
 
-def test_what_no_codebook_can_be_made_of_is_named() -> None:
+def test_what_no_codebook_can_be_made_of_is_named():
     array = wr.PlanarArray(2, 2)
     with pytest.raises(ValueError, match="array: got polarisation 'V'"):
         wr.channel.dft_codebook(wr.PlanarArray(2, 2, polarisation="V"))

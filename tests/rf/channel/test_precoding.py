@@ -1,7 +1,5 @@
 """Precoders: what each must null or maximise, by SciPy and by closed form, and what a field's covariance means."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -15,26 +13,26 @@ from warprrf.rf.channel.beams import signal_over_interference
 USERS, ELEMENTS = 4, 12
 
 
-def rayleigh(users: int = USERS, elements: int = ELEMENTS, seed: int = 0) -> np.ndarray:
+def rayleigh(users=USERS, elements=ELEMENTS, seed=0):
     rng = np.random.default_rng(seed)
     return 1e-5 * (rng.normal(size=(users, elements)) + 1j * rng.normal(size=(users, elements)))
 
 
-def diffuse(seed: int) -> wr.Paths:
+def diffuse(seed):
     return random_paths(5, seed, kind="diffuse")
 
 
-def alike(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def alike(a, b):
     """|<a, b>| of rows of unit norm: 1 where they differ by a phase alone."""
     return np.abs((a.conj() * b).sum(axis=1))
 
 
-def rank_one(h: np.ndarray) -> np.ndarray:
+def rank_one(h):
     return h.conj()[:, :, None] * h[:, None, :]
 
 
 @pytest.mark.parametrize("method", ["mr", "zf", "slnr"])
-def test_weights_have_unit_norm_and_one_user_gets_maximum_ratio(method: str) -> None:
+def test_weights_have_unit_norm_and_one_user_gets_maximum_ratio(method):
     h = rayleigh()
     for channels in (h, rank_one(h)):
         w = wr.channel.precoders(channels, method, noise=1e-9)
@@ -45,7 +43,7 @@ def test_weights_have_unit_norm_and_one_user_gets_maximum_ratio(method: str) -> 
         assert wr.channel.precoded_sinr(h[:1], alone, noise=1e-9)[0] == pytest.approx(gain / 1e-9, rel=1e-10)
 
 
-def test_zero_forcing_nulls_interference_and_gives_what_the_inverse_gram_says() -> None:
+def test_zero_forcing_nulls_interference_and_gives_what_the_inverse_gram_says():
     h = rayleigh()
     for channels in (h, rank_one(h)):
         heard = np.abs(h @ wr.channel.precoders(channels, "zf", noise=1e-9).T)
@@ -55,7 +53,7 @@ def test_zero_forcing_nulls_interference_and_gives_what_the_inverse_gram_says() 
         np.testing.assert_allclose(own**2, 1.0 / np.diag(np.linalg.inv(h @ h.conj().T)).real, rtol=1e-9)
 
 
-def test_slnr_is_the_generalised_eigenvector_and_for_channels_the_mmse_precoder() -> None:
+def test_slnr_is_the_generalised_eigenvector_and_for_channels_the_mmse_precoder():
     h, noise = rayleigh(), 3e-10
     scattered = wr.channel.transmit_covariance([diffuse(seed) for seed in range(3)], wr.PlanarArray(3, 4))
     for covariances, quiet in ((rank_one(h), noise), (scattered, 0.1)):
@@ -72,7 +70,7 @@ def test_slnr_is_the_generalised_eigenvector_and_for_channels_the_mmse_precoder(
     np.testing.assert_allclose(alike(w, mmse.T / np.linalg.norm(mmse.T, axis=1)[:, None]), 1.0, rtol=1e-12)
 
 
-def test_slnr_goes_from_zero_forcing_to_maximum_ratio_with_the_noise() -> None:
+def test_slnr_goes_from_zero_forcing_to_maximum_ratio_with_the_noise():
     h = rayleigh()
     for channels in (h, rank_one(h)):
         loud, quiet = (wr.channel.precoders(channels, "slnr", noise=n) for n in (1.0, 1e-18))
@@ -80,7 +78,7 @@ def test_slnr_goes_from_zero_forcing_to_maximum_ratio_with_the_noise() -> None:
         np.testing.assert_allclose(alike(quiet, wr.channel.precoders(h, "zf", noise=1.0)), 1.0, rtol=1e-6)
 
 
-def test_covariance_gives_every_pair_of_beams_its_mean_gain() -> None:
+def test_covariance_gives_every_pair_of_beams_its_mean_gain():
     tx = wr.channel.dft_codebook(wr.PlanarArray(4, 4, pattern="tr38901"))
     rx = wr.channel.dft_codebook(wr.PlanarArray(2, 2, orientation=(0.4, 0.1, 0.0)))
     users = [diffuse(seed) for seed in range(3)]
@@ -96,7 +94,7 @@ def test_covariance_gives_every_pair_of_beams_its_mean_gain() -> None:
     assert one[0, 0, 0].real == pytest.approx(users[0].power.sum(), rel=1e-12)
 
 
-def test_sinr_of_beams_is_that_of_the_multi_user_choice() -> None:
+def test_sinr_of_beams_is_that_of_the_multi_user_choice():
     book = wr.channel.dft_codebook(wr.PlanarArray(3, 4))
     h = rayleigh()
     gains = [np.abs(book.received(row))[None] ** 2 for row in h]
@@ -107,7 +105,7 @@ def test_sinr_of_beams_is_that_of_the_multi_user_choice() -> None:
         np.testing.assert_allclose(sinr, expected, rtol=1e-9)
 
 
-def test_bad_input_is_named() -> None:
+def test_bad_input_is_named():
     h, array = rayleigh(), wr.PlanarArray(2, 2)
     for change, message in (
         ({"channels": rank_one(h) + 1e-10j}, "not Hermitian"),
@@ -123,7 +121,7 @@ def test_bad_input_is_named() -> None:
         wr.channel.transmit_covariance(replace(diffuse(0), theta_t=np.full(5, np.nan)), array)
 
 
-def test_a_user_without_power_counts_as_dark_where_rates_are_reckoned() -> None:
+def test_a_user_without_power_counts_as_dark_where_rates_are_reckoned():
     h = rayleigh()
     w = wr.channel.precoders(h, "zf", noise=1e-9)
     dark = h.copy()

@@ -183,6 +183,9 @@ def test_relative_delays_turn_all_by_one_phase():
 def test_several_receivers_are_each_alone():
     parts = [random_paths(n, seed=n) for n in (7, 3, 12)] + [random_paths(3).select([])]
     both = Paths.stack(parts)
+    none = ~both.valid
+    assert none.sum(axis=1).tolist() == [5, 9, 0, 12]
+    assert np.isnan(both.tau[none]).all() and not both.gain[none].any() and (both.kind[none] == "").all()
     f = BAND.frequencies_hz(40)
     a = PlanarArray(2, 2)
     h = both.cfr(f, tx_array=a)

@@ -23,17 +23,17 @@ PUBLISHED = np.array(
 )
 
 
-def test_published_values_are_met() -> None:
+def test_published_values_are_met():
     frequency, expected = PUBLISHED[:, 0] * 1e9, PUBLISHED[:, 1:].sum(axis=1)
     np.testing.assert_allclose(1e3 * gas_attenuation_db_per_m(frequency), expected, rtol=1e-6)
 
 
-def test_one_frequency_gives_a_float_and_several_their_shape() -> None:
+def test_one_frequency_gives_a_float_and_several_their_shape():
     assert isinstance(gas_attenuation_db_per_m(300e9), float)
     assert gas_attenuation_db_per_m(np.full((2, 3), 300e9)).shape == (2, 3)
 
 
-def test_dry_air_and_vapour_alone_lose_less_and_vacuum_nothing() -> None:
+def test_dry_air_and_vapour_alone_lose_less_and_vacuum_nothing():
     both = gas_attenuation_db_per_m(300e9)
     dry = gas_attenuation_db_per_m(300e9, water_vapour_g_m3=0.0)
     assert 0 < dry < 0.1 * both  # vapour rules at 300 GHz

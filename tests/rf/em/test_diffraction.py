@@ -127,9 +127,8 @@ def test_total_is_continuous_where_paths_end(wavelengths, metal, n, sheet, heigh
         power = [(np.abs(side) ** 2).sum() for side in sides]
         assert abs(10 * np.log10(power[2] / power[1])) < 0.01
         assert np.abs(sides[2] - sides[1]).max() < 1e-3 * np.abs(sides[1]).max()
-        if (
-            height == 0
-        ):  # dipoles along and across the edge, whose patterns have no slope there: so has the sum no kink
+        # Dipoles along and across the edge, whose patterns have no slope there: so has the sum no kink.
+        if height == 0:
             across = [np.array([-np.sin(x), np.cos(x), 0.0]) for x in (phi, edge)]
             field = np.array([(side[2, 2], across[0] @ side @ across[1]) for side in sides])
             slopes = np.diff(field, axis=0)

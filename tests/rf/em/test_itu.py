@@ -13,13 +13,7 @@ from warprrf.rf.em.materials import (
 )
 
 
-def test_the_table_is_sionnas_row_by_row():
-    from sionna_room import sionna_or_skip
-
-    sionna_or_skip()
-    from warprrf.rf.scene_sionna import sionna_rt
-
-    sionna_rt()
+def test_the_table_is_sionnas_row_by_row(rt):
     from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES as THEIRS
 
     assert ITU_BANDS.keys() == THEIRS.keys()

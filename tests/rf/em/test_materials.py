@@ -1,11 +1,8 @@
 """Radio materials: the recommendation's rows, their bands, and scattering from roughness."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,18 +15,18 @@ TABLE = ROOT / "data" / "lobby" / "materials.json"
 
 
 @pytest.fixture(scope="module")
-def table() -> dict[str, Material]:
+def table():
     return load_materials(TABLE)
 
 
-def test_concrete_at_300_ghz_has_the_recommended_permittivity(table: dict[str, Material]) -> None:
+def test_concrete_at_300_ghz_has_the_recommended_permittivity(table):
     # ITU-R P.2040-4: 5.17 and 0.0145 f^1.09 S/m; sigma / (2 pi f eps0) = 17.98 sigma / f[GHz]
     eta = table["concrete"].permittivity(300e9)
     assert eta.real == pytest.approx(5.17)
     assert eta.imag == pytest.approx(-17.975 * 0.0145 * 300**1.09 / 300, rel=1e-3)
 
 
-def test_roughness_keeps_the_energy_of_the_mirror_direction() -> None:
+def test_roughness_keeps_the_energy_of_the_mirror_direction():
     # S^2 + rho^2 = 1 with rho the Rayleigh factor
     wavelength = 299792458.0 / 140e9
     rho = math.exp(-8 * (math.pi * 0.08e-3 / wavelength) ** 2)
@@ -37,7 +34,7 @@ def test_roughness_keeps_the_energy_of_the_mirror_direction() -> None:
     assert roughness_scattering(0.0, 140e9) == 0
 
 
-def test_the_first_row_that_holds_counts() -> None:
+def test_the_first_row_that_holds_counts():
     rows = (Band(200e9, 400e9, 2, 0, 0, 0), Band(100e9, 400e9, 3, 0, 0, 0))
     material = Material("two rows", rows)
     assert material.relative_permittivity(300e9) == 2
@@ -57,12 +54,12 @@ def test_the_first_row_that_holds_counts() -> None:
         ("alpha_r", 2.5),
     ],
 )
-def test_a_custom_material_gives_no_power(name: str, value: object) -> None:
+def test_a_custom_material_gives_no_power(name, value):
     with pytest.raises((ValueError, TypeError), match=name):
         Material.custom("m", **({"relative_permittivity": 3.0} | {name: value}))
 
 
-def test_no_material_gives_back_more_than_comes() -> None:
+def test_no_material_gives_back_more_than_comes():
     """|r|^2 + |t|^2 <= 1 for both polarisations, of any material that is accepted, thin, thick or endless."""
     rng = np.random.default_rng(5)
     frequencies, cosines = 10 ** rng.uniform(6, 13, 400), rng.uniform(0, 1, (200, 1))
@@ -87,7 +84,7 @@ def test_no_material_gives_back_more_than_comes() -> None:
         assert power.min() < 0.9  # some absorb
 
 
-def test_beyond_total_reflection_a_thick_slab_without_loss_gives_back_all() -> None:
+def test_beyond_total_reflection_a_thick_slab_without_loss_gives_back_all():
     """sin^2 of the incidence above eta: the wave within decays, |r| = 1 of an endless one, and nothing comes through."""
     grazing = np.array([0.05, 0.3, 0.6])
     for thickness in (10.0, np.inf):
@@ -107,12 +104,12 @@ def test_beyond_total_reflection_a_thick_slab_without_loss_gives_back_all() -> N
         ((1e9, 100e9, 3, 0, 0.01, 400), "conductivity.* at 100 GHz"),
     ],
 )
-def test_a_row_that_gives_power_somewhere_in_its_band_is_refused(row: tuple, message: str) -> None:
+def test_a_row_that_gives_power_somewhere_in_its_band_is_refused(row, message):
     with pytest.raises((ValueError, TypeError), match=message):
         Band(*row)
 
 
-def test_a_table_may_give_the_scattering_coefficient_itself_and_names_a_material_once(tmp_path: Path) -> None:
+def test_a_table_may_give_the_scattering_coefficient_itself_and_names_a_material_once(tmp_path):
     content, file = json.loads(TABLE.read_text()), tmp_path / "materials.json"
     brick = next(entry for entry in content["materials"] if entry["name"] == "brick")
     del brick["roughness_m"]
@@ -140,7 +137,7 @@ def test_a_table_may_give_the_scattering_coefficient_itself_and_names_a_material
             load_materials(file)
 
 
-def test_a_written_entry_reads_as_the_same_material(table: dict[str, Material], tmp_path: Path) -> None:
+def test_a_written_entry_reads_as_the_same_material(table, tmp_path):
     given = [
         *table.values(),
         Material.custom("own", relative_permittivity=2.5, scattering=0.3, pattern="directive", alpha_r=7),
@@ -159,7 +156,7 @@ def test_a_written_entry_reads_as_the_same_material(table: dict[str, Material], 
             assert again.alpha_r == material.alpha_r
 
 
-def test_every_value_of_the_table_has_a_source() -> None:
+def test_every_value_of_the_table_has_a_source():
     for entry in json.loads(TABLE.read_text())["materials"]:
         parts = [*entry["permittivity"], *(entry[k] for k in ("thickness_m", "roughness_m", "pattern"))]
         assert all(p["source"].startswith(("ITU-R P.2040-4", "assumed")) for p in parts)

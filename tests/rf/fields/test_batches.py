@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from warprrf.rf.spectra.spectrum import pixel_solid_angles
 
 PLACES, OTHER = RECEIVERS[:6], TX + [0.4, 0.2, -0.3]
 F = np.linspace(299e9, 301e9, 5)
+MODELS = ["bistatic", "rf3dgs+", "rf3dgs"]
 ARRAYS = {
     "tx_array": wr.PlanarArray(1, 2),
     "rx_array": wr.PlanarArray(3, 1, pattern=wr.horn(0.9)),
@@ -28,7 +30,8 @@ ARRAYS = {
 }
 
 
-def fitted(model: str = "bistatic") -> wr.RadioField:
+@cache
+def fitted(model):
     walls, box = SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5), SlabMaterial("box", 6.0, 0.5, np.inf, 0.8)
     scene = furnished(walls, box)
     ds = spectra(scene, PLACES[:3], shape=(12, 24), sigma=0.15)
@@ -38,19 +41,19 @@ def fitted(model: str = "bistatic") -> wr.RadioField:
 
 
 @pytest.fixture(scope="module")
-def field() -> wr.RadioField:
-    return fitted()
+def field():
+    return fitted("bistatic")
 
 
 @pytest.fixture(autouse=True)
-def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+def small_parts(monkeypatch):
     monkeypatch.setattr(batches, "AT_ONCE", 2)
 
 
-def answers(field: wr.RadioField, folder: Path | None = None, **how: Any) -> list[np.ndarray]:
+def answers(field, folder=None, **how):
     """Spectra, responses and gains of paths at all places."""
 
-    def store(name: str) -> dict[str, Any]:
+    def store(name):
         return how if folder is None else how | {"store": folder / name}
 
     paths = field.paths(PLACES, max_paths=7, **store("paths.nc"))
@@ -60,10 +63,10 @@ def answers(field: wr.RadioField, folder: Path | None = None, **how: Any) -> lis
     ]  # fmt: skip
 
 
-def test_a_row_is_what_its_link_gets_alone_without_a_receiver_axis(
-    field: wr.RadioField, tmp_path: Path
-) -> None:
-    own, stored = np.array([TX, OTHER, TX, OTHER, OTHER, TX]), {}
+@pytest.mark.parametrize("model", MODELS)
+def test_a_row_is_what_its_link_gets_alone_without_a_receiver_axis(model, tmp_path):
+    field, other = fitted(model), TX if model == "rf3dgs" else OTHER  # which knows its own transmitter alone
+    own, stored = np.array([TX, other, TX, other, other, TX]), {}
     verbs: dict[str, Any] = {
         "spectrum": lambda *at: field.spectrum(*at).path_gain, "links": lambda *at: field.links(*at).total_path_gain,
         "array": lambda *at: field.array_spectrum(at[0], wr.PlanarArray(2, 2), [[1.0, 0, 0]], at[1]),
@@ -73,18 +76,20 @@ def test_a_row_is_what_its_link_gets_alone_without_a_receiver_axis(
         "cfr": lambda at, source, **how: field.cfr(at, F, source, **ARRAYS, **how),
     }  # fmt: skip
     for name, ask in verbs.items():
-        rows, alone, shared = ask(PLACES, own), ask(PLACES[1], OTHER), ask(PLACES[1], own)
+        if name == "array" and model != "bistatic":
+            continue
+        rows, alone, shared = ask(PLACES, own), ask(PLACES[1], other), ask(PLACES[1], own)
         for row in (rows[1], shared[1], shared[3]):  # those of paths are padded
             row = row[: len(alone)] if alone.ndim else row
             np.testing.assert_allclose(row, alone, rtol=1e-5, atol=1e-6 * np.abs(alone).max(), err_msg=name)
         for _ in range(2 if name in ("spectra", "paths", "cfr") else 0):
-            np.testing.assert_array_equal(ask(PLACES[1], OTHER, store=tmp_path / name), alone)
+            np.testing.assert_array_equal(ask(PLACES[1], other, store=tmp_path / name), alone)
         stored[name] = rows
     assert wr.Paths.load(tmp_path / "paths").receiver.shape == (3,)
     np.testing.assert_allclose(
         stored["spectra"], stored["spectrum"], rtol=1e-6, atol=1e-6 * stored["spectrum"].max()
     )
-    np.testing.assert_array_equal(field.paths(PLACES, own, 5).transmitter, own)
+    assert (field.paths(PLACES, own, 5).transmitter == own).all()
     for cfr, *link in zip(stored["cfr"], PLACES, own, strict=True):
         np.testing.assert_allclose(
             cfr, field.paths(*link).cfr(F, **ARRAYS), rtol=1e-5, atol=1e-6 * np.abs(cfr).max()
@@ -96,7 +101,7 @@ def test_a_row_is_what_its_link_gets_alone_without_a_receiver_axis(
         field.spectra([PLACES[0], PLACES[0] + 50.0])
 
 
-def test_every_model_takes_what_the_base_says() -> None:
+def test_every_model_takes_what_the_base_says():
     """Names, order, kinds and defaults of parameters, which more may follow by name; places have one name each."""
     for kind in wr.RadioField.models.values():
         for verb in (n for n in dir(wr.RadioField) if n[0] != "_" and callable(getattr(wr.RadioField, n))):
@@ -116,8 +121,8 @@ def test_every_model_takes_what_the_base_says() -> None:
             assert not {"rx", "tx", "receiver", "transmitters"} & set(names), f
 
 
-@pytest.mark.parametrize("model", ["bistatic", "rf3dgs+", "rf3dgs"])
-def test_a_field_answers_on_any_grid(model: str) -> None:
+@pytest.mark.parametrize("model", MODELS)
+def test_a_field_answers_on_any_grid(model):
     """A pixel's centre has its power per solid angle on every grid that has it; totals of scattering are the room's; floor
     and range are a pixel's."""
     field, finer = fitted(model), (36, 72)
@@ -140,7 +145,7 @@ def test_a_field_answers_on_any_grid(model: str) -> None:
     assert wr.evaluate(truth, field.spectrum)["psnr_db"] > 100
 
 
-def test_a_store_holds_the_same_bits_and_is_known_again(field: wr.RadioField, tmp_path: Path) -> None:
+def test_a_store_holds_the_same_bits_and_is_known_again(field, tmp_path):
     for a, b, c in zip(answers(field), answers(field, tmp_path), answers(field, tmp_path), strict=True):
         np.testing.assert_array_equal(a, b)
         np.testing.assert_array_equal(a, c)
@@ -151,7 +156,7 @@ def test_a_store_holds_the_same_bits_and_is_known_again(field: wr.RadioField, tm
     assert {file.suffix for file in tmp_path.iterdir()} == {".nc"}  # nothing is left beside them
 
 
-def test_a_store_of_something_else_is_refused(field: wr.RadioField, tmp_path: Path) -> None:
+def test_a_store_of_something_else_is_refused(field, tmp_path):
     file = tmp_path / "spectra.nc"
     field.spectra(PLACES, store=file)
     before = file.read_bytes()
@@ -186,7 +191,7 @@ field.spectra(places, store=sys.argv[3], progress=tell)
 """
 
 
-def test_a_killed_process_loses_only_what_it_was_at(field: wr.RadioField, tmp_path: Path) -> None:
+def test_a_killed_process_loses_only_what_it_was_at(field, tmp_path):
     field.save(tmp_path / "field.safetensors")
     field = wr.RadioField.load(tmp_path / "field.safetensors")
     np.save(tmp_path / "places.npy", PLACES)
@@ -202,7 +207,7 @@ def test_a_killed_process_loses_only_what_it_was_at(field: wr.RadioField, tmp_pa
     with pytest.raises(ValueError, match="another field"):
         field.spectra(PLACES, OTHER, store=names[2])
 
-    def stop(*_: object) -> None:
+    def stop(*_):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -217,7 +222,7 @@ def test_a_killed_process_loses_only_what_it_was_at(field: wr.RadioField, tmp_pa
 GAIN = np.arange(30.0).reshape(6, 5)
 
 
-def fill(file: Path, rows: int = 6) -> np.ndarray:
+def fill(file, rows=6):
     """What a store of :data:`GAIN` holds, its first ``rows`` written at most."""
     variables = {
         "receiver_position": Variable(("receiver", "xyz")),
@@ -230,14 +235,12 @@ def fill(file: Path, rows: int = 6) -> np.ndarray:
 
 
 @pytest.mark.parametrize("opened", [False, True])
-def test_a_store_that_another_process_finishes_meanwhile_is_read(
-    opened: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_that_another_process_finishes_meanwhile_is_read(opened, tmp_path, monkeypatch):
     file, unfinished, open_ = tmp_path / "gain.nc", tmp_path / "gain.nc.unfinished", Store._open
     fill(file)
     os.rename(file, unfinished)  # as it is just before its last step
 
-    def late(self: Store, path: Path) -> None:
+    def late(self, path):
         if opened:
             open_(self, path)
         os.rename(unfinished, file)
@@ -248,7 +251,7 @@ def test_a_store_that_another_process_finishes_meanwhile_is_read(
     np.testing.assert_array_equal(fill(file), GAIN)
 
 
-def test_a_limit_of_the_size_of_files_is_an_error_that_names_the_store(tmp_path: Path) -> None:
+def test_a_limit_of_the_size_of_files_is_an_error_that_names_the_store(tmp_path):
     """In a process of its own: HDF5 crashed at its first failure."""
     fill(tmp_path / "whole.nc")
     assert (tmp_path / "whole.nc").stat().st_size > 7000

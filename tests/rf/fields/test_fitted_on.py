@@ -1,7 +1,6 @@
 """A field knows which receivers it was fitted on, and scoring says so when they are among those scored."""
 
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,12 +15,12 @@ QUICK = {"bistatic": {"quick": True}, "rf3dgs+": {"iterations": 2}, "rf3dgs": {"
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def room(tmp_path_factory):
     return small_room(tmp_path_factory.mktemp("room"))
 
 
 @pytest.mark.parametrize("model", QUICK)
-def test_a_field_and_its_file_know_what_it_was_fitted_on(model: str, room: Path, tmp_path: Path) -> None:
+def test_a_field_and_its_file_know_what_it_was_fitted_on(model, room, tmp_path):
     ds = wr.SpectrumDataset.load(room / "spectra.nc")
     mixed = ds.subset([0, 1, 2, 11])  # the last one is for test
     field = wr.RadioField.fit(wr.Reconstruction.load(room / "reconstruction"), mixed, model, **QUICK[model])
@@ -49,7 +48,7 @@ def test_a_field_and_its_file_know_what_it_was_fitted_on(model: str, room: Path,
     assert not figures.exists()
 
 
-def test_a_lookup_knows_what_it_was_built_from(room: Path) -> None:
+def test_a_lookup_knows_what_it_was_built_from(room):
     ds = wr.SpectrumDataset.load(room / "spectra.nc")
     for build in (lookups.nearest, lookups.idw, lookups.constant, lookups.mean):
         with pytest.warns(UserWarning, match="fitted on"):

@@ -24,11 +24,19 @@ def scene(tmp_path_factory):
     return write_scene(tmp_path_factory.mktemp("scene"))
 
 
+COMMON = {"transmitter": TX, "frequency_hz": F, "shape": SHAPE}
+
+
 @pytest.fixture(scope="module")
-def engines(scene):
-    sionna = sionna_or_skip()
-    common = {"transmitter": TX, "frequency_hz": F, "shape": SHAPE}
-    return ExactEngine(scene, **common), sionna(scene, sampling=Sampling(depth=1), **common)
+def sionna(scene):
+    """Sionna's engine, of this scene unless told."""
+    engine = sionna_or_skip()
+    return lambda room=scene, **sampling: engine(room, sampling=Sampling(**sampling), **COMMON)
+
+
+@pytest.fixture(scope="module")
+def engines(scene, sionna):
+    return ExactEngine(scene, **COMMON), sionna(depth=1)
 
 
 @pytest.mark.parametrize("rx", [SEES, BLOCKED])
@@ -38,12 +46,9 @@ def test_total_diffuse_power_agrees_within_half_a_percent(engines, rx):
     assert ours.diffuse(rx).power.sum() == pytest.approx(found.power[found.kind == "diffuse"].sum(), rel=5e-3)
 
 
-def test_one_seed_gives_the_same_paths_in_the_same_order(scene):
+def test_one_seed_gives_the_same_paths_in_the_same_order(sionna):
     """Sionna itself stores them in whatever order its threads end."""
-    sionna = sionna_or_skip()
-    engine = sionna(
-        scene, sampling=Sampling(depth=2, samples=20_000), transmitter=TX, frequency_hz=F, shape=SHAPE
-    )
+    engine = sionna(depth=2, samples=20_000)
     first = engine.solve(SEES)
     assert len(first.tau) > 5000 and (np.diff(first.tau) >= 0).all()
     for _ in range(4):
@@ -65,42 +70,33 @@ def test_spectra_have_the_same_shape_and_the_same_strongest_pixel(engines):
 
 def test_more_bounces_bring_more_power_and_simulate_says_how(scene):
     sionna_or_skip()
-    options = {
-        "transmitter": TX,
-        "receivers": [BLOCKED],
-        "frequency_hz": F,
-        "shape": SHAPE,
-        "engine": "sionna",
-    }
-    one, three = (simulate(scene, depth=n, samples=100_000, **options) for n in (1, 3))
+    options = COMMON | {"receivers": [BLOCKED], "engine": "sionna", "samples": 100_000}
+    one, three = (simulate(scene, depth=n, **options) for n in (1, 3))
     assert 1.05 < three.path_gain.sum() / one.path_gain.sum() < 10
     assert (three.attributes["depth"], three.attributes["samples"]) == (3, 100_000)
     assert three.attributes["version_sionna_rt"] and not three.line_of_sight[0]
 
 
-def test_a_scene_needs_no_file_and_its_own_devices_play_no_part(engines, scene):
+def test_a_scene_needs_no_file_and_its_own_devices_play_no_part(engines, sionna, scene):
     bare = Scene(
         scene.mesh, scene.materials, scene.face_material, transmitters={"tx": TX + 1}, receivers={"rx": SEES}
     )
-    engine = type(engines[1])(bare, transmitter=TX, frequency_hz=F, shape=SHAPE, sampling=Sampling(depth=1))
-    found, usual = (e.solve(SEES).power.sum() for e in (engine, engines[1]))
+    found, usual = (e.solve(SEES).power.sum() for e in (sionna(bare, depth=1), engines[1]))
     assert found == pytest.approx(usual, rel=2e-3)
 
 
-def test_a_place_that_no_path_reaches_has_an_empty_spectrum(scene):
-    sionna = sionna_or_skip()
-    engine = sionna(scene, transmitter=TX, frequency_hz=F, shape=SHAPE, sampling=Sampling(depth=0))
+def test_a_place_that_no_path_reaches_has_an_empty_spectrum(sionna):
+    engine = sionna(depth=0)
     found = engine.receive(BLOCKED)
     assert not found.path_gain.any() and not found.line_of_sight
     assert np.isnan(found.delay_s).all()
     assert engine.receive(SEES).line_of_sight
 
 
-def test_reciprocal_materials_are_refused(scene):
-    sionna = sionna_or_skip()
+def test_reciprocal_materials_are_refused(sionna, scene):
     other = scene.with_materials([replace(m, reciprocal=True) for m in scene.materials])
     with pytest.raises(ValueError, match="reciprocal=False"):
-        sionna(other, transmitter=TX, frequency_hz=F, shape=SHAPE)
+        sionna(other)
 
 
 def test_an_llvm_that_aborts_is_never_chosen(monkeypatch):

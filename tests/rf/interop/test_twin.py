@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sionna_room import sionna_or_skip
 from twin_fields import BLOCKED, MATERIALS, SEES, SHAPE, SIGMA, TX, F, known_field, room
 
 import warprrf as wr
@@ -50,10 +49,8 @@ def test_the_twin_answers_as_the_room_that_the_field_knows(twin, field, receiver
 
 
 def test_materials_are_the_fields_own(twin):
-    assert [group.name for group in twin.groups] == [
-        "walls",
-        "block/top <1>",
-    ]  # by area; no face, no material
+    # By area; no face, no material.
+    assert [group.name for group in twin.groups] == ["walls", "block/top <1>"]
     for group, given, weight in zip(twin.groups, MATERIALS, (0.25, 0.64), strict=False):
         assert group.permittivity.real == pytest.approx(given.relative_permittivity, rel=2e-3)
         assert group.scattering**2 == pytest.approx(weight, rel=2e-3)
@@ -70,10 +67,7 @@ def test_materials_are_the_fields_own(twin):
         twin.groups[0].material.permittivity(140e9)
 
 
-def test_sionna_opens_the_scene_as_it_is_and_our_loader_sets_the_scattering_patterns_too(twin):
-    sionna_or_skip()
-    import sionna.rt as rt
-
+def test_sionna_opens_the_scene_as_it_is_and_our_loader_sets_the_scattering_patterns_too(twin, rt):
     bare = rt.load_scene(str(twin.xml), merge_shapes=False)
     loaded = wr.interop.load_sionna_scene(twin.xml, frequency_hz=F)
     assert loaded.frequency.numpy()[0] == pytest.approx(F)
@@ -91,8 +85,8 @@ def test_sionna_opens_the_scene_as_it_is_and_our_loader_sets_the_scattering_patt
         wr.interop.load_sionna_scene(twin.xml, frequency_hz=140e9)
 
 
+@pytest.mark.usefixtures("rt")
 def test_sionna_scatters_and_mirrors_as_the_field(twin, field):
-    sionna_or_skip()
     found = spectra(twin, [SEES], engine="sionna", depth=1, samples=400_000).path_gain[0]
     ours = field.spectrum(SEES).path_gain
     assert found.sum() == pytest.approx(ours.sum(), rel=0.01)
@@ -158,9 +152,8 @@ def test_slabs_are_as_thick_as_the_scene_or_the_caller_says_and_else_let_nothing
     assert "block/top <1>" in found.left_out[0] and "walls" not in found.left_out[0]
     assert wr.Scene.load(found.xml).materials[0].thickness_m == pytest.approx(0.02)
     nowhere = replace(unknown, surface=replace(field.surface, thickness_m=np.full(3, np.nan)))
-    alike = replace(
-        nowhere, material=np.array([0, 0, 1])
-    )  # one material is one slab, however little is known
+    # One material is one slab, however little is known.
+    alike = replace(nowhere, material=np.array([0, 0, 1]))
     assert [group.name for group in wr.interop.write_twin(alike, tmp_path / "alike").groups] == ["walls"]
     given = wr.interop.write_twin(unknown, tmp_path / "given", thickness_m={"block/top <1>": 0.3})
     assert [group.thickness_m for group in given.groups] == [0.02, 0.3] and given.left_out == ()

@@ -1,18 +1,17 @@
 """Radio maps and links without spectra: closed forms, the field's own spectra, walls and air, files, bad input."""
 
 from dataclasses import replace
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from furnished import RECEIVERS, SHAPE, SIGMA, TX, F, spectra
-from radio_scenes import RadioScene, box_mesh
+from radio_scenes import box_mesh
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.observations import Frame
 from warprrf.rf.maps.links import BeamSearch, directivity, links_of
 from warprrf.rf.maps.radio_map import QUANTITIES, RadioMap, is_free
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_solid_angles
@@ -24,29 +23,26 @@ EVERYTHING = Effects(mirrors=2, scatterings=2, residual=False)
 PLACES = RECEIVERS[[0, 1, 3, 5, 9]]
 
 
-def prior(scene: object, effects: Effects) -> BistaticField:
-    known = SimpleNamespace(
-        transmitter=TX, frequency_hz=F, path_gain=np.zeros((1, *SHAPE)), floor=1e-16, range_db=(-150.0, -90.0),
-        beam_sigma_rad=SIGMA,
-    )  # fmt: skip
+def prior(scene, effects):
+    known = Frame(TX, F, SHAPE, 1e-16, (-150.0, -90.0), SIGMA, None)
     return BistaticField.prior(scene, known, effects=effects)
 
 
 @pytest.fixture(scope="module")
-def whole(scene: RadioScene) -> BistaticField:
+def whole(scene):
     return prior(scene, EVERYTHING)
 
 
 @pytest.fixture(scope="module")
-def found(whole: BistaticField) -> RadioMap:
+def found(whole):
     return whole.radio_map(1.2, 0.5, beam_sigma_rad=SIGMA)
 
 
-def db(ratio: np.ndarray) -> np.ndarray:
+def db(ratio):
     return np.abs(10.0 * np.log10(ratio))
 
 
-def test_an_empty_room_of_line_of_sight_alone_is_friis() -> None:
+def test_an_empty_room_of_line_of_sight_alone_is_friis():
     room = Mesh(*box_mesh([0, 0, 0], [5, 4, 3], inward=True))
     m = prior(room, Effects(mirrors=0, scatterings=0, transmissions=0)).radio_map(
         1.5, 0.4, transmit_power_dbm=10.0
@@ -63,7 +59,7 @@ def test_an_empty_room_of_line_of_sight_alone_is_friis() -> None:
     assert m.noise_power_dbm == pytest.approx(-173.975 + 10.0 * np.log10(2.16e9) + 10.0, abs=1e-3)
 
 
-def test_directivity_has_mean_one_over_the_sphere() -> None:
+def test_directivity_has_mean_one_over_the_sphere():
     shape = (400, 800)
     cosine = pixel_directions(shape) @ np.array([0.36, 0.48, 0.8])
     for sigma in (0.05, 0.3, 2.0):
@@ -71,7 +67,7 @@ def test_directivity_has_mean_one_over_the_sphere() -> None:
         assert mean == pytest.approx(1.0, rel=2e-3)
 
 
-def test_two_paths_within_a_beam_add_up_and_apart_do_not() -> None:
+def test_two_paths_within_a_beam_add_up_and_apart_do_not():
     search = BeamSearch((20, 40), np.radians(5.0))
     a, b = np.array([1.0, 0.0, 0.0]), np.array([np.cos(0.02), np.sin(0.02), 0.0])
     dark = np.zeros((1, 20, 40))
@@ -82,13 +78,13 @@ def test_two_paths_within_a_beam_add_up_and_apart_do_not() -> None:
     assert apart == pytest.approx(peak, rel=1e-9)
 
 
-def test_even_light_gives_any_beam_the_isotropic_gain() -> None:
+def test_even_light_gives_any_beam_the_isotropic_gain():
     even = np.broadcast_to(pixel_solid_angles((20, 40))[:, None] / (4.0 * np.pi), (1, 20, 40)).copy()
     none = np.zeros(0, int), np.zeros((0, 3)), np.zeros(0)
     assert BeamSearch((20, 40), 0.1)(even, *none)[0] == pytest.approx(1.0, rel=0.02)
 
 
-def test_map_is_what_the_spectra_sum_to(whole: BistaticField, found: RadioMap) -> None:
+def test_map_is_what_the_spectra_sum_to(whole, found):
     rows, columns = np.nonzero(found.free)
     search = BeamSearch(SHAPE, SIGMA)
     for k in range(0, len(rows), 11):
@@ -105,7 +101,7 @@ def test_map_is_what_the_spectra_sum_to(whole: BistaticField, found: RadioMap) -
         assert found.delay_spread_s[cell] == pytest.approx(truth.delay_spread_s[0], abs=0.2e-9)
 
 
-def test_more_rays_come_closer(whole: BistaticField) -> None:
+def test_more_rays_come_closer(whole):
     truth = np.array([whole.spectrum(p).total_path_gain for p in PLACES])
     error = [
         np.sqrt(np.mean(db(whole.links(PLACES, shape=shape).total_path_gain / truth) ** 2))
@@ -116,7 +112,7 @@ def test_more_rays_come_closer(whole: BistaticField) -> None:
 
 
 @pytest.mark.parametrize("order", [0, 1, 2])
-def test_fewer_mirrors_are_those_of_a_field_with_fewer(whole: BistaticField, order: int) -> None:
+def test_fewer_mirrors_are_those_of_a_field_with_fewer(whole, order):
     fewer = replace(whole, effects=replace(whole.effects, mirrors=order))
     expected, found = fewer.links(PLACES), whole.links(PLACES, mirror_order=order)
     for name, value in vars(expected).items():
@@ -129,7 +125,7 @@ def test_fewer_mirrors_are_those_of_a_field_with_fewer(whole: BistaticField, ord
     )
 
 
-def test_a_harmonic_field_has_maps_too(scene: RadioScene) -> None:
+def test_a_harmonic_field_has_maps_too(scene):
     ds = spectra(scene, PLACES, shape=(12, 24), sigma=np.radians(10.0), sub_pixels=2)
     field = RadioField.fit(scene, ds, model="rf3dgs+", iterations=3)
     with pytest.raises(
@@ -143,7 +139,7 @@ def test_a_harmonic_field_has_maps_too(scene: RadioScene) -> None:
         assert m.total_path_gain[row, column] == pytest.approx(sum_, rel=1e-5)
 
 
-def test_solids_are_no_cells_even_of_a_torn_mesh(scene: RadioScene) -> None:
+def test_solids_are_no_cells_even_of_a_torn_mesh(scene):
     rng = np.random.default_rng(0)
     surface = Surface.of(scene).mesh  # faces of a tenth of a metre
     torn = Mesh(surface.vertices, surface.faces[rng.random(len(surface.faces)) > 0.1])
@@ -156,7 +152,7 @@ def test_solids_are_no_cells_even_of_a_torn_mesh(scene: RadioScene) -> None:
         np.testing.assert_array_equal(is_free(mesh, points, TX)[clear], (room & ~box)[clear])
 
 
-def test_a_map_that_other_tools_turned_is_read_by_its_coordinates(found: RadioMap, tmp_path: Path) -> None:
+def test_a_map_that_other_tools_turned_is_read_by_its_coordinates(found, tmp_path):
     xarray = pytest.importorskip("xarray")
     found.save(tmp_path / "a.nc")
     with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf", decode_timedelta=False) as opened:
@@ -172,12 +168,12 @@ def test_a_map_that_other_tools_turned_is_read_by_its_coordinates(found: RadioMa
 @pytest.mark.parametrize(
     ("name", "value"), [("total_path_gain", -1.0), ("best_beam_gain", np.inf), ("cell_m", 0.0)]
 )
-def test_fields_that_no_map_has_are_refused(found: RadioMap, name: str, value: float) -> None:
+def test_fields_that_no_map_has_are_refused(found, name, value):
     with pytest.raises(ValueError, match=f"^{name}: "):
         replace(found, **{name: np.full_like(getattr(found, name), value)})
 
 
-def test_pictures_show_every_quantity(found: RadioMap, tmp_path: Path) -> None:
+def test_pictures_show_every_quantity(found, tmp_path):
     pytest.importorskip("matplotlib")
     found.picture(tmp_path / "map.png")
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
@@ -195,6 +191,6 @@ def test_pictures_show_every_quantity(found: RadioMap, tmp_path: Path) -> None:
         ({"mirror_order": 4}, "mirror_order: got 4, expected 0 to 3"),
     ],
 )
-def test_bad_input_is_named(whole: BistaticField, change: dict, message: str) -> None:
+def test_bad_input_is_named(whole, change, message):
     with pytest.raises(ValueError, match=message):
         whole.radio_map(**({"height": 1.2, "cell": 0.5} | change))

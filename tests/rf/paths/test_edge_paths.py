@@ -86,9 +86,8 @@ def test_what_a_path_over_an_edge_says_of_itself(tmp_path):
     one = p[0].select(p[0].kind == "edge")
     assert set(map(tuple, one.interactions[:, :2].tolist())) >= {(8, 0), (1, 8), (8, 1)}
     np.testing.assert_allclose(one.power, 0.5 * (np.abs(one.jones) ** 2).sum(axis=(1, 2)), rtol=1e-12)
-    for k in np.flatnonzero(
-        one.interactions[:, 1] == 0
-    ):  # equal angles with an edge, which all are along an axis
+    # Equal angles with an edge, which all are along an axis.
+    for k in np.flatnonzero(one.interactions[:, 1] == 0):
         point = one.vertices[k, 0]
         legs = point - one.transmitter, one.receiver - point
         slopes = np.abs(legs[0] / np.linalg.norm(legs[0]) - legs[1] / np.linalg.norm(legs[1]))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from path_makers import CARRIER, random_paths
 from places import LOBBY
+from sionna_room import placed
 
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.interop.sionna_engine import load_sionna_scene
@@ -16,24 +17,17 @@ TX = np.array([13.6, 11.2, 2.5])
 RECEIVERS = np.array([[7.0, 4.0, 1.5], [3.1, 9.2, 1.2], [15.0, 3.0, 1.7]])
 
 
-def solve(rt, scene, tx_array, rx_array, depth=2):
-    loaded = load_sionna_scene(scene, frequency_hz=CARRIER)
-    loaded.tx_array, loaded.rx_array = tx_array, rx_array
-    loaded.add(rt.Transmitter("tx", position=TX.tolist()))
-    for k, point in enumerate(RECEIVERS):
-        loaded.add(rt.Receiver(f"rx{k}", position=point.tolist()))
+def solve(rt, array=None, depth=2):
+    loaded = load_sionna_scene(LOBBY / "scene.xml", frequency_hz=CARRIER)
+    placed(rt, loaded, TX, RECEIVERS, array)
     return rt.PathSolver(deterministic=True)(
         loaded, max_depth=depth, samples_per_src=200_000, synthetic_array=True, refraction=False, seed=1
     )
 
 
-def element(rt, polarisation="VH"):
-    return rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization=polarisation)
-
-
 @pytest.fixture(scope="module")
 def solved(rt):
-    return solve(rt, LOBBY / "scene.xml", element(rt), element(rt))
+    return solve(rt)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +63,7 @@ def test_lobby_paths_agree(solved, traced):
 @pytest.mark.parametrize("polarisation", ["V", "cross"])
 def test_arrays_and_patterns_are_theirs(rt, traced, pattern, polarisation):
     shape = {"num_rows": 2, "num_cols": 3, "pattern": pattern[0], "polarization": polarisation}
-    theirs = solve(rt, LOBBY / "scene.xml", rt.PlanarArray(**shape), rt.PlanarArray(**shape), depth=0)
+    theirs = solve(rt, rt.PlanarArray(**shape), depth=0)
     a = PlanarArray(2, 3, pattern=pattern[1], polarisation=polarisation)
     ours = traced.to_sionna(a, a)
     for r in range(len(RECEIVERS)):
@@ -85,12 +79,9 @@ def test_arrays_and_patterns_are_theirs(rt, traced, pattern, polarisation):
 def test_paths_through_walls_and_round_edges_are_taken_too(rt):
     """Refraction is on by default: every path's power is half that of its four coefficients, and spectra hold them all."""
     room = rt.load_scene(rt.scene.box_one_screen)
-    room.tx_array = room.rx_array = element(rt)
     low, high = (np.ravel(corner) for corner in (room.mi_scene.bbox().min, room.mi_scene.bbox().max))
     places = low + (high - low) * [[0.2, 0.3, 0.6], [0.8, 0.7, 0.3], [0.3, 0.6, 0.5]]
-    room.add(rt.Transmitter("tx", position=places[0].tolist()))
-    for k in (1, 2):
-        room.add(rt.Receiver(f"rx{k}", position=places[k].tolist()))
+    placed(rt, room, places[0], places[1:])
     theirs = rt.PathSolver()(room, max_depth=2, diffraction=True, edge_diffraction=True)
     valid, bounces = theirs.valid.numpy()[:, 0], theirs.interactions.numpy()[:, :, 0]
     assert {4, 8} <= set(np.unique(bounces[:, valid]))
@@ -103,7 +94,7 @@ def test_paths_through_walls_and_round_edges_are_taken_too(rt):
     np.testing.assert_allclose(ds.path_gain.sum(axis=(1, 2)), total, rtol=1e-5)
     np.testing.assert_allclose(ds.receivers, places[1:], atol=1e-5)
     assert ds.line_of_sight.tolist() == [False, True]
-    room.tx_array = element(rt, "V")
+    room.tx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
     with pytest.raises(ValueError, match=r"scene.tx_array .* PlanarArray\(num_rows=1"):
         Paths.from_sionna(rt.PathSolver()(room, max_depth=1), frequency_hz=3.5e9)
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from sionna_room import placed
 
 import warprrf as wr
 from warprrf.rf.paths.path_set import Paths
@@ -29,10 +30,7 @@ def test_every_path_of_path_solver_is_found(name, rt):
     path = getattr(rt.scene, name)
     live = rt.load_scene(path, merge_shapes=False)
     live.frequency = F
-    live.tx_array = live.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="VH")
-    live.add(rt.Transmitter("tx", position=list(transmitter)))
-    for k, point in enumerate(receivers):
-        live.add(rt.Receiver(f"rx{k}", position=list(point)))
+    placed(rt, live, transmitter, receivers)
     solved = rt.PathSolver()(live, max_depth=2, synthetic_array=True, refraction=False, seed=1)
     theirs = Paths.from_sionna(solved, frequency_hz=F, drop_repeated=True)
     scene = wr.Scene.load(path)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from radio_scenes import box_mesh, joined
+from sionna_room import placed
 
 import warprrf as wr
 from warprrf.rf.em.materials import itu_material
@@ -35,11 +36,7 @@ def room(name):
 
 def path_solver(rt, scene, frequency_hz):
     """Of Sionna's paths with as many interactions as we ask for, by receiver: power, length, arrival, departure."""
-    live = load_sionna_scene(scene, frequency_hz=frequency_hz)
-    live.tx_array = live.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="VH")
-    live.add(rt.Transmitter("tx", position=list(TRANSMITTER)))
-    for k, place in enumerate(RECEIVERS):
-        live.add(rt.Receiver(f"rx{k}", position=list(place)))
+    live = placed(rt, load_sionna_scene(scene, frequency_hz=frequency_hz), TRANSMITTER, RECEIVERS)
     found = rt.PathSolver(deterministic=True)(
         live, max_depth=MIRRORS + CROSSINGS, samples_per_src=300_000, refraction=True, seed=1
     )

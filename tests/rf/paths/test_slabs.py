@@ -23,18 +23,18 @@ FLOORING = Material.custom("floor", relative_permittivity=3.0, conductivity=0.5,
 GLASS = itu_material("glass", thickness_m=0.01)
 
 
-def pane(x: float) -> tuple[np.ndarray, np.ndarray]:
+def pane(x):
     corners = [[x, y, z] for y, z in ((-6, 0.001), (6, 0.001), (6, 6), (-6, 6))]
     return np.array(corners), np.array([[0, 1, 2], [0, 2, 3]])
 
 
-def room(wall: tuple[np.ndarray, np.ndarray], glass: Material = GLASS) -> Scene:
+def room(wall, glass=GLASS):
     """A floor that scatters, and a wall across it."""
     mesh, part = joined(FLOOR, wall)
     return Scene(mesh, [FLOORING, glass], part)
 
 
-def paths(scene: Scene, ends: tuple[np.ndarray, np.ndarray] = (TX, RX), most: int = 3, **options):
+def paths(scene, ends=(TX, RX), most=3, **options):
     return trace_paths(
         scene,
         transmitter=ends[0],
@@ -62,14 +62,14 @@ WALLS = {
 
 
 @pytest.mark.parametrize("how", WALLS)
-def test_one_wall_lets_the_same_through_however_it_is_drawn(how: str) -> None:
+def test_one_wall_lets_the_same_through_however_it_is_drawn(how):
     expected, found = paths(SHEET), paths(WALLS[how])
     assert found.kind.tolist() == expected.kind.tolist() == ["slab", "slab"]
     np.testing.assert_allclose(found.gain, expected.gain, rtol=1e-9)
     np.testing.assert_allclose(found.tau, expected.tau, rtol=1e-12)
 
 
-def test_a_path_through_a_slab_is_what_the_slab_transmits_and_later() -> None:
+def test_a_path_through_a_slab_is_what_the_slab_transmits_and_later():
     """Amplitude, and the phase of the whole way: that of air but over the slab, and of the slab's transmission."""
     found = paths(SHEET)
     way = RX - TX
@@ -87,7 +87,7 @@ def test_a_path_through_a_slab_is_what_the_slab_transmits_and_later() -> None:
     assert found.tau[0] > length / SPEED_OF_LIGHT
 
 
-def test_ways_through_slabs_are_the_same_both_ways_and_as_many_as_asked_for() -> None:
+def test_ways_through_slabs_are_the_same_both_ways_and_as_many_as_asked_for():
     mesh, part = joined(FLOOR, pane(0.5), pane(1.0))
     scene = Scene(mesh, [FLOORING, GLASS], np.minimum(part, 1))
     there, back = paths(scene), paths(scene, (RX, TX))
@@ -98,7 +98,7 @@ def test_ways_through_slabs_are_the_same_both_ways_and_as_many_as_asked_for() ->
     assert len(paths(room(pane(1.0), metal)).tau) == 0
 
 
-def test_what_scatters_before_and_behind_a_slab_is_the_integral_over_the_floor() -> None:
+def test_what_scatters_before_and_behind_a_slab_is_the_integral_over_the_floor():
     """Lambertian scattering of a floor, lit through the pane, from a metal ceiling too, or seen through it."""
     effects = Effects(mirrors=1, scatterings=1, mirror_scatter=True, diffractions=0, residual=False)
     ceiling = FLOOR[0] + [0, 0, 6.0], FLOOR[1][:, ::-1]
@@ -118,7 +118,7 @@ def test_what_scatters_before_and_behind_a_slab_is_the_integral_over_the_floor()
     eta, thick = table.permittivity[0], table.thickness_m[0]
     wavelength_m = engine.mirrors.wavelength_m
 
-    def even(cosine: np.ndarray) -> np.ndarray:
+    def even(cosine):
         return 0.5 * sum(np.abs(r) ** 2 for r in slab_reflection(cosine, eta, thick, wavelength_m))
 
     passed = []
@@ -134,7 +134,7 @@ def test_what_scatters_before_and_behind_a_slab_is_the_integral_over_the_floor()
     assert by_field.sum() == pytest.approx(found["MTS"], rel=0.15)  # faces are lit whole
 
 
-def test_spectra_do_not_jump_at_a_shadow_s_boundary() -> None:
+def test_spectra_do_not_jump_at_a_shadow_s_boundary():
     """The receiver rises past the shadow of a half plane: the total is that of the fields, on both sides."""
     corners = np.array([[0, -50, -50], [0, -50, 0], [0, 50, 0], [0, 50, -50.0]])
     scene = Scene(
@@ -157,7 +157,7 @@ def test_spectra_do_not_jump_at_a_shadow_s_boundary() -> None:
 
 
 @pytest.mark.parametrize(("kind", "most"), [("edge", 0), ("edge", 2), ("slab", 2)])
-def test_a_field_s_paths_through_slabs_and_over_edges_are_those_that_are_traced(kind: str, most: int) -> None:
+def test_a_field_s_paths_through_slabs_and_over_edges_are_those_that_are_traced(kind, most):
     """Points, what happens there, and delays, those of slabs included."""
     frame = Frame(TX, F, (18, 36), 1e-20, (-200.0, 0.0), 0.1, None)
     effects = Effects(mirrors=1, transmissions=most, diffractions=1)

@@ -1,7 +1,6 @@
 """What a scene needs: choices that physics dictates, order among tolerances, and a fit that obeys."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.relevance.model import full_field, material_parameters, with_lobes
 from warprrf.rf.relevance.search import Relevance, relevance, relevances
-from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.tracing.model import SETS, Effects
 
 RECEIVERS = RECEIVERS[:4]
@@ -22,35 +20,35 @@ NOTHING = SlabMaterial("nothing", 1.0, 0.0, np.inf)  # reflects nothing: as good
 OPTIONS = {"transmitter": TX, "frequency_hz": F, "shape": SHAPE, "beam_sigma_rad": SIGMA}
 
 
-def plated(material: object) -> RadioScene:
+def plated(material):
     """An empty room but for a plate of one material on the floor."""
     mesh, part = joined(ROOM, box_mesh([0.2, 0.2, 0.01], [4.8, 3.8, 0.05]))
     return RadioScene(mesh, part, [NOTHING, material])
 
 
-def metal(roughness_m: float) -> Material:
+def metal(roughness_m):
     return replace(
         Material.conductor(pattern="directive", alpha_r=4), scattering=roughness_scattering(roughness_m, F)
     )
 
 
 @pytest.fixture(scope="module")
-def slabs() -> RadioScene:
+def slabs():
     walls = SlabMaterial("walls", 3.0, 0.5, 0.1, 0.5, "directive", 4)
     return furnished(walls, SlabMaterial("box", 6.0, 0.5, 0.1, 0.8))
 
 
 @pytest.fixture(scope="module")
-def data(slabs: RadioScene) -> SpectrumDataset:
+def data(slabs):
     return spectra(slabs, RECEIVERS, sub_pixels=4)
 
 
 @pytest.fixture(scope="module")
-def several(slabs: RadioScene) -> list[Relevance]:
+def several(slabs):
     return relevances(slabs, (1e-6, 0.1, 0.5, 2.0, 1000.0), receivers=RECEIVERS, **OPTIONS)
 
 
-def test_an_empty_room_has_line_of_sight_and_nothing_else() -> None:
+def test_an_empty_room_has_line_of_sight_and_nothing_else():
     found = relevance(furnished(NOTHING, NOTHING), receivers=RECEIVERS[:3], **OPTIONS)
     assert [name for name in found.kept if name not in ("diffraction", "transmission")] == ["line_of_sight"]
     assert found.model.mirrors == 0
@@ -58,7 +56,7 @@ def test_an_empty_room_has_line_of_sight_and_nothing_else() -> None:
     assert found["line_of_sight"].total_db > 10
 
 
-def test_a_smooth_plate_is_a_mirror_and_a_rough_one_scatters() -> None:
+def test_a_smooth_plate_is_a_mirror_and_a_rough_one_scatters():
     seen = RECEIVERS[:3]
     smooth = relevance(plated(metal(1e-7)), receivers=seen, **OPTIONS)
     assert smooth.model.mirrors == 1
@@ -69,7 +67,7 @@ def test_a_smooth_plate_is_a_mirror_and_a_rough_one_scatters() -> None:
     assert rough["scatterings_1"].worth_db > 1 > 0.1 > rough["mirrors_1"].worth_db
 
 
-def test_the_worth_of_a_mirror_is_its_power() -> None:
+def test_the_worth_of_a_mirror_is_its_power():
     """Line of sight and one mirror image over a metal floor: the total falls by 10 log10(1 + (d / d')^2)."""
     receiver = np.array([4.0, 3.0, 1.0])
     plate = plated(metal(0.0))
@@ -80,12 +78,12 @@ def test_the_worth_of_a_mirror_is_its_power() -> None:
     assert found["mirrors_1"].total_db == pytest.approx(10 * np.log10(1 + ratio), abs=0.1)
 
 
-def test_lambertian_materials_leave_one_lobe() -> None:
+def test_lambertian_materials_leave_one_lobe():
     scene = furnished(SlabMaterial("a", 4.0, 0.5, 0.1, 0.7), SlabMaterial("b", 3.0, 0.5, 0.1, 0.9))
     assert relevance(scene, receivers=RECEIVERS, **OPTIONS).lobes == (0,)
 
 
-def test_a_lobe_that_hardly_differs_is_replaced_and_power_is_kept() -> None:
+def test_a_lobe_that_hardly_differs_is_replaced_and_power_is_kept():
     scene = furnished(
         SlabMaterial("a", 4.0, 0.5, 0.1, 0.7, "directive", 5),
         SlabMaterial("b", 4.0, 0.5, 0.1, 0.7, "directive", 6),
@@ -102,8 +100,8 @@ def test_a_lobe_that_hardly_differs_is_replaced_and_power_is_kept() -> None:
     assert 0 < mixed.weight[0, 0] < mixed.weight[0, 1]  # exponent 5 is nearer to 6 than to Lambertian
 
 
-def test_gas_matters_over_a_kilometre_and_not_over_ten_metres() -> None:
-    def air(length: float) -> Relevance:
+def test_gas_matters_over_a_kilometre_and_not_over_ten_metres():
+    def air(length):
         """Two boxes as far apart as that, of nothing: only the air between them counts."""
         mesh, part = joined(
             box_mesh([0, 0, 0], [0.5, 0.5, 0.5]), box_mesh([length - 0.5, 7, 7], [length, 8, 8])
@@ -120,14 +118,14 @@ def test_gas_matters_over_a_kilometre_and_not_over_ten_metres() -> None:
     assert long["gas"].total_db == pytest.approx(1000 * gas_attenuation_db_per_m(F), rel=1e-3)
 
 
-def test_a_larger_tolerance_never_keeps_more(several: list[Relevance]) -> None:
+def test_a_larger_tolerance_never_keeps_more(several):
     for tight, loose in zip(several[:-1], several[1:], strict=True):
         assert set(loose.kept) <= set(tight.kept)
     assert len(several[0].kept) > len(several[2].kept) > len(several[-1].kept)
     assert several[-1].kept == ()
 
 
-def test_the_choice_stays_within_its_tolerance(slabs: RadioScene, several: list[Relevance]) -> None:
+def test_the_choice_stays_within_its_tolerance(slabs, several):
     """Checked on spectra made anew, not on what the choice was made with."""
     full = full_field(slabs, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA)[0]
     for found in several[1:4]:
@@ -140,7 +138,7 @@ def test_the_choice_stays_within_its_tolerance(slabs: RadioScene, several: list[
         assert np.sqrt(np.mean(np.square(change))) <= found.tolerance_db + several[1]["gas"].total_db
 
 
-def test_blocked_receivers_have_no_line_of_sight_to_lose(several: list[Relevance]) -> None:
+def test_blocked_receivers_have_no_line_of_sight_to_lose(several):
     found = several[1]
     assert found.blocked == 1
     assert found["line_of_sight"].image_blocked_db == 0.0
@@ -148,7 +146,7 @@ def test_blocked_receivers_have_no_line_of_sight_to_lose(several: list[Relevance
     assert found["diffraction"].total_db < found["diffraction"].total_blocked_db
 
 
-def test_table_and_file_say_the_same(several: list[Relevance], tmp_path: Path) -> None:
+def test_table_and_file_say_the_same(several, tmp_path):
     found = several[1]
     table = found.table()
     assert table.count("\n| ") == len(found.effects) + 1
@@ -161,7 +159,7 @@ def test_table_and_file_say_the_same(several: list[Relevance], tmp_path: Path) -
         Relevance.load(tmp_path / "r.json")
 
 
-def test_a_bare_mesh_assumes_materials_and_leaves_lobes_to_the_fit(slabs: RadioScene) -> None:
+def test_a_bare_mesh_assumes_materials_and_leaves_lobes_to_the_fit(slabs):
     found = relevance(slabs.mesh, receivers=RECEIVERS[:2], **OPTIONS)
     assert found.materials == "assumed"
     assert found["lobes"].kept is None
@@ -169,7 +167,7 @@ def test_a_bare_mesh_assumes_materials_and_leaves_lobes_to_the_fit(slabs: RadioS
     assert "assumed" in found.table()
 
 
-def test_a_fit_leaves_out_what_is_ruled_out(slabs: RadioScene, data: SpectrumDataset) -> None:
+def test_a_fit_leaves_out_what_is_ruled_out(slabs, data):
     ruled = relevance(plated(metal(1e-7)), receivers=RECEIVERS[:3], **OPTIONS)
     field = RadioField.fit(slabs, data, relevance=ruled)
     assert isinstance(field, BistaticField)
@@ -181,7 +179,7 @@ def test_a_fit_leaves_out_what_is_ruled_out(slabs: RadioScene, data: SpectrumDat
         RadioField.fit(slabs, replace(data, frequency_hz=140e9), relevance=ruled)
 
 
-def test_a_fitted_field_is_judged_by_its_parameters(slabs: RadioScene, data: SpectrumDataset) -> None:
+def test_a_fitted_field_is_judged_by_its_parameters(slabs, data):
     field = RadioField.fit(slabs, data, effects=SETS["single"])
     found = relevance(field, receivers=RECEIVERS, tolerance_db=0.5)
     assert found.materials == "fit"

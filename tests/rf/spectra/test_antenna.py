@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from path_makers import random_directions
 
 import warprrf as wr
 from warprrf.rf.spectra.antenna import deembed
@@ -100,8 +101,7 @@ def test_the_total_does_not_depend_on_the_horn_or_how_its_gain_is_stated():
 
 def test_deembedding_comes_closer_to_the_true_spectrum_than_the_measurement():
     rng = np.random.default_rng(3)
-    d = rng.normal(size=(12, 3))
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    d = random_directions(12, rng)
     powers = 10 ** rng.uniform(-10, -8, 12)
     truth = spread(d, powers, SHAPE, SIGMA)
     measured = scan(d, powers)

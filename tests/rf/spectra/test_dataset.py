@@ -132,14 +132,18 @@ def as_others_write(data):
     return data.drop_vars(["xyz", "angle"]).assign(delay=delay)
 
 
-@pytest.mark.parametrize(("change", "receivers"), [(turned, [5, 0, 7, 2]), (as_others_write, range(8))])
-def test_what_other_tools_reorder_is_read_by_its_coordinates(tmp_path, change, receivers):
+def rewritten(tmp_path, change):
+    """The file of a data set with a change of what xarray reads of it."""
     xarray = pytest.importorskip("xarray")
-    before = dataset(8)
-    before.save(tmp_path / "a.nc")
+    dataset(8).save(tmp_path / "a.nc")
     with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf", decode_timedelta=False) as opened:
         change(opened.load()).to_netcdf(tmp_path / "b.nc", engine="h5netcdf")
-    same(SpectrumDataset.load(tmp_path / "b.nc"), before.subset(receivers))
+    return tmp_path / "b.nc"
+
+
+@pytest.mark.parametrize(("change", "receivers"), [(turned, [5, 0, 7, 2]), (as_others_write, range(8))])
+def test_what_other_tools_reorder_is_read_by_its_coordinates(tmp_path, change, receivers):
+    same(SpectrumDataset.load(rewritten(tmp_path, change)), dataset(8).subset(receivers))
 
 
 REFUSED = {
@@ -160,12 +164,9 @@ REFUSED = {
 
 @pytest.mark.parametrize(("match", "change"), REFUSED.items(), ids=REFUSED)
 def test_what_cannot_be_put_in_order_is_refused(tmp_path, match, change):
-    xarray = pytest.importorskip("xarray")
-    dataset(8).save(tmp_path / "a.nc")
-    with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf", decode_timedelta=False) as opened:
-        change(opened.load()).to_netcdf(tmp_path / "b.nc", engine="h5netcdf")
+    path = rewritten(tmp_path, change)
     with pytest.raises(ValueError, match=rf"b\.nc: {match}"):
-        SpectrumDataset.load(tmp_path / "b.nc")
+        SpectrumDataset.load(path)
 
 
 def test_a_file_that_states_more_than_it_can_hold_is_refused(tmp_path):

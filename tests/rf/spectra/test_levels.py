@@ -2,7 +2,6 @@
 
 import warnings
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,11 +26,11 @@ UNITS = [
 ]
 
 
-def readings(power_db: np.ndarray, **settings: object) -> Readings:
+def readings(power_db, **settings):
     return Readings(TX, RX, 10 ** (power_db / 10), F, 1e-15, **settings)
 
 
-def spectra(total_db: np.ndarray) -> SpectrumDataset:
+def spectra(total_db):
     gain = np.zeros((3, 4, 8))
     gain[:, 1, 2:4] = 0.5 * 10 ** (total_db[:, None] / 10)
     return SpectrumDataset.from_spectra(
@@ -40,7 +39,7 @@ def spectra(total_db: np.ndarray) -> SpectrumDataset:
 
 
 @pytest.mark.parametrize(("spoil", "unit"), UNITS)
-def test_powers_of_another_unit_are_questioned_and_the_unit_guessed(spoil, unit: str, tmp_path: Path) -> None:
+def test_powers_of_another_unit_are_questioned_and_the_unit_guessed(spoil, unit, tmp_path):
     """As much as was transmitted is an error, far above line of sight a warning: in tables, spectra, their files and fits."""
     power_db, good = np.asarray(spoil(TRUE_DB)), spectra(TRUE_DB)
     ends = zip(("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z"), [*np.zeros((3, 3)), *RX.T], strict=True)
@@ -60,7 +59,7 @@ def test_powers_of_another_unit_are_questioned_and_the_unit_guessed(spoil, unit:
             load()
 
 
-def test_powers_that_can_be_pass() -> None:
+def test_powers_that_can_be_pass():
     """What adds to line of sight up to the margin, fading, the gain of antennas, chains of unknown gain; the lobby."""
     strong = np.full(3, 0.9 * MARGIN_DB) + FREE_DB
     gain_db = 10 * np.log10(horn(0.2)(np.array(0.0)))

@@ -1,6 +1,5 @@
 """Metrics against closed forms, brute force and scikit-image."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -15,7 +14,7 @@ FLOOR = 1e-12
 RANGE_DB = (-120.0, -60.0)
 
 
-def small_dataset(count: int = 3, seed: int = 0) -> SimpleNamespace:
+def small_dataset(count=3, seed=0):
     rng = np.random.default_rng(seed)
     gain = 10 ** rng.uniform(-11, -6, (count, *SHAPE))
     return SimpleNamespace(
@@ -29,7 +28,7 @@ def small_dataset(count: int = 3, seed: int = 0) -> SimpleNamespace:
     )
 
 
-def scored(ds: SimpleNamespace, change: Callable[[Spectrum], object] = lambda truth: truth) -> dict:
+def scored(ds, change=lambda truth: truth):
     """Figures of predictions that are the truth, changed."""
     truth = {
         tuple(r): Spectrum(ds.path_gain[k], ds.delay_s[k], ds.aod[k], FLOOR, RANGE_DB)
@@ -38,19 +37,19 @@ def scored(ds: SimpleNamespace, change: Callable[[Spectrum], object] = lambda tr
     return metrics.evaluate(ds, lambda rx: change(truth[tuple(rx)]))
 
 
-def test_psnr_of_a_constant_offset_is_twenty_log_of_it() -> None:
+def test_psnr_of_a_constant_offset_is_twenty_log_of_it():
     image = np.random.default_rng(0).uniform(0.2, 0.7, SHAPE)
     assert metrics.psnr(image + 0.1, image) == pytest.approx(20.0)
     assert metrics.psnr(image, image) == metrics.PSNR_CEILING_DB
 
 
-def test_unit_image_maps_floor_to_zero_and_clips_above_the_range() -> None:
+def test_unit_image_maps_floor_to_zero_and_clips_above_the_range():
     gain = np.array([[0.0, 1e-9, 1.0]])
     expected = [0.0, (10 * np.log10(1e-9 + FLOOR) + 120) / 60, 1.0]
     assert metrics.unit_image(gain, FLOOR, RANGE_DB)[0] == pytest.approx(expected)
 
 
-def test_ssim_equals_scikit_images() -> None:
+def test_ssim_equals_scikit_images():
     skimage = pytest.importorskip("skimage.metrics")
     rng = np.random.default_rng(1)
     for _ in range(5):
@@ -61,7 +60,7 @@ def test_ssim_equals_scikit_images() -> None:
     assert metrics.ssim(a, a) == pytest.approx(1.0)
 
 
-def test_rmse_weighs_rows_by_solid_angle() -> None:
+def test_rmse_weighs_rows_by_solid_angle():
     difference = np.zeros(SHAPE)
     difference[4] = 6.0
     weight = pixel_solid_angles(SHAPE)
@@ -70,21 +69,21 @@ def test_rmse_weighs_rows_by_solid_angle() -> None:
     )
 
 
-def test_strongest_direction_is_that_of_a_path_even_beside_the_pole() -> None:
+def test_strongest_direction_is_that_of_a_path_even_beside_the_pole():
     weak, strong = np.array([1.0, 0.0, 0.1]), np.array([0.2, -0.1, 1.0])
     image = spread(np.stack([weak, strong]), np.array([1.0, 1.5]), (60, 120), np.radians(4.0))
     found = metrics.strongest_direction(image)
     assert metrics.angle_deg(found, strong / np.linalg.norm(strong)) < 2.2  # half a pixel's diagonal
 
 
-def test_angle_is_accurate_for_tiny_and_opposite_directions() -> None:
+def test_angle_is_accurate_for_tiny_and_opposite_directions():
     a = np.array([1.0, 0.0, 0.0])
     tiny = np.array([np.cos(1e-9), np.sin(1e-9), 0.0])
     assert metrics.angle_deg(a, tiny) == pytest.approx(np.degrees(1e-9), rel=1e-6)
     assert metrics.angle_deg(a, -a) == pytest.approx(180.0)
 
 
-def test_beam_response_equals_the_double_sum() -> None:
+def test_beam_response_equals_the_double_sum():
     image = np.random.default_rng(2).random(SHAPE) ** 8
     toward = pixel_directions(SHAPE)
     kappa = metrics.beam_kappa(np.radians(25.0))
@@ -94,7 +93,7 @@ def test_beam_response_equals_the_double_sum() -> None:
         assert response[row, column] == pytest.approx((weight * image).sum(), rel=1e-10)
 
 
-def test_steering_half_a_beamwidth_off_a_lone_path_loses_three_decibels() -> None:
+def test_steering_half_a_beamwidth_off_a_lone_path_loses_three_decibels():
     image = np.zeros((90, 180))
     image[45, 90] = 1e-8
     path = pixel_directions(image.shape)[45, 90]
@@ -106,13 +105,13 @@ def test_steering_half_a_beamwidth_off_a_lone_path_loses_three_decibels() -> Non
     assert metrics.beam_gain_loss_db(image, path, np.radians(10.0)) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_weighted_median_ignores_what_has_no_weight() -> None:
+def test_weighted_median_ignores_what_has_no_weight():
     assert metrics.weighted_median(np.array([5.0, 1.0, 3.0, 100.0]), np.array([1.0, 1.0, 1.5, 0.0])) == 3.0
     with pytest.raises(ValueError, match="weights"):
         metrics.weighted_median(np.array([1.0]), np.array([0.0]))
 
 
-def test_a_perfect_prediction_has_no_error() -> None:
+def test_a_perfect_prediction_has_no_error():
     report = scored(small_dataset())
     assert report["psnr_db"] == metrics.PSNR_CEILING_DB
     assert report["ssim"] == pytest.approx(1.0)
@@ -123,21 +122,21 @@ def test_a_perfect_prediction_has_no_error() -> None:
     assert report["lpips"] is None and report["lpips_reason"]
 
 
-def test_a_late_delay_and_a_turned_departure_are_measured_as_such() -> None:
+def test_a_late_delay_and_a_turned_departure_are_measured_as_such():
     turn = [np.radians(4.0), 0.0]
     report = scored(small_dataset(), lambda s: replace(s, delay_s=s.delay_s + 2e-9, aod=s.aod + turn))
     assert report["tof_error_median_ns"] == pytest.approx(2.0)
     assert report["aod_error_median_deg"] == pytest.approx(4.0)
 
 
-def test_delays_that_are_missing_for_most_power_give_no_figure() -> None:
+def test_delays_that_are_missing_for_most_power_give_no_figure():
     one_row = np.where(np.arange(SHAPE[0])[:, None] == 0, 1.0, np.nan)
     report = scored(small_dataset(), lambda s: replace(s, delay_s=s.delay_s * one_row, aod=None))
     assert report["tof_error_median_ns"] is None
     assert report["aod_error_median_deg"] is None
 
 
-def test_blocked_figures_are_those_of_receivers_without_line_of_sight() -> None:
+def test_blocked_figures_are_those_of_receivers_without_line_of_sight():
     ds = small_dataset(4)
     report = scored(ds, lambda s: s.path_gain * (1.0 + (s.path_gain == ds.path_gain[1::2]).any()))
     rows = report["per_receiver"]["psnr_db"]
@@ -154,6 +153,6 @@ def test_blocked_figures_are_those_of_receivers_without_line_of_sight() -> None:
         (np.full(SHAPE, -1.0), "negative"),
     ],
 )
-def test_bad_predictions_are_refused(wrong: np.ndarray, message: str) -> None:
+def test_bad_predictions_are_refused(wrong, message):
     with pytest.raises(ValueError, match=message):
         metrics.evaluate(small_dataset(), lambda rx: wrong)

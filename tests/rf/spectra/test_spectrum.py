@@ -1,8 +1,8 @@
 """The grid covers the sphere, and the beam keeps power wherever a path points."""
 
 import numpy as np
-import path_makers
 import pytest
+from path_makers import random_directions
 
 from warprrf.rf.spectra.spectrum import (
     Spectrum,
@@ -18,10 +18,6 @@ from warprrf.rf.spectra.spectrum import (
 )
 
 SIGMA = np.deg2rad(2.0)
-
-
-def random_directions(n, seed=0):
-    return path_makers.random_directions(n, np.random.default_rng(seed))
 
 
 def brute_force(d, powers, shape, sigma):
@@ -118,11 +114,9 @@ def test_bad_paths_are_refused():
 
 
 @pytest.mark.parametrize("sigma", [np.radians(2.0), np.radians(0.05), 1.2])
-def test_beams_made_at_once_are_those_made_one_by_one(sigma: float) -> None:
-    rng = np.random.default_rng(4)
-    directions = rng.normal(size=(12, 3))
-    directions[0], directions[1] = [0, 0, 1], [-1, 1e-9, 0]  # a pole, and the seam
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+def test_beams_made_at_once_are_those_made_one_by_one(sigma):
+    # A pole, and the seam.
+    directions = np.concatenate([random_directions(10, 4), [[0, 0, 1], [-1, 1e-9, 0]]])
     together = unit_beams(directions, (30, 60), sigma)
     for beam, direction in zip(together, directions, strict=True):
         alone = spread(direction[None], np.ones(1), (30, 60), sigma)

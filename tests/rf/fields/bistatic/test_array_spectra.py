@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from furnished import RECEIVERS, TX, furnished
-from radio_scenes import RadioScene, SlabMaterial, as_fits_predict, observation
+from radio_scenes import SlabMaterial, as_fits_predict, observation
 
 from warprrf.rf.channel.array_spectra import UP, ArraySpectra, hemisphere
 from warprrf.rf.channel.arrays import PlanarArray
@@ -14,7 +14,6 @@ from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.measured import ArrayImage, read
 from warprrf.rf.fields.bistatic.observations import Frame
-from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.trace import trace_paths
 from warprrf.rf.spectra.spectrum import directions_from_angles
 from warprrf.rf.tracing.model import SETS, Effects
@@ -31,12 +30,12 @@ BOX = SlabMaterial("box", 12.0, 0.0, np.inf, 0.6)
 
 
 @pytest.fixture(scope="module")
-def scene() -> RadioScene:
+def scene():
     return furnished(WALLS, BOX)
 
 
 @pytest.fixture(scope="module")
-def field(scene: RadioScene) -> BistaticField:
+def field(scene):
     frame = Frame(TX, F, (24, 48), 1e-12, (-120.0, -40.0), np.radians(5.0), None)
     prior = BistaticField.prior(scene, frame, effects=SINGLE, sub_pixels=2)
     known = prior.parameters
@@ -47,15 +46,13 @@ def field(scene: RadioScene) -> BistaticField:
     return replace(prior, parameters=replace(known, log_excess=excess, log_mirror=share))
 
 
-def heard(paths: Paths) -> np.ndarray:
+def heard(paths):
     """Channel (M,) of complex paths between vertical antennas."""
     toward = directions_from_angles(paths.theta_r, paths.phi_r)
     return ARRAY.response(toward, 1.0).T @ paths.jones[:, 0, 0]
 
 
-def test_mirrors_and_line_of_sight_add_up_as_complex_paths_do(
-    scene: RadioScene, field: BistaticField
-) -> None:
+def test_mirrors_and_line_of_sight_add_up_as_complex_paths_do(scene, field):
     """Of the exact paths of the scene with their Jones matrices; zones that a mirror's edge covers in part are left out."""
     alone = replace(field, effects=replace(SINGLE, scatterings=0))
     compared = 0
@@ -71,7 +68,7 @@ def test_mirrors_and_line_of_sight_add_up_as_complex_paths_do(
     assert compared >= 1
 
 
-def test_one_path_alone_peaks_at_its_path_gain(field: BistaticField) -> None:
+def test_one_path_alone_peaks_at_its_path_gain(field):
     alone = replace(field, effects=Effects(mirrors=0, scatterings=0, transmissions=0, diffractions=0))
     place = RECEIVERS[1]
     toward = (TX - place) / np.linalg.norm(TX - place)
@@ -81,7 +78,7 @@ def test_one_path_alone_peaks_at_its_path_gain(field: BistaticField) -> None:
     assert alone.array_spectrum(place, ARRAY, DIRECTIONS).max() <= friis * (1 + 1e-5)
 
 
-def test_scattered_light_is_the_mean_over_its_random_phases(field: BistaticField) -> None:
+def test_scattered_light_is_the_mean_over_its_random_phases(field):
     alone = replace(field, effects=replace(SINGLE, line_of_sight=False, mirrors=0))
     place = RECEIVERS[0]
     view = alone.view(place)
@@ -95,7 +92,7 @@ def test_scattered_light_is_the_mean_over_its_random_phases(field: BistaticField
     assert np.abs(found - drawn).max() < 0.12 * found.max()  # 2000 draws: 2 % each, the largest of hundreds
 
 
-def test_paths_of_unknown_length_add_in_power(field: BistaticField) -> None:
+def test_paths_of_unknown_length_add_in_power(field):
     place = RECEIVERS[0]
     alone = replace(field, effects=replace(SINGLE, scatterings=0))
     view = alone.view(place)
@@ -114,7 +111,7 @@ def test_paths_of_unknown_length_add_in_power(field: BistaticField) -> None:
     assert np.abs(found - mean).max() < 0.05 * found.max()
 
 
-def test_what_a_fit_predicts_is_what_is_read(field: BistaticField) -> None:
+def test_what_a_fit_predicts_is_what_is_read(field):
     view = field.view(RECEIVERS[0])
     image = ArrayImage.of(view, ARRAY, DIRECTIONS.reshape(-1, 3), 0.0004)
     power = read(field.path_gains(view), image)
@@ -123,7 +120,7 @@ def test_what_a_fit_predicts_is_what_is_read(field: BistaticField) -> None:
     np.testing.assert_allclose(found, power, rtol=0.02, atol=0.01 * power.max())
 
 
-def test_a_fit_to_normalised_pictures_beats_the_nearest(scene: RadioScene, field: BistaticField) -> None:
+def test_a_fit_to_normalised_pictures_beats_the_nearest(scene, field):
     """Readings of exact complex paths and of scattering with drawn phases, as pictures of 8 bits."""
     rng, truth = np.random.default_rng(5), []
     for place in RECEIVERS:
@@ -140,7 +137,7 @@ def test_a_fit_to_normalised_pictures_beats_the_nearest(scene: RadioScene, field
     fitted = RadioField.fit(scene, known, quick=True, effects=replace(SETS["single"], mirrors=2))
     assert isinstance(fitted, BistaticField)
 
-    def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    def psnr(a, b):
         return float(-10 * np.log10(np.mean((a - b) ** 2)))
 
     for place, picture in zip(RECEIVERS[6:], pictures[6:], strict=True):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from furnished import RECEIVERS, ROOM, TX
+from path_makers import random_directions
 from radio_scenes import joined, mirror_paths
 
 from warprrf.geometry.mesh import Mesh
@@ -17,13 +18,11 @@ from warprrf.rf.tracing.surface import POSITION_ERROR_M, Surface
 RX = RECEIVERS[0]
 
 
-def reflected_ways(count: int, mirrors: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def reflected_ways(count, mirrors, seed):
     """Stops (L, k + 2, 3), normals and cosines (L, k, ...) of random chains that obey the law of reflection."""
     rng = np.random.default_rng(seed)
-    normal = rng.normal(size=(count, mirrors, 3))
-    normal /= np.linalg.norm(normal, axis=2, keepdims=True)
-    along = rng.normal(size=(count, 3))
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    normal = random_directions(count * mirrors, rng).reshape(count, mirrors, 3)
+    along = random_directions(count, rng)
     stops, cosine = [-along, np.zeros((count, 3))], []
     for k in range(mirrors):
         height = (along * normal[:, k]).sum(axis=1)
@@ -33,7 +32,7 @@ def reflected_ways(count: int, mirrors: int, seed: int) -> tuple[np.ndarray, np.
     return np.stack(stops, axis=1), normal, np.stack(cosine, axis=1)
 
 
-def reflected(excess: np.ndarray, cosine: np.ndarray, turn: np.ndarray) -> np.ndarray:
+def reflected(excess, cosine, turn):
     """Share of unpolarised light that chains of mirrors (L, k) reflect, by the kernel of records; 0 in ``excess`` is none."""
     index = np.where(excess > 0, np.arange(excess.size).reshape(excess.shape), -1).astype(np.int32)
     none = np.zeros(excess.size)
@@ -43,7 +42,7 @@ def reflected(excess: np.ndarray, cosine: np.ndarray, turn: np.ndarray) -> np.nd
     return Records(np.ones(len(excess)), np.arange(len(excess)), index, angle, kind).powers(Evaluation(p))
 
 
-def test_a_mirror_met_head_on_has_no_plane_of_incidence() -> None:
+def test_a_mirror_met_head_on_has_no_plane_of_incidence():
     """A wave that goes to a wall and back keeps its polarisation, whichever plane stands in for the missing one."""
     stops = np.array([[[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [0.0, 0.0, 4.0], [0.0, 0.0, 1.0]]])
     normal = np.array([[[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
@@ -54,7 +53,7 @@ def test_a_mirror_met_head_on_has_no_plane_of_incidence() -> None:
 @pytest.mark.parametrize(
     ("edge_m", "least", "most"), [(-0.2, 1.0, 1.0), (-0.012, 0.4, 0.75), (0.01, 0.0, 0.0)]
 )
-def test_a_screen_beside_a_chain_covers_part_of_its_zone(edge_m: float, least: float, most: float) -> None:
+def test_a_screen_beside_a_chain_covers_part_of_its_zone(edge_m, least, most):
     """Floor, then a wall: a screen across the leg between them leaves all, about half, or nothing of the path.
 
     The screen ends ``edge_m`` past the path, where the zone has a radius of 23 mm; rays start a position error above a mirror,
@@ -83,14 +82,14 @@ def test_a_screen_beside_a_chain_covers_part_of_its_zone(edge_m: float, least: f
     assert all(least <= share <= most for share in found.share[same])
 
 
-def _surface(mesh: Mesh) -> Surface:
+def _surface(mesh):
     """A surface that is as wrong as one from photos: its position error widens the zones."""
     return replace(Surface.of(mesh), position_error_m=POSITION_ERROR_M)
 
 
 @pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("mirrors", [1, 2, 3])
-def test_any_chain_reflects_as_fields_in_space_do(mirrors: int) -> None:
+def test_any_chain_reflects_as_fields_in_space_do(mirrors):
     """Two field vectors across the first leg, reflected one mirror after the other in room coordinates.
 
     With three mirrors the sense of each turn counts: of two, only its size.

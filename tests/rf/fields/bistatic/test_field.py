@@ -8,6 +8,7 @@ import pytest
 from furnished import MATERIALS, RECEIVERS, ROOM, SHAPE, SIGMA, TX, F, spectra
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths, observation
 
+from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.fresnel import fresnel_curves, slab_transmission
 from warprrf.rf.em.materials import itu_material
 from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT
@@ -19,7 +20,6 @@ from warprrf.rf.fields.bistatic.fit import trace
 from warprrf.rf.fields.bistatic.measured import WeighedPaths
 from warprrf.rf.fields.bistatic.observations import Columns
 from warprrf.rf.spectra.beam import BeamOperator
-from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.lookups import nearest
 from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.spectrum import spread, sub_pixel_directions, to_db
@@ -31,31 +31,27 @@ WAVELENGTH = SPEED_OF_LIGHT / F
 
 
 @pytest.fixture(scope="module")
-def data(scene: RadioScene) -> SpectrumDataset:
+def data(scene):
     return spectra(scene)
 
 
 @pytest.fixture(scope="module")
-def field(scene: RadioScene, data: SpectrumDataset) -> BistaticField:
+def field(scene, data):
     return RadioField.fit(scene, data.subset(np.arange(6)))
 
 
-def psnr(field: RadioField, ds: SpectrumDataset, transmitter: np.ndarray | None = None) -> float:
+def psnr(field, ds, transmitter=None):
     return evaluate(ds, lambda rx: field.spectrum(rx, transmitter))["psnr_db"]
 
 
-def test_spectra_that_would_not_fit_into_memory_are_refused(
-    scene: RadioScene, data: SpectrumDataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_spectra_that_would_not_fit_into_memory_are_refused(scene, data, monkeypatch):
     monkeypatch.setattr(fitting, "MOST_RAYS", 10 * 24 * 48 * 4 - 1)
     with pytest.raises(ValueError, match="ds: 10 spectra of 24 x 48 pixels take 4.6e.04 rays"):
         trace(scene, data, sub_pixels=2)
     assert len(trace(scene, data.subset(np.arange(9)), sub_pixels=2).views) == 9
 
 
-def test_a_fit_to_many_keeps_no_records_and_is_the_same(
-    scene: RadioScene, data: SpectrumDataset, field: BistaticField, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fit_to_many_keeps_no_records_and_is_the_same(scene, data, field, monkeypatch):
     """Of each ray 4 bytes of its face, 8 of its range, and a bit that says whether it is lit; records alone would take 24."""
     monkeypatch.setattr(fitting, "MOST_KEPT", 0)
     few = data.subset(np.arange(6))
@@ -71,7 +67,7 @@ def test_a_fit_to_many_keeps_no_records_and_is_the_same(
         assert np.array_equal(getattr(again.parameters, name), getattr(field.parameters, name))
 
 
-def test_ten_times_better_than_the_nearest_measurement(field: BistaticField, data: SpectrumDataset) -> None:
+def test_ten_times_better_than_the_nearest_measurement(field, data):
     test = data.subset(np.arange(6, 10))
     ours = evaluate(test, field.spectrum)
     copied = evaluate(test, nearest(data.subset(np.arange(6))))
@@ -81,16 +77,14 @@ def test_ten_times_better_than_the_nearest_measurement(field: BistaticField, dat
     assert ours["tof_error_median_ns"] < 0.1
 
 
-def test_a_transmitter_never_seen_is_as_good(
-    scene: RadioScene, field: BistaticField, data: SpectrumDataset
-) -> None:
+def test_a_transmitter_never_seen_is_as_good(scene, field, data):
     other = np.array([4.3, 3.2, 2.4])
     moved = spectra(scene, RECEIVERS[[2, 4, 6, 8]], transmitter=other)
     assert psnr(field, moved, other) > psnr(field, data.subset(np.arange(6, 10))) - 4
     assert psnr(field, moved, other) > psnr(field, moved) + 8  # and it does depend on the transmitter
 
 
-def test_paths_carry_the_spectrum_and_line_of_sight_is_exact(field: BistaticField) -> None:
+def test_paths_carry_the_spectrum_and_line_of_sight_is_exact(field):
     paths, spectrum = field.paths(RECEIVERS[3]), field.spectrum(RECEIVERS[3])
     assert paths.power.sum() == pytest.approx(spectrum.total_path_gain, rel=1e-5)
     los = paths.kind == "los"
@@ -103,7 +97,7 @@ def test_paths_carry_the_spectrum_and_line_of_sight_is_exact(field: BistaticFiel
     assert several.gain.shape == (2, 5)
 
 
-def test_before_any_spectrum_the_field_is_that_of_the_prior(scene: RadioScene, data: SpectrumDataset) -> None:
+def test_before_any_spectrum_the_field_is_that_of_the_prior(scene, data):
     prior = BistaticField.prior(scene, data)
     unfitted = BistaticField.fit(scene, data.subset([0]), iterations=0)
     image = prior.spectrum(RECEIVERS[4]).path_gain
@@ -114,7 +108,7 @@ def test_before_any_spectrum_the_field_is_that_of_the_prior(scene: RadioScene, d
     assert bare.spectrum(RECEIVERS[4]).path_gain.max() == 0
 
 
-def test_an_uncalibrated_gain_is_found(scene: RadioScene, data: SpectrumDataset) -> None:
+def test_an_uncalibrated_gain_is_found(scene, data):
     few = data.subset(np.arange(4))
     off = replace(few, path_gain=few.path_gain * np.float32(10**0.35), floor=few.floor * 10**0.35)
     found = RadioField.fit(scene, off, gain_offset=True)
@@ -122,7 +116,7 @@ def test_an_uncalibrated_gain_is_found(scene: RadioScene, data: SpectrumDataset)
     assert 0 < found.report["gain_offset_std_db"] < 0.5
 
 
-def test_uncertainty_covers_the_error(field: BistaticField, data: SpectrumDataset) -> None:
+def test_uncertainty_covers_the_error(field, data):
     errors, sigma = [], []
     for k in range(6, 10):
         found = field.spectrum(data.receivers[k], uncertainty=True)
@@ -133,7 +127,7 @@ def test_uncertainty_covers_the_error(field: BistaticField, data: SpectrumDatase
     assert (ratio <= 2).mean() > 0.75
 
 
-def test_the_beam_keeps_power_and_its_adjoint_is_one() -> None:
+def test_the_beam_keeps_power_and_its_adjoint_is_one():
     beam = BeamOperator(SHAPE, SIGMA)
     rng = np.random.default_rng(1)
     x, y = rng.random((*SHAPE, 2)), rng.random((*SHAPE, 2))
@@ -144,13 +138,13 @@ def test_the_beam_keeps_power_and_its_adjoint_is_one() -> None:
     assert np.abs(beam.adjoint(y, quick=True) - back).max() < 3e-6 * back.max()
 
 
-def test_element_at_the_transmitter_is_bounded(field: BistaticField) -> None:
+def test_element_at_the_transmitter_is_bounded(field):
     near = field.spectrum([1.5, 1.0, 1.5], transmitter=[2.5, 2.0, 2.401]).path_gain  # 1 mm over the box
     assert np.isfinite(near).all()
     assert near.sum() < 1e-3  # not more than the source sends: (lambda / 4 pi d)^2 is 6e-9 at 1 m
 
 
-def test_transmitter_in_a_patchs_plane_has_no_mirror_there(scene: RadioScene) -> None:
+def test_transmitter_in_a_patchs_plane_has_no_mirror_there(scene):
     surface = Surface.of(scene)
     found = mirror_paths(surface, np.array([0.5, 0.5, 2.4]), np.array([[4.0, 3.0, 2.0]]), WAVELENGTH, 1)
     top = np.flatnonzero((np.abs(surface.plane_offset - 2.4) < 1e-6) & (surface.plane_normal[:, 2] > 0.9))
@@ -158,7 +152,7 @@ def test_transmitter_in_a_patchs_plane_has_no_mirror_there(scene: RadioScene) ->
     assert not np.isin(found.patch[:, 0], top).any()
 
 
-def test_a_receiver_one_millimetre_from_a_wall(scene: RadioScene, field: BistaticField) -> None:
+def test_a_receiver_one_millimetre_from_a_wall(scene, field):
     point = np.array([4.999, 2.0, 1.0])
     found = field.spectrum(point)
     truth = spectra(scene, point[None]).path_gain[0]
@@ -171,7 +165,7 @@ def test_a_receiver_one_millimetre_from_a_wall(scene: RadioScene, field: Bistati
         field.spectrum(TX)
 
 
-def test_a_receiver_in_full_shadow_gets_nothing_but_what_bounces(scene: RadioScene) -> None:
+def test_a_receiver_in_full_shadow_gets_nothing_but_what_bounces(scene):
     # A closed shell around the receiver: nothing arrives.
     mesh, part = joined(
         ROOM,
@@ -187,9 +181,7 @@ def test_a_receiver_in_full_shadow_gets_nothing_but_what_bounces(scene: RadioSce
     assert len(field.paths([3.5, 2.5, 1.5]).gain) == 0
 
 
-def test_an_empty_spectrum_is_refused_and_one_among_others_is_not(
-    scene: RadioScene, data: SpectrumDataset
-) -> None:
+def test_an_empty_spectrum_is_refused_and_one_among_others_is_not(scene, data):
     nothing = replace(data.subset([0, 1]), path_gain=np.zeros((2, *SHAPE), np.float32))
     with pytest.raises(ValueError, match="no pixel above the floor"):
         RadioField.fit(scene, nothing)
@@ -202,7 +194,7 @@ def test_an_empty_spectrum_is_refused_and_one_among_others_is_not(
     ).all()
 
 
-def test_what_glass_lets_through_is_found_at_any_carrier_or_said_to_be_left_out() -> None:
+def test_what_glass_lets_through_is_found_at_any_carrier_or_said_to_be_left_out():
     """A pane of 10 mm: line of sight behind it is Friis's power less the slab's transmission."""
     corner = [[2.6, y, z] for y, z in ((0, 0), (3, 0), (3, 3), (0, 3))]
     mesh, part = joined(ROOM, (np.array(corner), np.array([[0, 1, 2], [0, 2, 3]])))
@@ -225,7 +217,7 @@ def test_what_glass_lets_through_is_found_at_any_carrier_or_said_to_be_left_out(
         assert sight == pytest.approx(friis**2 * np.mean(np.abs(waves) ** 2), rel=1e-6)
 
 
-def test_an_open_room_s_fit_leaves_nothing_out(scene: RadioScene, data: SpectrumDataset) -> None:
+def test_an_open_room_s_fit_leaves_nothing_out(scene, data):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         field = RadioField.fit(scene, spectra(scene, RECEIVERS, frequency_hz=140e9), quick=True)
@@ -233,7 +225,7 @@ def test_an_open_room_s_fit_leaves_nothing_out(scene: RadioScene, data: Spectrum
     assert len(estimate["receivers"]) == 3 and max(estimate["diffraction"] + estimate["transmission"]) < 0.5
 
 
-def test_effects_may_change_after_the_fit(field: BistaticField) -> None:
+def test_effects_may_change_after_the_fit(field):
     place = RECEIVERS[3]
     all_on, bare = (replace(field, effects=e) for e in (Effects(), Effects(True, 0, 0)))
     more, less = (one.spectrum(place, uncertainty=True) for one in (all_on, bare))
@@ -241,26 +233,28 @@ def test_effects_may_change_after_the_fit(field: BistaticField) -> None:
     assert np.isfinite(more.std_db).all()
 
 
-def test_one_training_receiver_is_enough_for_a_field(scene: RadioScene, data: SpectrumDataset) -> None:
+def test_one_training_receiver_is_enough_for_a_field(scene, data):
     single = RadioField.fit(scene, data.subset([0]))
     assert psnr(single, data.subset(np.arange(6, 10))) > 30
     with pytest.raises(ValueError, match="no receiver was held out of this field's fit to 1,"):
         single.spectrum(RECEIVERS[5], uncertainty=True)
 
 
-def test_duplicate_receivers_change_little(scene: RadioScene, data: SpectrumDataset) -> None:
+def test_duplicate_receivers_change_little(scene, data):
     once = RadioField.fit(scene, data.subset([0, 1]))
     twice = RadioField.fit(scene, data.subset([0, 1, 0, 1][:3]))
     a, b = (to_db(f.spectrum(RECEIVERS[8]).path_gain, data.floor) for f in (once, twice))
     assert np.sqrt(np.mean((a - b) ** 2)) < 0.5
 
 
-def test_what_was_traced_at_other_places_is_refused(scene: RadioScene, data: SpectrumDataset) -> None:
-    with pytest.raises(ValueError, match="views"):
-        RadioField.fit(scene, data.subset([1]), views=trace(scene, data.subset([0])))
+def test_what_was_traced_at_other_places_or_in_other_air_is_refused(scene, data):
+    humid = replace(data.subset([0]), attributes=Air().attributes)
+    for other in (data.subset([1]), humid):
+        with pytest.raises(ValueError, match="views.*air and rays of this fit"):
+            RadioField.fit(scene, other, views=trace(scene, data.subset([0])))
 
 
-def test_the_beam_operator_is_the_beam_of_every_pixel() -> None:
+def test_the_beam_operator_is_the_beam_of_every_pixel():
     beam = BeamOperator(SHAPE, SIGMA)
     rng = np.random.default_rng(6)
     directions = sub_pixel_directions(SHAPE, 4)[0].reshape(*SHAPE, -1, 3)[:, 0]
@@ -278,7 +272,7 @@ def test_the_beam_operator_is_the_beam_of_every_pixel() -> None:
     np.testing.assert_allclose(some, expected.reshape(-1, 2)[pixels], rtol=1e-5)
 
 
-def test_a_quick_fit_tries_nothing_and_is_near(scene: RadioScene, data: SpectrumDataset) -> None:
+def test_a_quick_fit_tries_nothing_and_is_near(scene, data):
     few, test = data.subset(np.arange(6)), data.subset(np.arange(6, 10))
     quick = RadioField.fit(scene, few, quick=True)
     assert quick.sub_pixels == 1
@@ -291,9 +285,7 @@ def test_a_quick_fit_tries_nothing_and_is_near(scene: RadioScene, data: Spectrum
         RadioField.fit(scene, few, sub_pixels=0)
 
 
-def test_a_fit_goes_on_after_steps_that_were_cut_short(
-    field: BistaticField, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fit_goes_on_after_steps_that_were_cut_short(field, monkeypatch):
     """One weight has 9 nepers to go, 1.5 a step, while pixels that nothing explains hide how much each step gains."""
     lit, count = 20, 4020
     true = Parameters.prior(1, (0,))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import warp as wp
 from furnished import RECEIVERS, SHAPE, SIGMA, TX, F, spectra
-from radio_scenes import RadioScene, as_fits_predict, observation
+from radio_scenes import as_fits_predict, observation
 
 from warprrf.rf.channel.array_spectra import UP, hemisphere
 from warprrf.rf.channel.arrays import PlanarArray
@@ -23,29 +23,29 @@ from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.readings import Readings, horn, path_weights
 from warprrf.rf.tracing.interreflection import irradiance
 from warprrf.rf.tracing.model import SETS, Effects, Layout
-from warprrf.rf.tracing.records import Bins, Evaluation, Records
-from warprrf.rf.tracing.tracer import SPECULAR, View
+from warprrf.rf.tracing.records import Bins, Evaluation
+from warprrf.rf.tracing.tracer import SPECULAR
 
 RX = RECEIVERS[0]
 SINGLE, EVERYTHING = replace(SETS["single"], residual=False), Effects(residual=False)
 
 
-def delay_profile(view: View) -> WeighedPaths:
+def delay_profile(view):
     """Power in windows of 2 ns, summed over all directions."""
     start = np.arange(0.0, 50e-9, 2e-9)
 
-    def weigh(arrival: np.ndarray, departure: np.ndarray, delay_s: np.ndarray) -> np.ndarray:
+    def weigh(arrival, departure, delay_s):
         return (delay_s >= start[:, None]) & (delay_s < start[:, None] + 2e-9)
 
     return WeighedPaths.of(view, weigh, arrival=True, departure=False, delay_step_s=2e-9)
 
 
 @pytest.fixture(scope="module")
-def field(scene: RadioScene) -> BistaticField:
+def field(scene):
     return BistaticField.prior(scene, spectra(scene, RX[None]), effects=SINGLE)
 
 
-def test_a_delay_profile_is_the_sum_of_its_paths(field: BistaticField) -> None:
+def test_a_delay_profile_is_the_sum_of_its_paths(field):
     view = field.view(RX)
     profile = delay_profile(view)
     found = as_fits_predict(observation(view, profile, field.floor), SINGLE, field.parameters) * field.floor
@@ -62,7 +62,7 @@ def test_a_delay_profile_is_the_sum_of_its_paths(field: BistaticField) -> None:
     assert found.sum() == pytest.approx(expected.sum(), rel=0.01)
 
 
-def test_places_where_a_horn_is_turned_alike_share_a_table(field: BistaticField) -> None:
+def test_places_where_a_horn_is_turned_alike_share_a_table(field):
     """It says what a table of each place's own says, and memory does not grow with the places."""
     places, azimuth = RX + [[0.0, 0, 0], [0.3, -0.4, 0.2]], np.linspace(-3.0, 3.0, 7)
     arrival = np.tile(np.column_stack([np.full(7, 1.5), azimuth]), (2, 1))
@@ -97,26 +97,26 @@ def test_places_where_a_horn_is_turned_alike_share_a_table(field: BistaticField)
             np.testing.assert_allclose(found, back[0], rtol=0.05, atol=1e-3 * back[0].max())
 
 
-def differences(ask, x: np.ndarray, step: float) -> np.ndarray:
+def differences(ask, x, step):
     """Slopes of the readings ``ask(x)`` by each parameter, shape (parameters, readings)."""
     steps = step * np.eye(len(x))
     return np.stack([(ask(x + s) - ask(x - s)) / (2.0 * step) for s in steps])
 
 
-def dense(table: np.ndarray, index: np.ndarray, layout: Layout) -> np.ndarray:
+def dense(table, index, layout):
     """A Jacobian with the rows of what is not seen: zeros."""
     whole = np.zeros((layout.size, table.shape[1]))
     whole[index] = table
     return whole
 
 
-def array_image(view: View) -> ArrayImage:
+def array_image(view):
     """Half a hemisphere as an array of 4 x 4 elements sees it, whose paths' lengths are known to 0.4 mm."""
     array, directions = PlanarArray(4, 4, orientation=UP), hemisphere((18, 36)).reshape(-1, 3)
     return ArrayImage.of(view, array, directions, 0.0004).part(np.arange(0, len(directions), 13))
 
 
-def pixels(view: View) -> SpectrumPixels:
+def pixels(view):
     return SpectrumPixels(BeamOperator(SHAPE, SIGMA), np.arange(0, SHAPE[0] * SHAPE[1], 7))
 
 
@@ -128,9 +128,7 @@ def pixels(view: View) -> SpectrumPixels:
         (delay_profile, SINGLE, {"ratio": 0.6}), (array_image, SINGLE, {"chain": OWN_GAIN}),
     ],
 )  # fmt: skip
-def test_errors_of_a_fit_have_the_slopes_of_differences(
-    field: BistaticField, measured, effects: Effects, how: dict
-) -> None:
+def test_errors_of_a_fit_have_the_slopes_of_differences(field, measured, effects, how):
     """Also at another carrier, and where the readings' common gain is unknown."""
     view, rng = field.view(RX), np.random.default_rng(5)
     o = observation(view, measured(view), field.floor, **how)
@@ -154,9 +152,7 @@ def test_errors_of_a_fit_have_the_slopes_of_differences(
 
 @pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("reciprocal", [False, True])
-def test_slopes_of_records_of_every_sequence_are_those_of_differences(
-    scene: RadioScene, reciprocal: bool
-) -> None:
+def test_slopes_of_records_of_every_sequence_are_those_of_differences(scene, reciprocal):
     """In float64 and summed by pixels; what comes to the elements that send is held. And, in float32, what is read of
     all. What Warp's tape says is in tests/gradients."""
     field = BistaticField.prior(scene, spectra(scene, RX[None]), effects=EVERYTHING, reciprocal=reciprocal)
@@ -166,11 +162,11 @@ def test_slopes_of_records_of_every_sequence_are_those_of_differences(
     layout = Layout(groups, lobes, through=True)
     x = layout.pack(field.parameters) + np.random.default_rng(1).normal(0.0, 0.3, layout.size)
 
-    def materials(x: np.ndarray) -> Evaluation:
+    def materials(x):
         p = layout.unpack(x, field.parameters)
         return Evaluation(p, None, side, got * p.scattered_share[side] / np.pi)
 
-    def sums(records: Records, own: np.ndarray, x: np.ndarray) -> np.ndarray:
+    def sums(records, own, x):
         return np.bincount(own, records.powers(materials(x)))
 
     where = layout.stride * np.arange(groups)
@@ -193,14 +189,14 @@ def test_slopes_of_records_of_every_sequence_are_those_of_differences(
     assert (np.abs(dense(table, index, layout) - slopes).max(axis=1) <= bound).all()
 
 
-def test_a_used_field_is_copied_and_pickled(field: BistaticField) -> None:
+def test_a_used_field_is_copied_and_pickled(field):
     field = replace(field, device=wp.get_device("cpu"))
     expected = field.spectrum(RX).path_gain
     for again in (copy.deepcopy(field), pickle.loads(pickle.dumps(field))):
         np.testing.assert_array_equal(again.spectrum(RX).path_gain, expected)
 
 
-def test_what_was_traced_for_old_transmitters_and_dropped_fields_goes(field: BistaticField) -> None:
+def test_what_was_traced_for_old_transmitters_and_dropped_fields_goes(field):
     traced = []
     for x in np.linspace(0.5, 1.5, 10):
         again = copy.deepcopy(field)

@@ -2,13 +2,11 @@
 
 import warnings
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from furnished import RECEIVERS, SHAPE, SIGMA, TX, F, spectra
-from radio_scenes import RadioScene
 
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
@@ -26,12 +24,12 @@ WIDTH = np.radians(20.0)
 
 
 @pytest.fixture(scope="module")
-def test(scene: RadioScene) -> SpectrumDataset:
+def test(scene):
     held = RECEIVERS[6:] + np.array([0.1, 0.1, 0.05])
     return spectra(scene, held)
 
 
-def horn_readings(scene: RadioScene, side_lobes_db: float) -> Readings:
+def horn_readings(scene, side_lobes_db):
     """A horn at six receivers, turned through 18 azimuths at two elevations: read off narrow beams of the exact engine."""
     engine = ExactEngine(
         scene, transmitter=TX, frequency_hz=F, shape=(60, 120), beam_sigma_rad=np.radians(1.5), sub_pixels=2
@@ -53,16 +51,16 @@ def horn_readings(scene: RadioScene, side_lobes_db: float) -> Readings:
 
 
 @pytest.fixture(scope="module")
-def turned(scene: RadioScene) -> Readings:
+def turned(scene):
     return horn_readings(scene, -60.0)
 
 
-def score(field: RadioField, test: SpectrumDataset) -> float:
+def score(field, test):
     """PSNR on the grid of ``test``."""
     return evaluate(test, replace(field, shape=SHAPE, beam_sigma_rad=SIGMA).spectrum)["psnr_db"]
 
 
-def test_a_gain_that_hangs_on_side_lobes_is_said_to(scene: RadioScene, turned: Readings) -> None:
+def test_a_gain_that_hangs_on_side_lobes_is_said_to(scene, turned):
     """What 3 dB of their level move the gain by is in its error, as two fits with levels so far apart have it."""
     quick = {"quick": True, "effects": "single"}
     clear = RadioField.fit(scene, turned, **quick).report["chains"]["horn"]
@@ -77,9 +75,7 @@ def test_a_gain_that_hangs_on_side_lobes_is_said_to(scene: RadioScene, turned: R
     assert moved > 2.0 and found["std_db"] == pytest.approx(moved, rel=0.25)
 
 
-def test_wrong_readings_are_named_and_hardly_count(
-    scene: RadioScene, turned: Readings, test: SpectrumDataset
-) -> None:
+def test_wrong_readings_are_named_and_hardly_count(scene, turned, test):
     rng = np.random.default_rng(1)
     above = np.flatnonzero(turned.power > 3.0 * turned.floor)
     wrong = np.sort(rng.choice(above, len(above) // 10, replace=False))
@@ -94,7 +90,7 @@ def test_wrong_readings_are_named_and_hardly_count(
     assert score(spoilt, test) > score(clean, test) - 1.0
 
 
-def test_data_sets_of_one_name_are_told_apart_in_a_report(scene: RadioScene, turned: Readings) -> None:
+def test_data_sets_of_one_name_are_told_apart_in_a_report(scene, turned):
     power = turned.power.copy()
     power[[0, len(power) // 2]] *= 1e3  # a row of each half
     halves = [replace(turned, power=power).subset(part) for part in np.split(np.arange(len(turned)), 2)]
@@ -103,7 +99,7 @@ def test_data_sets_of_one_name_are_told_apart_in_a_report(scene: RadioScene, tur
     assert all(0 in report["unexplained"][name] for name in ("readings 1", "readings 2"))
 
 
-def test_the_noise_of_readings_is_estimated(scene: RadioScene, turned: Readings) -> None:
+def test_the_noise_of_readings_is_estimated(scene, turned):
     """Noise and what the field cannot explain of clean readings add in power."""
     noise = 10.0 ** (0.3 * np.random.default_rng(3).normal(size=len(turned)))  # 3 dB
     power = np.maximum(np.where(turned.power > turned.floor, turned.power * noise, 0.0), turned.floor)
@@ -115,7 +111,7 @@ def test_the_noise_of_readings_is_estimated(scene: RadioScene, turned: Readings)
     assert found == pytest.approx(np.hypot(3.0, clean), rel=0.2)
 
 
-def test_fading_is_as_deep_as_paths_make_it(scene: RadioScene) -> None:
+def test_fading_is_as_deep_as_paths_make_it(scene):
     """Waves of random phases: in line of sight power fades less than Rayleigh's does, and no chain's gain is moved."""
     effects, rng = replace(SETS["single"], residual=False), np.random.default_rng(0)
     places = rng.uniform([0.3, 0.3, 0.3], [4.7, 3.7, 1.5], (60, 3))
@@ -133,7 +129,7 @@ def test_fading_is_as_deep_as_paths_make_it(scene: RadioScene) -> None:
         assert found["gain_db"] == pytest.approx(CHAIN_DB, abs=bound)
 
 
-def test_several_transmitters_are_fitted_together_and_remembered(scene: RadioScene, tmp_path: Path) -> None:
+def test_several_transmitters_are_fitted_together_and_remembered(scene, tmp_path):
     second, third = np.array([4.3, 0.7, 2.0]), np.array([4.2, 3.4, 2.3])
     sets = [spectra(scene, RECEIVERS[k : k + 3], transmitter=t) for k, t in ((0, TX), (3, second))]
     field = RadioField.fit(scene, sets, quick=True)
@@ -151,7 +147,7 @@ def test_several_transmitters_are_fitted_together_and_remembered(scene: RadioSce
     assert both > 25.0
 
 
-def test_a_rotator_whose_zero_is_unknown_is_turned_to_the_room(scene: RadioScene, turned: Readings) -> None:
+def test_a_rotator_whose_zero_is_unknown_is_turned_to_the_room(scene, turned):
     assert turned.arrival is not None
     away = replace(
         turned, arrival=turned.arrival - [0.0, np.radians(137.0)], azimuth_known=False, name="away"
@@ -162,7 +158,7 @@ def test_a_rotator_whose_zero_is_unknown_is_turned_to_the_room(scene: RadioScene
         replace(turned, arrival=None, receive_pattern=None, azimuth_known=False)
 
 
-def test_receivers_that_stood_elsewhere_are_found(scene: RadioScene, turned: Readings) -> None:
+def test_receivers_that_stood_elsewhere_are_found(scene, turned):
     rng = np.random.default_rng(2)
     away = 0.08 * rng.normal(size=(6, 3)).clip(-1.5, 1.5)
     count = len(turned) // 6
@@ -174,7 +170,7 @@ def test_receivers_that_stood_elsewhere_are_found(scene: RadioScene, turned: Rea
     sight = RECEIVERS[:6] - TX
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
 
-    def across(error: np.ndarray) -> float:  # powers say little of how far away a receiver is
+    def across(error):  # powers say little of how far away a receiver is
         return float(np.sqrt(((error - (error * sight).sum(axis=1, keepdims=True) * sight) ** 2).mean()))
 
     assert across(left) < 0.5 * across(away)
@@ -183,7 +179,7 @@ def test_receivers_that_stood_elsewhere_are_found(scene: RadioScene, turned: Rea
         replace(turned, arrival=None, receive_pattern=None, position_std_m=0.05)
 
 
-def test_roughness_counts_in_wavelengths_at_another_carrier(scene: RadioScene) -> None:
+def test_roughness_counts_in_wavelengths_at_another_carrier(scene):
     """A mirror's share exp(-(4 pi sigma_h / lambda)^2) is found again, the sum of both shares stays, and so does what
     free space gives: the square of the wavelength."""
     truth = spectra(scene, RECEIVERS[:3])
@@ -202,7 +198,7 @@ def test_roughness_counts_in_wavelengths_at_another_carrier(scene: RadioScene) -
         field.at_frequency(-1.0)
 
 
-def test_carriers_are_fitted_together(scene: RadioScene) -> None:
+def test_carriers_are_fitted_together(scene):
     """Roughness makes 1 - S^2 = exp(-(4 pi sigma_h / lambda)^2): half the carrier, its fourth root. What was measured at
     one carrier serves the other."""
     smoother = [replace(m, scattering=np.sqrt(1 - (1 - m.scattering**2) ** 0.25)) for m in scene.materials]
@@ -221,7 +217,7 @@ def test_carriers_are_fitted_together(scene: RadioScene) -> None:
     assert both.parameters.roughness == pytest.approx(2.0, abs=0.2)
 
 
-def test_carriers_whose_scattering_does_not_follow_roughness_are_fitted_together(scene: RadioScene) -> None:
+def test_carriers_whose_scattering_does_not_follow_roughness_are_fitted_together(scene):
     """Sionna's S is one number at every carrier: a power of the carrier of 0 where Ament has 2."""
     carriers = 300e9, 140e9
     sets = [
@@ -237,7 +233,7 @@ def test_carriers_whose_scattering_does_not_follow_roughness_are_fitted_together
         assert np.abs(10.0 * np.log10(ratio)).max() < 0.1
 
 
-def test_directions_that_nobody_measured_do_not_count(scene: RadioScene, test: SpectrumDataset) -> None:
+def test_directions_that_nobody_measured_do_not_count(scene, test):
     whole = spectra(scene, RECEIVERS[:5])
     gain = whole.path_gain.copy()
     gain[:, :6] = np.nan
@@ -262,7 +258,7 @@ def test_directions_that_nobody_measured_do_not_count(scene: RadioScene, test: S
         RadioField.fit(scene, part, "rf3dgs+")
 
 
-def test_a_censored_reading_says_only_that_there_was_no_more() -> None:
+def test_a_censored_reading_says_only_that_there_was_no_more():
     target = Target(np.array([3.0, 3.0]), censored=np.array([True, False]))
     quiet, loud = np.full(2, 0.01), np.full(2, 100.0)
     assert target.error(quiet)[0] == 0 and target.slope(quiet)[0] == 0
@@ -270,7 +266,7 @@ def test_a_censored_reading_says_only_that_there_was_no_more() -> None:
     assert target.error(loud)[0] == target.error(loud)[1] > 10
 
 
-def test_a_reading_weighs_paths_by_directions_and_delay() -> None:
+def test_a_reading_weighs_paths_by_directions_and_delay():
     east, north = directions_from_angles([np.pi / 2] * 2, [0.0, np.pi / 2])
     one = Readings(
         TX, RECEIVERS[0], [1e-9, 1e-9], F, 1e-15, arrival=[[np.pi / 2, 0.0], [np.pi / 2, np.pi / 2]],
@@ -288,7 +284,7 @@ def test_a_reading_weighs_paths_by_directions_and_delay() -> None:
     assert shares.sum() == pytest.approx(1.0, abs=1e-3)  # all taps share the path's power
 
 
-def test_a_horn_of_a_width_is_lossless() -> None:
+def test_a_horn_of_a_width_is_lossless():
     angle = np.linspace(0, np.pi, 100_001)
     for width in (0.05, 0.5, 2.0):
         gain = horn(width)(angle)
@@ -302,7 +298,7 @@ HEADER = "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,azimuth_deg,elevation_deg,power_db,chain
 ROW = "0.8,0.9,2.2,4.2,3.1,1.2,-180,30,-93.1,horn"
 
 
-def of_csv(text: str, path: Path) -> Readings:
+def of_csv(text, path):
     path.write_text(text, encoding="utf-8")
     return Readings.load(path, frequency_hz=F, floor=1e-12, receive_pattern=horn(WIDTH))
 
@@ -316,12 +312,12 @@ def of_csv(text: str, path: Path) -> Readings:
         (f"{HEADER},power_db\n{ROW},-60", "several columns power_db"),
     ],
 )
-def test_what_a_table_s_file_does_not_say_clearly_is_refused(text: str, told: str, tmp_path: Path) -> None:
+def test_what_a_table_s_file_does_not_say_clearly_is_refused(text, told, tmp_path):
     with pytest.raises(ValueError, match=rf"horn\.csv: .*{told}"):
         of_csv(text, tmp_path / "horn.csv")
 
 
-def test_a_table_s_file_is_read_as_it_is_meant(tmp_path: Path) -> None:
+def test_a_table_s_file_is_read_as_it_is_meant(tmp_path):
     """Spaces, empty lines, a byte-order mark, a chain called NA, a power that was not measured; other columns are named."""
     lines = [HEADER, ROW.replace("horn", "NA"), "", ROW.replace("-93.1", "n/a").replace("horn", "")]
     spaced = "\ufeff" + "\n".join(line.replace(",", " , ") for line in lines)
@@ -338,18 +334,12 @@ def test_a_table_s_file_is_read_as_it_is_meant(tmp_path: Path) -> None:
     assert told[0].filename == __file__
 
 
-@pytest.mark.parametrize(
-    ("frequency_hz", "floor", "told"),
-    [(28, 1e-15, "expected hertz"), (F, 1e-9, "no value above the floor")],
-)
-def test_a_carrier_in_gigahertz_and_powers_all_at_the_floor_are_questioned(
-    frequency_hz: float, floor: float, told: str
-) -> None:
-    with pytest.raises(ValueError, match=told):
-        Readings(TX, RECEIVERS[:2], [1e-9, 1e-9], frequency_hz, floor)
+def test_a_carrier_in_gigahertz_is_questioned():
+    with pytest.raises(ValueError, match="expected hertz"):
+        Readings(TX, RECEIVERS[:2], [1e-9, 1e-9], 28, 1e-15)
 
 
-def test_a_cell_without_a_chain_is_a_calibrated_reading() -> None:
+def test_a_cell_without_a_chain_is_a_calibrated_reading():
     table = pd.DataFrame({name: [1.0, 2.0] for end in ("transmitter", "receiver") for name in COLUMNS[end]})
     table["power_db"] = -80.0
     for missing in (None, np.nan):
@@ -357,9 +347,7 @@ def test_a_cell_without_a_chain_is_a_calibrated_reading() -> None:
         assert read.chain.tolist() == ["horn", ""]
 
 
-def test_the_only_place_of_a_chain_is_not_held_out(
-    scene: RadioScene, turned: Readings, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_only_place_of_a_chain_is_not_held_out(scene, turned, monkeypatch):
     """Its gain would be known from nothing: a horn at one place beside spectra at seven, whichever place it is."""
     several = spectra(scene, RECEIVERS[1:8])
     alone = turned.subset(np.flatnonzero((turned.receivers == RECEIVERS[0]).all(axis=1)))

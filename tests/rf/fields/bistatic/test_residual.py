@@ -14,7 +14,7 @@ from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.links import LinkTracer
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
-from warprrf.rf.fields.bistatic.residual import Shares, fit_residual, shares_of
+from warprrf.rf.fields.bistatic.residual import fit_residual, shares_of
 from warprrf.rf.maps.links import LinkOptions
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.tracing.model import Effects
@@ -24,7 +24,7 @@ MEASURED = SpectrumPixels(BeamOperator(SHAPE, SIGMA))
 
 
 @pytest.fixture(scope="module")
-def field() -> BistaticField:
+def field():
     """A room before any measurement, whose surfaces also send on the light of others."""
     mesh = Mesh(*subdivide_to_size(*ROOM, 0.25))
     walls = SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5)
@@ -33,7 +33,7 @@ def field() -> BistaticField:
     return BistaticField.prior(scene, spectra(scene, RECEIVERS[:1]), effects=effects)
 
 
-def planted_shares(field: BistaticField, planted: np.ndarray) -> list[Shares]:
+def planted_shares(field, planted):
     """What cells give receivers of ``field``, who read it with the gains ``planted``."""
     textured, found = replace(field, residual=planted), []
     for receiver in RECEIVERS:
@@ -45,7 +45,7 @@ def planted_shares(field: BistaticField, planted: np.ndarray) -> list[Shares]:
     return found
 
 
-def test_planted_gains_come_back(field: BistaticField) -> None:
+def test_planted_gains_come_back(field):
     """Noiseless spectra: the image is met to 0.1 dB, and the gains of what is seen well to a fraction of a dB: in three
     plantings, of which one alone depends on where its largest gains happen to lie."""
     found_again = []
@@ -70,7 +70,7 @@ def test_planted_gains_come_back(field: BistaticField) -> None:
     assert np.mean(found_again) > 0.9
 
 
-def test_nothing_seen_is_nothing_learned(field: BistaticField) -> None:
+def test_nothing_seen_is_nothing_learned(field):
     """Spectra that the field explains already, and surfaces that no spectrum shows, have gains of 1."""
     shares = planted_shares(field, np.zeros_like(field.residual))
     assert np.abs(fit_residual(shares, field.surface)).max() < 1e-4
@@ -78,9 +78,8 @@ def test_nothing_seen_is_nothing_learned(field: BistaticField) -> None:
     shown = np.isin(
         np.arange(surface.cells), np.unique(surface.cell_element, return_index=True)[1], invert=True
     )
-    shown &= (
-        surface.element_centre[surface.cell_element][:, 2] < 2.9
-    )  # no ceiling, and else all cells but one
+    # No ceiling, and else all cells but one.
+    shown &= surface.element_centre[surface.cell_element][:, 2] < 2.9
     hide = sparse.diags_array(np.tile(shown.astype(np.float32), 2))
     twice = planted_shares(field, np.full_like(field.residual, np.log(2.0)))
     doubled = [replace(s, power=s.power @ hide) for s in twice]
@@ -91,7 +90,7 @@ def test_nothing_seen_is_nothing_learned(field: BistaticField) -> None:
     assert (found[0][~shown & ~dark] > 0).mean() > 0.8
 
 
-def test_gains_multiply_their_own_light_alone(field: BistaticField) -> None:
+def test_gains_multiply_their_own_light_alone(field):
     view, cells = field.view(RECEIVERS[0]), field.surface.cells
     bare = field.path_gains(view).tables
     for row, own in enumerate((["S"], ["MS", "E"])):
@@ -101,7 +100,7 @@ def test_gains_multiply_their_own_light_alone(field: BistaticField) -> None:
         assert all(bare[name].sum() > 0 for name in own)
 
 
-def test_another_transmitters_light_falls_elsewhere(field: BistaticField) -> None:
+def test_another_transmitters_light_falls_elsewhere(field):
     """Gains of surfaces hold for every transmitter; those of what they send on belong to the one they were learned
     under."""
     there = TX + [1.0, 0.5, -0.3]
@@ -114,11 +113,11 @@ def test_another_transmitters_light_falls_elsewhere(field: BistaticField) -> Non
     assert not np.allclose(ours["S"], bare["S"], atol=0.0)
 
 
-def test_links_have_the_same_gains(field: BistaticField) -> None:
+def test_links_have_the_same_gains(field):
     """What either gain adds to the total path gain of a link is what it adds to the spectrum."""
     rng = np.random.default_rng(6)
 
-    def totals(asked: BistaticField) -> tuple[np.ndarray, np.ndarray]:
+    def totals(asked):
         tracer, options = asked.tracer(), LinkOptions(asked.beam_sigma_rad, SHAPE)
         links = LinkTracer(tracer, asked.state, asked.evaluation(tracer), options, SHAPE)(RECEIVERS)
         return links.total_path_gain, np.array([asked.spectrum(r).path_gain.sum() for r in RECEIVERS])

@@ -26,7 +26,7 @@ WAVELENGTH = SPEED_OF_LIGHT / F
 RECEIVERS = RECEIVERS[:6]
 
 
-def test_facets_too_small_for_mirrors_leave_line_of_sight_alone() -> None:
+def test_facets_too_small_for_mirrors_leave_line_of_sight_alone():
     ball = icosphere(subdivisions=4, radius=0.3)
     surface = Surface.of(
         RadioScene(Mesh(ball.vertices, ball.faces), np.zeros(len(ball.faces), int), [SlabMaterial()])
@@ -37,7 +37,7 @@ def test_facets_too_small_for_mirrors_leave_line_of_sight_alone() -> None:
 
 @pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("reciprocal", [False, True])
-def test_columns_are_the_sums_of_their_records(scene: RadioScene, reciprocal: bool) -> None:
+def test_columns_are_the_sums_of_their_records(scene, reciprocal):
     """What a fit is made on: light over several surfaces exactly, single scattering with Fresnel curves of three components."""
     field = BistaticField.prior(
         scene, spectra(scene, RECEIVERS[:1]), effects=EVERYTHING, reciprocal=reciprocal
@@ -47,7 +47,7 @@ def test_columns_are_the_sums_of_their_records(scene: RadioScene, reciprocal: bo
     columns = columns_of(o, EVERYTHING, field.evaluation(view.tracer))
     single = replace(columns, senders=columns.senders[:0], further=columns.further[:0]).power(p)
 
-    def image(by_ray: np.ndarray) -> np.ndarray:
+    def image(by_ray):
         return beam(by_ray.reshape(*SHAPE, -1).sum(axis=-1, keepdims=True)).ravel() / field.floor
 
     further = image(gains.by_ray([name for name in gains.tables if name not in ("specular", "S")]))
@@ -74,7 +74,7 @@ MATERIALS = [
 
 
 @pytest.fixture(scope="module")
-def scene() -> RadioScene:
+def scene():
     mesh, part = joined(
         ROOM,
         box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 1.4]),
@@ -84,7 +84,7 @@ def scene() -> RadioScene:
 
 
 @pytest.fixture(scope="module")
-def problem(scene: RadioScene) -> Problem:
+def problem(scene):
     ds = spectra(scene, RECEIVERS)
     target = to_db(ds.path_gain, ds.floor) - 10 * np.log10(ds.floor)
     measured = SpectrumPixels(BeamOperator(SHAPE, np.radians(5.0)))
@@ -95,7 +95,7 @@ def problem(scene: RadioScene) -> Problem:
     return Problem.of(observations, SINGLE, np.arange(3), Parameters.prior(3))
 
 
-def test_spectra_join_groups_of_one_material_and_no_others(problem: Problem, scene: RadioScene) -> None:
+def test_spectra_join_groups_of_one_material_and_no_others(problem, scene):
     area = np.bincount(scene.face_material, scene.mesh.areas)
     separate = gauss_newton(problem, Parameters.prior(3), 40)
     alike = np.zeros((3, 4))  # all appear the same
@@ -109,7 +109,7 @@ def test_spectra_join_groups_of_one_material_and_no_others(problem: Problem, sce
     assert moved[2] == moved[1] != moved[0]
 
 
-def test_looks_that_differ_keep_apart_what_spectra_cannot_tell(problem: Problem, scene: RadioScene) -> None:
+def test_looks_that_differ_keep_apart_what_spectra_cannot_tell(problem, scene):
     dark = replace(
         problem, columns=[replace(c, single=0 * c.single) for c in problem.columns],
         observations=[observation(o.view, o.measured, o.floor) for o in problem.observations],
@@ -120,7 +120,7 @@ def test_looks_that_differ_keep_apart_what_spectra_cannot_tell(problem: Problem,
     assert material[0] == material[1]  # nothing speaks against it
 
 
-def test_columns_of_materials_predict_what_those_of_their_groups_do(problem: Problem) -> None:
+def test_columns_of_materials_predict_what_those_of_their_groups_do(problem):
     rng = np.random.default_rng(0)
     owner = np.array([0, 1, 1])
     p = Parameters(rng.normal(-2, 0.5, (2, 5)), rng.normal(1, 0.3, 2), rng.normal(-1, 0.3, 2))

@@ -1,7 +1,8 @@
 """Groups of a mesh without colours or names: what shape alone tells, how scans come in, and what it is worth."""
 
 import numpy as np
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined, tube
+from furnished import ROOM, spectra
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, tube
 from trimesh.remesh import subdivide_to_size
 
 from warprrf.geometry.mesh import Mesh
@@ -12,16 +13,15 @@ from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.tracing.shapes import shape_groups
 from warprrf.rf.tracing.surface import Surface
 
-ROOM = box_mesh([0, 0, 0], [5, 4, 3], inward=True)
 CUPBOARD = box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.2])
 DESK = box_mesh([0.6, 2.6, 0.7], [2.0, 3.3, 0.8])
 
 
-def groups_of(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def groups_of(mesh):
     return shape_groups(mesh, planar_patches(mesh).face_patch)
 
 
-def as_partition(label: np.ndarray) -> set[frozenset[int]]:
+def as_partition(label):
     return {frozenset(np.flatnonzero(label == k).tolist()) for k in np.unique(label)}
 
 
@@ -61,9 +61,8 @@ def test_groups_do_not_depend_on_indices_winding_or_direction():
 
 
 def test_crumbs_join_the_nearest_piece_of_their_part():
-    ledge = box_mesh(
-        [0, 1.0, 1.0], [0.1, 1.3, 1.1]
-    )  # stands in the wall x = 0, linked to it by a corner's edge
+    # Stands in the wall x = 0, linked to it by a corner's edge.
+    ledge = box_mesh([0, 1.0, 1.0], [0.1, 1.3, 1.1])
     mesh, part = joined(ROOM, ledge)
     group, material, _ = groups_of(mesh)
     assert len(set(group[part == 1])) == 1  # a part of crumbs is one group
@@ -81,7 +80,7 @@ def test_tops_of_one_height_mirror_for_the_thing_they_are_of():
     assert surface.patch_group[first] != surface.patch_group[second]
 
 
-def scan(edge_m: float = 0.07, error_m: float = 0.02) -> Mesh:
+def scan(edge_m=0.07, error_m=0.02):
     """The furnished room as a scanner gives it: small faces, vertices with errors, holes."""
     r = np.random.default_rng(3)
     vertices, faces = subdivide_to_size(*ROOM, edge_m)
@@ -123,14 +122,11 @@ def test_a_bare_mesh_is_nearly_as_good_as_one_with_names():
     scene = RadioScene(mesh, face_material, materials)
     r = np.random.default_rng(5)
     places = np.column_stack([r.uniform(0.4, 4.6, 14), r.uniform(0.4, 1.4, 14), r.uniform(0.9, 2.0, 14)])
-    ds = exact_spectra(
-        scene, places, transmitter=np.array([4.3, 3.4, 2.3]), frequency_hz=300e9, shape=(24, 48),
-        sigma=np.radians(5.0), sub_pixels=3,
-    )  # fmt: skip
+    ds = spectra(scene, places, transmitter=np.array([4.3, 3.4, 2.3]), sub_pixels=3)
     train, test = ds.subset(range(4)), ds.subset(range(4, 14))
     one = RadioScene(mesh, np.zeros(len(part), int), materials[:1])
 
-    def psnr_db(geometry) -> float:
+    def psnr_db(geometry):
         field = RadioField.fit(geometry, train, sub_pixels=2)
         return evaluate(test, field.spectrum)["psnr_db"]
 

@@ -1,8 +1,9 @@
 """Where to measure next, and fields of no measurement."""
 
+import furnished
 import numpy as np
 import pytest
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined
 
 import warprrf as wr
 from warprrf.rf.em.materials import assumed_permittivity
@@ -17,7 +18,7 @@ CANDIDATES = np.concatenate([WEST, EAST])
 
 
 @pytest.fixture(scope="module")
-def scene() -> RadioScene:
+def scene():
     """Two halves of a room, with a gap at the end of the wall between them."""
     mesh, part = joined(
         box_mesh([0, 0, 0], [6, 4, 3], inward=True), box_mesh([2.9, -0.01, -0.01], [3.1, 3.0, 3.01])
@@ -27,24 +28,16 @@ def scene() -> RadioScene:
     )
 
 
-def spectra(scene: RadioScene, places: np.ndarray) -> wr.SpectrumDataset:
-    return exact_spectra(
-        scene,
-        places,
-        transmitter=TX,
-        frequency_hz=CARRIER_HZ,
-        shape=(24, 48),
-        sigma=np.radians(5.0),
-        sub_pixels=2,
-    )
+def spectra(scene, places):
+    return furnished.spectra(scene, places, transmitter=TX, sub_pixels=2)
 
 
 @pytest.fixture(scope="module")
-def unmeasured(scene: RadioScene) -> wr.RadioField:
+def unmeasured(scene):
     return wr.RadioField.fit(scene, spectra(scene, CANDIDATES[:2]).subset([]))
 
 
-def test_no_spectra_at_all_are_a_field_and_one_is_a_better_one(scene, unmeasured) -> None:
+def test_no_spectra_at_all_are_a_field_and_one_is_a_better_one(scene, unmeasured):
     ds = spectra(scene, CANDIDATES)
     assert unmeasured.report["receivers"] == 0 and len(unmeasured.fitted_on) == 0
     found = [
@@ -54,7 +47,7 @@ def test_no_spectra_at_all_are_a_field_and_one_is_a_better_one(scene, unmeasured
     assert found[0] + 1.0 < found[1]
 
 
-def test_an_empty_data_set_is_enough_to_start(scene) -> None:
+def test_an_empty_data_set_is_enough_to_start(scene):
     nothing = wr.SpectrumDataset.empty(transmitter=TX, frequency_hz=CARRIER_HZ, shape=(24, 48))
     field = wr.RadioField.fit(scene, nothing)
     # 60 dB below free space over ten metres
@@ -69,7 +62,7 @@ def test_an_empty_data_set_is_enough_to_start(scene) -> None:
         wr.RadioField.fit(scene.mesh, nothing, model="rf3dgs+")
 
 
-def test_permittivities_before_any_measurement_are_those_of_p2040() -> None:
+def test_permittivities_before_any_measurement_are_those_of_p2040():
     # ITU-R P.2040-4, table 3, glass at 300 GHz: 5.79 - 0.0004 * 300^1.658 / (2 pi 300e9 eps_0) j
     assert assumed_permittivity("mat-itu_glass.001", CARRIER_HZ) == pytest.approx(5.79, abs=0.02)
     assert assumed_permittivity("group_3", CARRIER_HZ) == assumed_permittivity("anything", CARRIER_HZ)
@@ -77,12 +70,12 @@ def test_permittivities_before_any_measurement_are_those_of_p2040() -> None:
     assert assumed_permittivity("metal", CARRIER_HZ) > 1e4
 
 
-def test_both_sides_of_a_wall_are_measured_before_a_place_again(unmeasured) -> None:
+def test_both_sides_of_a_wall_are_measured_before_a_place_again(unmeasured):
     chosen = set(unmeasured.suggest(CANDIDATES, 3).tolist())
     assert chosen & {4, 5} and chosen & {0, 1, 2, 3} and not chosen >= {0, 2}
 
 
-def test_the_order_of_candidates_does_not_matter(unmeasured) -> None:
+def test_the_order_of_candidates_does_not_matter(unmeasured):
     turned = np.array([3, 5, 0, 4, 1, 2])
     assert (
         turned[unmeasured.suggest(CANDIDATES[turned], 3)].tolist()
@@ -90,13 +83,13 @@ def test_the_order_of_candidates_does_not_matter(unmeasured) -> None:
     )
 
 
-def test_what_was_measured_is_not_measured_again(scene, unmeasured) -> None:
+def test_what_was_measured_is_not_measured_again(scene, unmeasured):
     first = int(unmeasured.suggest(CANDIDATES)[0])
     field = wr.RadioField.fit(scene, spectra(scene, CANDIDATES).subset([first]), quick=True)
     assert field.suggest(CANDIDATES)[0] != first
 
 
-def test_a_horn_is_not_pointed_twice_at_one_place(unmeasured) -> None:
+def test_a_horn_is_not_pointed_twice_at_one_place(unmeasured):
     angles = np.column_stack([np.full(6, np.pi / 2), [0.0, 0.0, 0.01, 2.0, 2.01, -2.0]])
     place = np.tile(WEST[0], (6, 1))
     chosen = unmeasured.suggest(place, 3, arrival=angles, receive_pattern=wr.horn(np.radians(10.0)))
@@ -105,7 +98,7 @@ def test_a_horn_is_not_pointed_twice_at_one_place(unmeasured) -> None:
         unmeasured.suggest(place, 3, arrival=angles)
 
 
-def test_variances_are_those_of_the_joint_posterior() -> None:
+def test_variances_are_those_of_the_joint_posterior():
     rng = np.random.default_rng(0)
     material = np.array([0, 0, 0, 1, 1])
     unknowns = Unknowns(material, np.array([1.0, 0.3]), np.array([0.5, 0.5, 0.2, 0.3, 0.3]))
@@ -118,7 +111,7 @@ def test_variances_are_those_of_the_joint_posterior() -> None:
     assert (unknowns.variance(precision + rng.random(5)) < unknowns.variance(precision)).all()
 
 
-def test_a_part_of_what_was_traced_reads_its_own_spectra(scene) -> None:
+def test_a_part_of_what_was_traced_reads_its_own_spectra(scene):
     ds = spectra(scene, CANDIDATES)
     seen, chosen = trace(scene, ds, sub_pixels=1), [4, 1]
     alone = wr.RadioField.fit(scene, ds.subset(chosen), quick=True)

@@ -1,7 +1,7 @@
 """Radio fields: the paper's equations by brute force, their scaling laws, paths, files, and resumed fits."""
 
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -28,7 +28,7 @@ FLOOR, RANGE_DB = 1e-16, (-160.0, -80.0)
 
 
 @pytest.fixture(scope="module")
-def room() -> SimpleNamespace:
+def room():
     """A closed room with a block that hides the transmitter from behind it, covered with discs."""
     mesh, _ = joined(ROOM, box_mesh([2, 0.2, 0.1], [2.4, 2.9, 2.9]))
     return SimpleNamespace(mesh=mesh, gaussians=discs_on_mesh(mesh, 1500, seed=1))
@@ -39,9 +39,7 @@ RECEIVERS = RECEIVERS[(RECEIVERS[:, 0] < 1.7) | (RECEIVERS[:, 0] > 2.7)][:16]
 VISIBLE, BLOCKED = np.array([1.5, 2.4, 1.2]), np.array([3.6, 1.2, 1.3])
 
 
-def field_with(
-    room: SimpleNamespace, layers: dict[str, np.ndarray], parts: dict | None = None, **options
-) -> HarmonicField:
+def field_with(room, layers, parts=None, **options):
     """A field on the room, or with other ``parts``, of known coefficients."""
     given = {
         "gaussians": room and room.gaussians, "mesh": room and room.mesh, "transmitter": TRANSMITTER,
@@ -51,7 +49,7 @@ def field_with(
     return HarmonicField(**(given | (parts or {})), options=FieldOptions(**options), layers=layers)
 
 
-def smooth_layers(gaussians: Gaussians, seed: int = 0) -> dict[str, np.ndarray]:
+def smooth_layers(gaussians, seed=0):
     rng = np.random.default_rng(seed)
     table = np.zeros((len(gaussians), 16), np.float32)
     table[:, 0] = 3.0 * np.sin(gaussians.means @ rng.normal(0, 0.7, 3))
@@ -59,7 +57,7 @@ def smooth_layers(gaussians: Gaussians, seed: int = 0) -> dict[str, np.ndarray]:
     return {"gain": table}
 
 
-def dataset(field: HarmonicField, receivers: np.ndarray) -> SimpleNamespace:
+def dataset(field, receivers):
     spectra = [field.spectrum(r) for r in receivers]
     gain = np.stack([s.path_gain for s in spectra])
     return SimpleNamespace(
@@ -71,19 +69,19 @@ def dataset(field: HarmonicField, receivers: np.ndarray) -> SimpleNamespace:
 
 
 @pytest.fixture(scope="module")
-def truth(room: SimpleNamespace) -> HarmonicField:
+def truth(room):
     return field_with(room, smooth_layers(room.gaussians))
 
 
 @pytest.fixture(scope="module")
-def spectra(truth: HarmonicField) -> SimpleNamespace:
+def spectra(truth):
     return dataset(truth, RECEIVERS)
 
 
 @pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("rule", ["product", "exp"])
 @pytest.mark.parametrize("gain", ["exp", "linear"])
-def test_a_pixel_is_the_papers_equations(rule: str, gain: str) -> None:
+def test_a_pixel_is_the_papers_equations(rule, gain):
     """Eq. (2)-(4) by hand: discs across one ray, harmonics of degree 0 and 1 written out."""
     row, column = 7, 20
     d = pixel_directions(SHAPE)[row, column]
@@ -119,9 +117,7 @@ def test_a_pixel_is_the_papers_equations(rule: str, gain: str) -> None:
 
 
 @pytest.mark.parametrize(("model", "power_ratio"), [("rf3dgs+", 0.25), ("rf3dgs", 1.0)])
-def test_doubling_every_distance_quarters_the_power_only_with_lengths(
-    room: SimpleNamespace, model: str, power_ratio: float
-) -> None:
+def test_doubling_every_distance_quarters_the_power_only_with_lengths(room, model, power_ratio):
     layers = smooth_layers(room.gaussians)
     small = field_with(room, layers, model=model)
     g = room.gaussians
@@ -137,7 +133,7 @@ def test_doubling_every_distance_quarters_the_power_only_with_lengths(
         assert b.delay_s == pytest.approx(2 * a.delay_s, rel=1e-9)
 
 
-def test_moving_the_transmitter_changes_power_by_the_squared_ratio_of_lengths(truth: HarmonicField) -> None:
+def test_moving_the_transmitter_changes_power_by_the_squared_ratio_of_lengths(truth):
     elsewhere = np.array([1.4, 3.2, 0.9])
     here, there = truth.spectrum(BLOCKED), truth.spectrum(BLOCKED, transmitter=elsewhere)
     paths = [truth.paths(BLOCKED), truth.paths(BLOCKED, elsewhere)]
@@ -150,7 +146,7 @@ def test_moving_the_transmitter_changes_power_by_the_squared_ratio_of_lengths(tr
 
 
 @pytest.mark.parametrize("kind", ["mesh", "peak", "expected"])
-def test_interaction_points_give_lengths_to_the_walls(room: SimpleNamespace, kind: str) -> None:
+def test_interaction_points_give_lengths_to_the_walls(room, kind):
     """Rays to the walls of an axis-aligned box, by the slab formula in float64: exact of its mesh, nearly of discs."""
     mesh = Mesh(*ROOM)
     discs = discs_on_mesh(mesh, 1500, seed=1)
@@ -168,15 +164,13 @@ def test_interaction_points_give_lengths_to_the_walls(room: SimpleNamespace, kin
     assert error.max() < 1e-8 if kind == "mesh" else np.median(error) < 0.01
 
 
-def test_a_field_is_recovered_from_spectra_of_its_own_kind(
-    room: SimpleNamespace, spectra: SimpleNamespace
-) -> None:
+def test_a_field_is_recovered_from_spectra_of_its_own_kind(room, spectra):
     each = ("receivers", "path_gain", "delay_s", "aod", "line_of_sight")
     train = SimpleNamespace(**(vars(spectra) | {name: getattr(spectra, name)[:13] for name in each}))
     found = HarmonicField.fit(room, train, iterations=150, seed=0)
     untrained = HarmonicField.fit(room, train, iterations=0, seed=0)
 
-    def score(field: HarmonicField, index: int) -> float:
+    def score(field, index):
         image = unit_image(field.spectrum(spectra.receivers[index]).path_gain, FLOOR, spectra.range_db)
         return psnr(image, unit_image(spectra.path_gain[index], FLOOR, spectra.range_db))
 
@@ -187,9 +181,7 @@ def test_a_field_is_recovered_from_spectra_of_its_own_kind(
     assert found.report["losses"]["gain"][-1] < 0.3 * found.report["losses"]["gain"][0]
 
 
-def test_rf3dgs_learns_delay_and_departure_of_its_training_spectra(
-    room: SimpleNamespace, spectra: SimpleNamespace
-) -> None:
+def test_rf3dgs_learns_delay_and_departure_of_its_training_spectra(room, spectra):
     found = HarmonicField.fit(room, spectra, "rf3dgs", iterations=100)
     blocked = [i for i, r in enumerate(spectra.receivers) if r[0] > 2.7]
     delay = np.stack([found.spectrum(spectra.receivers[i]).delay_s for i in blocked])
@@ -199,15 +191,11 @@ def test_rf3dgs_learns_delay_and_departure_of_its_training_spectra(
     assert np.median(np.abs(zenith - spectra.aod[blocked][..., 0])) < np.radians(3)
 
 
-def test_gaussians_that_nobody_saw_keep_the_median_gain(
-    room: SimpleNamespace, spectra: SimpleNamespace
-) -> None:
+def test_gaussians_that_nobody_saw_keep_the_median_gain(room, spectra):
     g = room.gaussians
-    outside = Gaussians(
-        np.concatenate([g.means, [[50.0, 50, 50]]]), np.concatenate([g.quaternions, g.quaternions[:1]]),
-        np.concatenate([g.scales, g.scales[:1]]), np.concatenate([g.opacities, [0.0]]),
-        np.concatenate([g.sh, g.sh[:1]]),
-    )  # fmt: skip
+    parts = (g.means, g.quaternions, g.scales, g.opacities, g.sh)
+    outside = Gaussians(*(np.concatenate([part, part[:1]]) for part in parts))
+    outside.means[-1], outside.opacities[-1] = 50.0, 0.0
     found = HarmonicField.fit(SimpleNamespace(gaussians=outside, mesh=room.mesh), spectra, iterations=3)
     assert not found.layers["gain"][-1].any()
     seen = found.layers["gain"][:-1].any(axis=1)
@@ -215,26 +203,21 @@ def test_gaussians_that_nobody_saw_keep_the_median_gain(
 
 
 def test_a_killed_fit_goes_on_and_ends_with_the_same_bits_and_refuses_another_fits_checkpoint(
-    room: SimpleNamespace, spectra: SimpleNamespace, tmp_path: Path
-) -> None:
-    class Killed(Exception):
-        pass
-
-    def killer(stage: str, done: int, total: int) -> None:
+    room, spectra, tmp_path
+):
+    def killer(stage, done, total):
         if stage == "fit" and done == 70:
-            raise Killed
+            raise KeyboardInterrupt
 
-    file = tmp_path / "fit.safetensors"
-    whole = HarmonicField.fit(room, spectra, iterations=80, batch=4)
-    with pytest.raises(Killed):
-        HarmonicField.fit(room, spectra, iterations=80, batch=4, checkpoint=file, progress=killer)
+    file, steps = tmp_path / "fit.safetensors", []
+    fit = partial(HarmonicField.fit, room, spectra, iterations=80, batch=4)
+    whole = fit()
+    with pytest.raises(KeyboardInterrupt):
+        fit(checkpoint=file, progress=killer)
     with pytest.raises(ValueError, match="another fit|other data"):
-        HarmonicField.fit(room, spectra, iterations=80, batch=4, checkpoint=file, gain="linear")
+        fit(checkpoint=file, gain="linear")
     assert file.exists()
-    steps = []
-    resumed = HarmonicField.fit(
-        room, spectra, iterations=80, batch=4, checkpoint=file, progress=lambda s, d, t: steps.append((s, d))
-    )
+    resumed = fit(checkpoint=file, progress=lambda s, d, t: steps.append((s, d)))
     assert min(d for s, d in steps if s == "fit") == 51
     assert np.array_equal(whole.layers["gain"], resumed.layers["gain"])
     assert whole.report["losses"] == resumed.report["losses"]
@@ -244,8 +227,8 @@ def test_a_killed_fit_goes_on_and_ends_with_the_same_bits_and_refuses_another_fi
 @pytest.mark.parametrize("line_of_sight", [None, "explicit"])
 @pytest.mark.parametrize("floor", [1e-16, 1e-3])
 def test_paths_sum_to_the_spectrum_to_which_an_explicit_line_of_sight_adds_friis_gain(
-    room: SimpleNamespace, truth: HarmonicField, line_of_sight: str | None, floor: float
-) -> None:
+    room, truth, line_of_sight, floor
+):
     field = field_with(room, truth.layers, line_of_sight=line_of_sight)
     field = replace(field, floor=floor)
     for receiver, seen in ((VISIBLE, True), (BLOCKED, False)):
@@ -257,7 +240,7 @@ def test_paths_sum_to_the_spectrum_to_which_an_explicit_line_of_sight_adds_friis
         assert more == pytest.approx(seen * friis if line_of_sight else 0.0, rel=1e-5, abs=1e-6 * friis)
 
 
-def test_line_of_sight_path_is_exact(room: SimpleNamespace, truth: HarmonicField) -> None:
+def test_line_of_sight_path_is_exact(room, truth):
     outward = VISIBLE - TRANSMITTER
     distance = np.linalg.norm(outward)
     for option in (None, "explicit"):
@@ -274,7 +257,7 @@ def test_line_of_sight_path_is_exact(room: SimpleNamespace, truth: HarmonicField
     assert not (truth.paths(BLOCKED).kind == "los").any()
 
 
-def test_phase_and_delay_of_a_path_follow_from_its_vertices(truth: HarmonicField) -> None:
+def test_phase_and_delay_of_a_path_follow_from_its_vertices(truth):
     paths = truth.paths(BLOCKED)
     point = paths.vertices[:, 0]
     length = np.linalg.norm(point - TRANSMITTER, axis=1) + np.linalg.norm(point - BLOCKED, axis=1)
@@ -283,12 +266,12 @@ def test_phase_and_delay_of_a_path_follow_from_its_vertices(truth: HarmonicField
     assert np.abs(np.angle(turned)).max() < 1e-6
 
 
-def test_max_paths_keeps_the_strongest(truth: HarmonicField) -> None:
+def test_max_paths_keeps_the_strongest(truth):
     everything, few = truth.paths(VISIBLE), truth.paths(VISIBLE, max_paths=5)
     assert few.gain == pytest.approx(everything.gain[np.argsort(-everything.power)[:5]])
 
 
-def test_options_that_do_not_exist_are_refused(room: SimpleNamespace, spectra: SimpleNamespace) -> None:
+def test_options_that_do_not_exist_are_refused(room, spectra):
     for name in ("transmittance", "interaction_point", "gain", "line_of_sight", "sh_degree"):
         with pytest.raises((ValueError, TypeError), match=name):
             HarmonicField.fit(room, spectra, **{name: 7})
@@ -296,9 +279,7 @@ def test_options_that_do_not_exist_are_refused(room: SimpleNamespace, spectra: S
         HarmonicField.fit(room.gaussians, spectra, line_of_sight="explicit")
 
 
-def test_rf3dgs_refuses_a_transmitter_that_it_does_not_know(
-    room: SimpleNamespace, truth: HarmonicField
-) -> None:
+def test_rf3dgs_refuses_a_transmitter_that_it_does_not_know(room, truth):
     fixed = field_with(room, truth.layers, model="rf3dgs")
     assert np.array_equal(
         fixed.spectrum(VISIBLE, transmitter=TRANSMITTER).path_gain, fixed.spectrum(VISIBLE).path_gain
@@ -307,7 +288,7 @@ def test_rf3dgs_refuses_a_transmitter_that_it_does_not_know(
         fixed.spectrum(VISIBLE, transmitter=[1.0, 3.0, 1.0])
 
 
-def test_transport_of_other_receivers_is_refused(room: SimpleNamespace, truth: HarmonicField) -> None:
+def test_transport_of_other_receivers_is_refused(room, truth):
     other = transport(room.gaussians, BLOCKED[None], SHAPE, range_db=RANGE_DB)
     with pytest.raises(ValueError, match="transport"):
         truth.spectrum(VISIBLE, transport=other)

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from path_makers import random_directions
 from scipy.special import factorial, lpmv
 
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -21,7 +22,7 @@ SHAPE = (12, 24)
 GAUSSIANS = 9
 
 
-def synthetic_transport(receivers: int = 3, seed: int = 0) -> Transport:
+def synthetic_transport(receivers=3, seed=0):
     """Random sparse weights: zero to four Gaussians a pixel, indices with gaps."""
     rng = np.random.default_rng(seed)
     pixels = receivers * SHAPE[0] * SHAPE[1]
@@ -39,7 +40,7 @@ def synthetic_transport(receivers: int = 3, seed: int = 0) -> Transport:
     )
 
 
-def gain_target(problem: Problem, seed: int = 1, unit: np.ndarray | None = None) -> Target:
+def gain_target(problem, seed=1, unit=None):
     rng = np.random.default_rng(seed)
     shape = (len(problem.transport.receivers), *SHAPE)
     return Target(
@@ -53,13 +54,13 @@ def gain_target(problem: Problem, seed: int = 1, unit: np.ndarray | None = None)
     )
 
 
-def coefficients_for(problem: Problem, kind: str, seed: int = 2) -> np.ndarray:
+def coefficients_for(problem, kind, seed=2):
     table = np.random.default_rng(seed).normal(0, 0.3, (len(problem.seen), 16))
     table[:, 0] += 6.0 if kind == "linear" else 1.0  # clamped sums stay off their kink
     return table
 
 
-def harmonics(d: np.ndarray) -> np.ndarray:
+def harmonics(d):
     """Real harmonics of degree 0 to 3 from SciPy's Legendre functions, in the INRIA order and signs, shape (..., 16)."""
     azimuth, out = np.arctan2(d[..., 1], d[..., 0]), []
     for degree in range(4):
@@ -71,7 +72,7 @@ def harmonics(d: np.ndarray) -> np.ndarray:
     return np.stack(out, axis=-1)
 
 
-def loss_by_hand(problem: Problem, target: Target, kind: str, table: np.ndarray) -> float:
+def loss_by_hand(problem, target, kind, table):
     """The documented loss in NumPy: dense loops, no kernels."""
     t = problem.transport
     basis = harmonics(pixel_directions(SHAPE).reshape(-1, 3))
@@ -89,7 +90,7 @@ def loss_by_hand(problem: Problem, target: Target, kind: str, table: np.ndarray)
     u = u.reshape(target.image.shape)
     a, b = u, target.image
 
-    def smooth(image: np.ndarray) -> np.ndarray:
+    def smooth(image):
         padded = np.pad(image, ((0, 0), (RADIUS, RADIUS), (0, 0)))
         rows = sum(w * padded[:, k : k + image.shape[1]] for k, w in enumerate(WINDOW))
         return sum(w * np.roll(rows, RADIUS - k, axis=2) for k, w in enumerate(WINDOW))
@@ -104,7 +105,7 @@ def loss_by_hand(problem: Problem, target: Target, kind: str, table: np.ndarray)
 @pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("kind", ["exp", "linear", "signed"])
 @pytest.mark.parametrize("with_unit", [False, True])
-def test_loss_and_gradient_against_numpy_and_finite_differences(kind: str, with_unit: bool) -> None:
+def test_loss_and_gradient_against_numpy_and_finite_differences(kind, with_unit):
     problem = Problem(synthetic_transport(), batch=3, precision=np.float64)
     unit = np.random.default_rng(7).uniform(0.5, 2.0, len(problem.seen)) if with_unit else None
     target = replace(gain_target(problem, unit=unit), kind=kind)
@@ -114,7 +115,7 @@ def test_loss_and_gradient_against_numpy_and_finite_differences(kind: str, with_
     table = coefficients_for(problem, kind)
     layer = Layer(problem, target)
 
-    def loss(values: np.ndarray) -> float:
+    def loss(values):
         return layer.step(0, problem.upload(values, problem.kernels.vec16))
 
     assert loss(table) == pytest.approx(loss_by_hand(problem, target, kind, table), rel=1e-12)
@@ -128,7 +129,7 @@ def test_loss_and_gradient_against_numpy_and_finite_differences(kind: str, with_
         assert (gradient * direction).sum() == pytest.approx(numeric, rel=2e-5, abs=1e-9)
 
 
-def test_gradient_does_not_depend_on_how_launches_are_split(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gradient_does_not_depend_on_how_launches_are_split(monkeypatch):
     import warprrf.device as device
 
     problem = Problem(synthetic_transport(receivers=4), batch=4)
@@ -143,7 +144,7 @@ def test_gradient_does_not_depend_on_how_launches_are_split(monkeypatch: pytest.
 
 
 @pytest.mark.usefixtures("device")
-def test_adams_first_step_is_the_learning_rate_against_the_gradients_sign() -> None:
+def test_adams_first_step_is_the_learning_rate_against_the_gradients_sign():
     """Kingma and Ba 2015: after bias correction the first update is rate * g / |g|."""
     problem = Problem(synthetic_transport(), batch=3, precision=np.float64)
     target = gain_target(problem)
@@ -157,7 +158,7 @@ def test_adams_first_step_is_the_learning_rate_against_the_gradients_sign() -> N
 
 
 @pytest.mark.parametrize(("degree", "count"), [(0, 1), (1, 4), (2, 9), (3, 16)])
-def test_coefficients_above_the_degree_stay_zero(degree: int, count: int) -> None:
+def test_coefficients_above_the_degree_stay_zero(degree, count):
     problem = Problem(synthetic_transport(), batch=3)
     state = fit_layer(problem, gain_target(problem), steps=4, degree=degree)
     assert state.coefficients[:, :count].all()
@@ -167,7 +168,7 @@ def test_coefficients_above_the_degree_stay_zero(degree: int, count: int) -> Non
 RANGE_DB = (-60.0, 0.0)
 
 
-def test_the_ridge_holds_a_gaussian_at_its_start() -> None:
+def test_the_ridge_holds_a_gaussian_at_its_start():
     problem = Problem(synthetic_transport(), batch=3)
     target = gain_target(problem)
     free, held = (
@@ -178,18 +179,16 @@ def test_the_ridge_holds_a_gaussian_at_its_start() -> None:
     assert np.abs(held).max() < 0.1 * np.abs(free).max()
 
 
-def test_a_pixels_weight_is_the_sum_of_its_pairs_and_zero_without_any() -> None:
+def test_a_pixels_weight_is_the_sum_of_its_pairs_and_zero_without_any():
     seen = synthetic_transport()
     expected = np.bincount(seen.pixel, seen.weight, 3 * SHAPE[0] * SHAPE[1]).reshape(3, *SHAPE)
     assert np.allclose(seen.pixel_weight, expected, rtol=1e-12, atol=0)
 
 
-def shell(count: int = 250, seed: int = 0) -> Gaussians:
+def shell(count=250, seed=0):
     """Blobs on two shells around the origin: what lies behind shows only through the first."""
     rng = np.random.default_rng(seed)
-    direction = rng.normal(size=(count, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    distance = np.where(np.arange(count) % 2, 2.0, 4.0)
+    direction, distance = random_directions(count, rng), np.where(np.arange(count) % 2, 2.0, 4.0)
     return Gaussians(
         (direction * distance[:, None]).astype(np.float32),
         np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
@@ -199,7 +198,7 @@ def shell(count: int = 250, seed: int = 0) -> Gaussians:
     )
 
 
-def test_listed_responses_give_the_weights_that_the_rasteriser_gives() -> None:
+def test_listed_responses_give_the_weights_that_the_rasteriser_gives():
     gaussians = replace(shell(), opacities=np.full(250, 0.999, np.float32))
     receivers = np.array([[0.0, 0.0, 0.0], [0.3, -0.2, 0.1]])
     seen = transport(gaussians, receivers, SHAPE, range_db=RANGE_DB, top_k=64)
@@ -214,7 +213,7 @@ def test_listed_responses_give_the_weights_that_the_rasteriser_gives() -> None:
 
 @pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("with_unit", [False, True])
-def test_gradient_by_opacity_against_finite_differences(with_unit: bool) -> None:
+def test_gradient_by_opacity_against_finite_differences(with_unit):
     rng = np.random.default_rng(1)
     blank = synthetic_transport(receivers=2)
     listed = Listed(blank, rng.uniform(0.2, 1.0, len(blank.gaussian)).astype(np.float32), 1 - 1e-6)
@@ -224,7 +223,7 @@ def test_gradient_by_opacity_against_finite_differences(with_unit: bool) -> None
     target = gain_target(problem, unit=unit)
     coefficients = problem.upload(coefficients_for(problem, "exp"), problem.kernels.vec16)
 
-    def loss(values: np.ndarray) -> tuple[float, np.ndarray]:
+    def loss(values):
         everyone = np.zeros(3 * GAUSSIANS)
         everyone[problem.seen] = values
         layer = Layer(problem, target, OpacityTraining(problem, listed, everyone))
@@ -240,7 +239,7 @@ def test_gradient_by_opacity_against_finite_differences(with_unit: bool) -> None
         assert gradient[k] == pytest.approx(slope, rel=2e-3, abs=1e-7)
 
 
-def test_training_opacity_fits_what_frozen_opacity_cannot() -> None:
+def test_training_opacity_fits_what_frozen_opacity_cannot():
     """Targets of the same blobs, more transparent: with opacity trained the loss ends lower, and so do opacities."""
     gaussians = shell()
     receivers = np.array([[0.0, 0.0, 0.0], [0.3, -0.2, 0.1], [-0.2, 0.3, 0.2], [0.1, 0.1, -0.3]])
