@@ -1,4 +1,6 @@
-"""Power of path records and its logarithmic slopes: the one place where an interaction is written down.
+"""Power of path records and its logarithmic slopes, interaction by interaction.
+
+The same coefficients with their phases, of single paths, are in :mod:`warprrf.rf.em.fresnel`.
 
 A record is a power that geometry fixes and up to :data:`MOST` interactions from the transmitter to the receiver. Mirrors
 and slabs multiply Jones matrices in (TE, TM), real: half-spaces have no phase but their sign (ITU-R P.2040-4, eqs. (37a),

@@ -65,7 +65,7 @@ SETS = {
     "room": Effects(scatter_mirror=False, transmissions=0, diffractions=0),
     "everything": Effects(transmissions=0, diffractions=0),
 }
-"""Sets of effects that a fit tries; it adds what passes slabs and goes over edges where the scene needs it."""
+"""Sets of effects that a fit tries. None has slabs or edges: ``effects="auto"`` adds them where the scene needs them."""
 
 MOST_NEPERS = 40.0  # of any logarithm: 174 dB from one, where no surface is
 _EXCESS = (0.05, 200.0)  # of epsilon_r - 1: the last reflects like metal

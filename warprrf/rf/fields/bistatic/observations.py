@@ -330,7 +330,8 @@ class Columns:
     """Readings of scattered light as sums over groups, or materials, in units of the floor: a table collapsed.
 
     Fits and merging ask for powers so often that evaluating every record would take ten times as long. What comes over more
-    than one surface follows the share that the last one scatters of even light; all else of it is held.
+    than one surface follows the share that the last one scatters of even light; all else of it is held, what slabs let through
+included: that is learned from single paths.
 
     Attributes:
         groups: that scatter straight from the transmitter, shape ``(A,)``.
