@@ -331,7 +331,7 @@ class Columns:
 
     Fits and merging ask for powers so often that evaluating every record would take ten times as long. What comes over more
     than one surface follows the share that the last one scatters of even light; all else of it is held, what slabs let through
-included: that is learned from single paths.
+    included: that is learned from single paths.
 
     Attributes:
         groups: that scatter straight from the transmitter, shape ``(A,)``.
