@@ -21,7 +21,7 @@ from benchmarks.report import Report, Row, columns_table
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.steps import Attempt, Steps, digest
 
-VERSION = 3
+VERSION = 4
 """Counted up by hand when a fit, or its figures, come out differently."""
 LEFT_OUT = ("per_receiver", "lpips", "lpips_reason", "seconds_per_spectrum")  # of what wr.evaluate returns
 

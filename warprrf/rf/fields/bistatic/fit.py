@@ -618,9 +618,24 @@ def choose(t: Training) -> Choice:
         best, least = trial, loss
     if best is None:
         raise ValueError("effects: got none to choose from")
+    best, least = _spared(t, best, least)
     if np.isfinite(t.surface.appearance).all() and material.max() > 0 and not t.totals:
         best = merged(t, best, least)
     return best
+
+
+def _spared(t: Training, best: Choice, least: float) -> tuple[Choice, float]:
+    """``best`` and its loss without those of :data:`RARE` that places held out are predicted better without: a scene may need
+    what is not in its readings (a simulation without diffraction), or what its mesh shows wrongly."""
+    for name, on in RARE.items() if t.options.effects == "auto" and t.options.relevance is None else ():
+        off: dict[str, Any] = dict.fromkeys(on, 0)
+        fewer = replace(best.effects, **off)
+        if fewer != best.effects:
+            trial = t.fitted(replace(best, effects=fewer), t.few(1), SHORT_STEPS)
+            loss = t.held_loss(trial)
+            t.note(f"no {name}", loss < least, loss)
+            best, least = (trial, loss) if loss < least else (best, least)
+    return best, least
 
 
 def _choose_of_few(t: Training, trials: list[Choice]) -> Choice:
@@ -790,12 +805,13 @@ def _offsets(t: Training, found: Fit) -> dict[int, list[tuple[Place, np.ndarray]
 
 
 def left_out(t: Training, model: Model) -> dict[str, Any]:
-    """Effects of :data:`RARE` that are not modelled, estimated at a few ``"receivers"`` that are blocked: by how much they would
-    raise all power there [dB], by name; and ``"error_db"``, by how much the fit has more than was read there, rms. What it
-    lacks is no measure of its error: it may be just these effects."""
+    """Effects of :data:`RARE` that are not modelled and were not tried, estimated at a few ``"receivers"`` that are blocked: by
+    how much they would raise all power there [dB], by name; and ``"error_db"``, by how much the fit has more than was read
+    there, rms. What it lacks is no measure of its error: it may be just these effects."""
     blocked = list({o.place.seen_from: k for k, o in enumerate(t.observations) if _is_dark(o.view)}.values())
     seen = list(t.evaluated(model, evenly(np.array(blocked, int), MOST_BLOCKED)))
-    lacking = {name: on for name, on in RARE.items() if not any(getattr(model.effects, key) for key in on)}
+    tried = model.effects, *t.candidates
+    lacking = {name: on for name, on in RARE.items() if not any(getattr(e, key) for e in tried for key in on)}
     change, by_tracer = {name: np.zeros(len(seen)) for name in RARE}, dict[int, list[int]]()
     whole, over = np.zeros(len(seen)), np.zeros(len(seen))
     for k, (o, here, materials) in enumerate(seen):
