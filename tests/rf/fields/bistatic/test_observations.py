@@ -177,9 +177,10 @@ def test_slopes_of_records_of_every_sequence_are_those_of_differences(scene, rec
         found = np.zeros((bins.count, layout.size))
         exact.add_slopes(materials(x), bins, where, found)
         slopes = differences(partial(sums, exact, own), x, 1e-5)
-        bound = 1e-7 * np.abs(slopes).max(axis=1)
+        largest = np.abs(slopes).max(axis=1)
+        seen = largest > 1e-4 * largest.max()  # of the others differences are too coarse
+        bound = 1e-7 * np.where(seen, largest, 1e-4 * largest.max())
         assert (np.abs(found.T - slopes).max(axis=1) <= bound).all(), name
-        seen = np.abs(slopes).max(axis=1) > 1e-9 * np.abs(slopes).max()
         assert (np.abs((1 + 1e-6) * found.T - slopes).max(axis=1) > bound)[seen].all() and seen.any(), name
     o = observation(view, pixels(view), field.floor)
     table, index = o.slopes(EVERYTHING, materials(x), layout)
