@@ -178,8 +178,11 @@ def test_slopes_of_records_of_every_sequence_are_those_of_differences(scene, rec
         exact.add_slopes(materials(x), bins, where, found)
         slopes = differences(partial(sums, exact, own), x, 1e-5)
         largest = np.abs(slopes).max(axis=1)
-        seen = largest > 1e-4 * largest.max()  # of the others differences are too coarse
-        bound = 1e-7 * np.where(seen, largest, 1e-4 * largest.max())
+        seen = largest > 1e-9 * largest.max()
+        rounding = (
+            np.finfo(float).eps * sums(exact, own, x).max() / 1e-5
+        )  # all that differences tell of the others
+        bound = np.where(seen, 1e-7 * largest, rounding)
         assert (np.abs(found.T - slopes).max(axis=1) <= bound).all(), name
         assert (np.abs((1 + 1e-6) * found.T - slopes).max(axis=1) > bound)[seen].all() and seen.any(), name
     o = observation(view, pixels(view), field.floor)
