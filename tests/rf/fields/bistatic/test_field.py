@@ -194,12 +194,30 @@ def test_an_empty_spectrum_is_refused_and_one_among_others_is_not(scene, data):
     ).all()
 
 
-def test_what_glass_lets_through_is_found_at_any_carrier_or_said_to_be_left_out():
-    """A pane of 10 mm: line of sight behind it is Friis's power less the slab's transmission."""
+def glazed():
+    """The room without its block, parted by a pane of 10 mm."""
     corner = [[2.6, y, z] for y, z in ((0, 0), (3, 0), (3, 3), (0, 3))]
     mesh, part = joined(ROOM, (np.array(corner), np.array([[0, 1, 2], [0, 2, 3]])))
-    glass = SlabMaterial("glass", 6.31, 2.0, 0.01, 0.3)
-    scene, carrier_hz = RadioScene(mesh, part, [MATERIALS[0], glass]), 140e9
+    return RadioScene(mesh, part, [MATERIALS[0], SlabMaterial("glass", 6.31, 2.0, 0.01, 0.3)])
+
+
+@pytest.mark.parametrize("most", [0, 3])
+def test_a_fit_finds_whether_readings_have_what_slabs_let_through(most):
+    scene = glazed()
+    bare = spectra(scene, RECEIVERS, frequency_hz=140e9)
+    effects = replace(SETS["single"], transmissions=most, residual=False)
+    prior = BistaticField.prior(scene, bare, effects=effects)
+    known = [prior.spectrum(receiver) for receiver in RECEIVERS]
+    arrays = {
+        name: np.stack([getattr(one, name) for one in known]) for name in ("path_gain", "delay_s", "aod")
+    }
+    field = RadioField.fit(scene, replace(bare, **arrays))
+    assert field.effects.transmissions == most
+
+
+def test_what_glass_lets_through_is_found_at_any_carrier_or_said_to_be_left_out():
+    """Line of sight behind a pane is Friis's power less the slab's transmission."""
+    scene, carrier_hz = glazed(), 140e9
     known = spectra(scene, RECEIVERS[[1, 3, 4, 7]], frequency_hz=carrier_hz)
     with pytest.warns(UserWarning, match="transmission is not modelled.* 2 of 2 blocked receivers") as told:
         RadioField.fit(scene, known, quick=True, effects=SETS["single"])

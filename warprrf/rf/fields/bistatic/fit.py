@@ -544,7 +544,11 @@ class Training:
         those chosen."""
         if len(self.held) <= LEAST_RECEIVERS:
             return self.loss(self.model(choice), self.held)
-        problem = self.problem(choice.effects, choice.material, self.held, choice.parameters)
+        return self.part_loss(choice, self.held)
+
+    def part_loss(self, choice: Choice, places: np.ndarray) -> float:
+        """The same of the readings chosen of ``places``."""
+        problem = self.problem(choice.effects, choice.material, places, choice.parameters)
         p = choice.parameters
         losses = [o.losses(o.gain(p, x) * x) for o, _, _, x in problem.evaluated(p)]
         return float(np.mean(np.concatenate(losses)))
@@ -625,17 +629,20 @@ def choose(t: Training) -> Choice:
 
 
 def _spared(t: Training, best: Choice, least: float) -> tuple[Choice, float]:
-    """``best`` and its loss without those of :data:`RARE` that places held out are predicted better without: a scene may need
-    what is not in its readings (a simulation without diffraction), or what its mesh shows wrongly."""
+    """``best`` and its loss without those of :data:`RARE` that readings are predicted better without: a scene may need what is
+    not in its readings (a simulation without diffraction), or what its mesh shows wrongly. Places held out are too few to
+    say so alone: none of them may be behind a wall."""
+    chosen, places = best, np.union1d(t.few(1), t.held)
     for name, on in RARE.items() if t.options.effects == "auto" and t.options.relevance is None else ():
         off: dict[str, Any] = dict.fromkeys(on, 0)
-        fewer = replace(best.effects, **off)
-        if fewer != best.effects:
-            trial = t.fitted(replace(best, effects=fewer), t.few(1), SHORT_STEPS)
-            loss = t.held_loss(trial)
-            t.note(f"no {name}", loss < least, loss)
-            best, least = (trial, loss) if loss < least else (best, least)
-    return best, least
+        fewer = replace(chosen.effects, **off)
+        if fewer != chosen.effects:
+            trial = t.fitted(replace(chosen, effects=fewer), t.few(1), SHORT_STEPS)
+            loss = t.part_loss(trial, places)
+            kept = loss < BETTER * t.part_loss(chosen, places)
+            t.note(f"no {name}", kept, loss)
+            chosen = trial if kept else chosen
+    return chosen, least if chosen is best else t.held_loss(chosen)
 
 
 def _choose_of_few(t: Training, trials: list[Choice]) -> Choice:
