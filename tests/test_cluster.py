@@ -15,7 +15,7 @@ from warprrf import device
 from warprrf.cluster import each
 from warprrf.device import threads
 from warprrf.rf.fields import batches
-from warprrf.rf.fields.bistatic.fit import trace
+from warprrf.rf.fields.bistatic.training import trace
 
 PLACES = make.places(9)
 F = np.linspace(299e9, 301e9, 4)

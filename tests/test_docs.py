@@ -18,7 +18,7 @@ import warprrf as wr
 import warprrf.viewer
 from warprrf.rf.fields.base import ResponseOptions
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.fit import FitOptions
+from warprrf.rf.fields.bistatic.options import FitOptions
 from warprrf.rf.fields.harmonic.options import FieldOptions
 from warprrf.rf.maps.radio_map import MapOptions
 from warprrf.rf.relevance.search import Setting

@@ -19,7 +19,7 @@ import numpy as np
 import warprrf as wr
 from fuzz.place import POINTS, READINGS, TOWARDS, Place
 from warprrf.rf.fields import BistaticField, HarmonicField
-from warprrf.rf.fields.bistatic.fit import FitOptions
+from warprrf.rf.fields.bistatic.options import FitOptions
 from warprrf.rf.fields.harmonic.options import FieldOptions
 
 IGNORED = ("progress", "ax", "client")

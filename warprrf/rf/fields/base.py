@@ -110,7 +110,7 @@ class RadioField(ABC):
             ds: training set: spectra, and for a ``bistatic`` field also :class:`Readings`, or a list of both.
             model: ``"bistatic"``, ``"rf3dgs+"`` or ``"rf3dgs"``.
             options: by name, ``device`` and ``progress`` among them. A ``bistatic`` field takes ``client``, and those of
-                :class:`~warprrf.rf.fields.bistatic.fit.FitOptions`: ``quick=True``, ``effects``, ``relevance``, ``lobes``,
+                :class:`~warprrf.rf.fields.bistatic.options.FitOptions`: ``quick=True``, ``effects``, ``relevance``, ``lobes``,
                 ``reciprocal``, ``sub_pixels``, ``gain_offset``, ``iterations``, ``seed``. The others take those of
                 :class:`~warprrf.rf.fields.harmonic.options.FieldOptions`: ``iterations``, ``batch``, ``sh_degree``,
                 ``checkpoint``, ``seed``, ...

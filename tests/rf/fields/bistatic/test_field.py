@@ -13,12 +13,12 @@ from warprrf.rf.em.fresnel import fresnel_curves, slab_transmission
 from warprrf.rf.em.materials import itu_material
 from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
-from warprrf.rf.fields.bistatic import fit as fitting
 from warprrf.rf.fields.bistatic import gauss_newton as newton
+from warprrf.rf.fields.bistatic import training
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.fit import trace
 from warprrf.rf.fields.bistatic.measured import WeighedPaths
 from warprrf.rf.fields.bistatic.observations import Columns
+from warprrf.rf.fields.bistatic.training import trace
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.lookups import nearest
 from warprrf.rf.spectra.metrics import evaluate
@@ -45,7 +45,7 @@ def psnr(field, ds, transmitter=None):
 
 
 def test_spectra_that_would_not_fit_into_memory_are_refused(scene, data, monkeypatch):
-    monkeypatch.setattr(fitting, "MOST_RAYS", 10 * 24 * 48 * 4 - 1)
+    monkeypatch.setattr(training, "MOST_RAYS", 10 * 24 * 48 * 4 - 1)
     with pytest.raises(ValueError, match="ds: 10 spectra of 24 x 48 pixels take 4.6e.04 rays"):
         trace(scene, data, sub_pixels=2)
     assert len(trace(scene, data.subset(np.arange(9)), sub_pixels=2).views) == 9
@@ -53,7 +53,7 @@ def test_spectra_that_would_not_fit_into_memory_are_refused(scene, data, monkeyp
 
 def test_a_fit_to_many_keeps_no_records_and_is_the_same(scene, data, field, monkeypatch):
     """Of each ray 4 bytes of its face, 8 of its range, and a bit that says whether it is lit; records alone would take 24."""
-    monkeypatch.setattr(fitting, "MOST_KEPT", 0)
+    monkeypatch.setattr(training, "MOST_KEPT", 0)
     few = data.subset(np.arange(6))
     views = trace(scene, few)
     again = RadioField.fit(scene, few, views=views)

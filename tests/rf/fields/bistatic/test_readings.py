@@ -10,7 +10,7 @@ from furnished import RECEIVERS, SHAPE, SIGMA, TX, F, spectra
 
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
-from warprrf.rf.fields.bistatic import fit as fitting
+from warprrf.rf.fields.bistatic import training
 from warprrf.rf.fields.bistatic.observations import Target
 from warprrf.rf.positions import is_free
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -357,6 +357,6 @@ def test_the_only_place_of_a_chain_is_not_held_out(scene, turned, monkeypatch):
             assert field.report["held_out"] == 2
             assert field.report["chains"]["horn"]["gain_db"] == pytest.approx(CHAIN_DB, abs=1.0)
     # readings that come after more spectra than effects are chosen by
-    monkeypatch.setattr(fitting, "MOST_TO_CHOOSE", 4)
+    monkeypatch.setattr(training, "MOST_TO_CHOOSE", 4)
     field = RadioField.fit(scene, [several, turned.subset(np.arange(72))], sub_pixels=1)
     assert field.report["chains"]["horn"]["gain_db"] == pytest.approx(CHAIN_DB, abs=1.0)

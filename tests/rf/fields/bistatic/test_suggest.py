@@ -7,8 +7,8 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined
 
 import warprrf as wr
 from warprrf.rf.em.materials import assumed_permittivity
-from warprrf.rf.fields.bistatic.fit import trace
 from warprrf.rf.fields.bistatic.suggest import Unknowns
+from warprrf.rf.fields.bistatic.training import trace
 
 CARRIER_HZ = 300e9
 TX = np.array([1.0, 2.0, 2.4])

@@ -42,7 +42,7 @@ from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import Data, Measured, RadioField, with_settings
 from warprrf.rf.fields.bistatic import files
-from warprrf.rf.fields.bistatic.fit import SUB_PIXELS, FitOptions, TrainingViews, fit
+from warprrf.rf.fields.bistatic.fit import fit
 from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, read
 from warprrf.rf.fields.bistatic.needs import assumed
@@ -56,9 +56,11 @@ from warprrf.rf.fields.bistatic.observations import (
     kinds_of,
     places_of,
 )
+from warprrf.rf.fields.bistatic.options import SUB_PIXELS, FitOptions
 from warprrf.rf.fields.bistatic.paths import paths_of, strongest
 from warprrf.rf.fields.bistatic.suggest import SHAPE as SUGGEST_SHAPE
 from warprrf.rf.fields.bistatic.suggest import Pointings, Sensitivity, Unknowns, suggest
+from warprrf.rf.fields.bistatic.training import TrainingViews
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
 from warprrf.rf.maps.links import LinkOptions, Links
 from warprrf.rf.paths.path_set import Paths
@@ -182,7 +184,7 @@ class BistaticField(RadioField):
                 Without any receiver the field is what is known beforehand.
             model: ``"bistatic"``.
             options: what is modelled and how it is fitted.
-            views: what :func:`warprrf.rf.fields.bistatic.fit.trace` found for exactly these receivers.
+            views: what :func:`warprrf.rf.fields.bistatic.training.trace` found for exactly these receivers.
             client: a ``dask.distributed.Client`` whose workers cast the rays; this process by default.
             device: where rays are cast.
             progress: called with the stages ``"patches"``, ``"mirrors"``, ``"transport"`` and ``"fit"``.

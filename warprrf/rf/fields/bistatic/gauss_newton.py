@@ -185,7 +185,7 @@ def _joined(*parts: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarr
 
 
 @dataclass(frozen=True)
-class Fitted:
+class Solution:
     """Result of :func:`gauss_newton`.
 
     Attributes:
@@ -240,7 +240,7 @@ def priors(
     return np.concatenate(residuals), np.concatenate(rows)
 
 
-def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Fitted:
+def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
     """Levenberg-Marquardt on the parameters of materials.
 
     Args:
@@ -294,7 +294,7 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Fitted:
         losses.append(current / weight / count)
         if fall < TOLERANCE and honest and (np.abs(move) < LONGEST).all():
             break
-    return Fitted(layout.unpack(vector, start), np.linalg.inv(hessian), losses)
+    return Solution(layout.unpack(vector, start), np.linalg.inv(hessian), losses)
 
 
 def _normal_equations(problem: Problem, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.ndarray]:

@@ -580,17 +580,28 @@ def kinds_of(data: Sequence[Measured]) -> list[Kind]:
     ]
 
 
+def chains_of(places: Sequence[Place]) -> list[str]:
+    """Names of the measuring chains of unknown gain."""
+    return sorted({place.chain for place in places} - {""})
+
+
 def observe(
-    data: Sequence[Measured], places: Sequence[Place], views: Sequence[View], frequency_hz: float
-) -> tuple[list[Observation], list[str]]:
-    """What was read at each of ``places``, and the names of the chains whose gain is unknown.
+    data: Sequence[Measured],
+    places: Sequence[Place],
+    views: Sequence[View],
+    frequency_hz: float,
+    chains: Sequence[str],
+) -> list[Observation]:
+    """What was read at each of ``places``.
 
     Args:
+        data: all data sets.
+        places: of these.
         views: what is seen at each place.
         frequency_hz: carrier that a fit's parameters are of.
+        chains: names of all measuring chains of unknown gain.
     """
-    chains, kinds = sorted({p.chain for p in places} - {""}), kinds_of(data)
-    index = {name: k for k, name in enumerate(chains)}
+    kinds, index = kinds_of(data), {name: k for k, name in enumerate(chains)}
     found = []
     for place, view in zip(places, views, strict=True):
         one = kinds[place.data].observe(place, view)
@@ -599,7 +610,7 @@ def observe(
                 one, chain=index.get(place.chain, one.chain), ratio=float(place.frequency_hz / frequency_hz)
             )
         )
-    return found, chains
+    return found
 
 
 def _shares(o: Observation) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,200 @@
+"""What a fit reports: gains of chains and how far side lobes move them, readings that it cannot explain, effects that it leaves
+out; and warnings of these."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from warprrf.checks import some_of, users_level
+from warprrf.rf.em.waves import NEPER
+from warprrf.rf.fields.base import Measured
+from warprrf.rf.fields.bistatic.gauss_newton import THROUGH, layout_of
+from warprrf.rf.fields.bistatic.needs import MOST_BLOCKED, RARE, RAYS, evenly, total
+from warprrf.rf.fields.bistatic.observations import NOISE_DB, frame_of, huber, observe
+from warprrf.rf.fields.bistatic.training import Choice, Training, Unexplained
+from warprrf.rf.spectra.readings import Readings
+from warprrf.rf.tracing.model import Layout, Model
+from warprrf.rf.tracing.render import path_gains
+from warprrf.rf.tracing.tracer import View
+
+SIDE_LOBES_DB = 3.0
+"""Standard deviation of the level of an antenna's side lobes, which few measure."""
+HANGING_DB = 1.0  # that this moves a chain's gain by and is worth a warning
+DARK = 0.01  # share of line of sight below which a place is blocked
+LEFT_OUT_DB = 0.5  # of them is too little for a warning
+
+
+def left_out(t: Training, model: Model) -> dict[str, Any]:
+    """Effects of :data:`RARE` that are not modelled and were not tried, estimated at a few ``"receivers"`` that are blocked: by
+    how much they would raise all power there [dB], by name; and ``"error_db"``, by how much the fit has more than was read
+    there, rms. What it lacks is no measure of its error: it may be just these effects."""
+    blocked = list({o.place.seen_from: k for k, o in t.observations.items() if _is_dark(o.view)}.values())
+    seen = list(t.evaluated(model, evenly(np.array(blocked, int), MOST_BLOCKED)))
+    tried = model.effects, *t.candidates
+    lacking = {name: on for name, on in RARE.items() if not any(getattr(e, key) for e in tried for key in on)}
+    change, by_tracer = {name: np.zeros(len(seen)) for name in RARE}, dict[int, list[int]]()
+    whole, over = np.zeros(len(seen)), np.zeros(len(seen))
+    for k, (o, here, materials) in enumerate(seen):
+        gains = path_gains(o.view, here, materials)
+        whole[k] = gains.specular.sum() + gains.by_ray().sum() + o.floor
+        read_sum, predicted = o.target.sums(o.predicted(here, materials))
+        over[k] = NEPER * max(np.log1p(predicted) - np.log1p(read_sum), 0.0)
+        by_tracer.setdefault(id(o.view.tracer), []).append(k)
+    for own in by_tracer.values() if lacking else ():
+        tracer, here = seen[own[0]][0].view.tracer.on_grid(*RAYS), seen[own[0]][1]
+        receivers = np.stack([seen[k][0].place.receiver for k in own])
+        few = total(tracer, receivers, here, {})
+        for name, on in lacking.items():
+            more = np.maximum(total(tracer, receivers, here, on) - few, 0.0)
+            change[name][own] = NEPER * np.log1p(more / whole[own])
+    error_db = float(np.sqrt(np.mean(over**2))) if len(seen) else 0.0
+    found: dict[str, Any] = {"receivers": [o.place.receiver.tolist() for o, *_ in seen], "error_db": error_db}
+    return found | {name: own.tolist() for name, own in change.items()}
+
+
+def _is_dark(view: View) -> bool:
+    """Whether less than :data:`DARK` of line of sight passes what is in its way."""
+    p = view.paths
+    return bool((p.share[p.in_sight] ** 2).sum() < DARK)
+
+
+def side_lobes(t: Training, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
+    """Of each chain, shape ``(C,)``: the share of its readings that side lobes of its antennas bring, as it counts in dB; and
+    how far :data:`SIDE_LOBES_DB` of their level move its gain [dB], all other parameters with it."""
+    covariance, p = choice.solution.covariance, choice.parameters
+    first = len(covariance) - len(t.chains)
+    pull = np.zeros((len(t.chains), len(covariance)))  # of side lobes' level on the parameters
+    size, parts = np.zeros(len(t.chains)), dict(t.parts)
+    turned = [
+        isinstance(one, Readings) and not (one.arrival is None and one.departure is None) for one in t.data
+    ]
+    places = [k for k, o in parts.items() if o.chain >= 0 and turned[o.place.data]]
+    bare = [one.without_side_lobes() if isinstance(one, Readings) else one for one in t.data]
+    seen = [parts[k] for k in places]
+    frequency_hz = frame_of(t.data).frequency_hz
+    lobes = observe(bare, [o.place for o in seen], [o.view for o in seen], frequency_hz, t.chains)
+    for k, lobe in zip(places, lobes, strict=True):
+        parts[k] = replace(lobe.part(np.asarray(parts[k].rows)), ratio=parts[k].ratio)
+    whole, main = (
+        one.problem(choice.effects, choice.material, places, p) for one in (t, replace(t, parts=parts))
+    )
+    linear = whole.linearised(p, layout_of(replace(whole, observations=list(t.parts.values())), p))
+    for (error, table, index), (o, _, _, power), (*_, own) in zip(
+        linear, whole.evaluated(p), main.evaluated(p), strict=True
+    ):
+        gain, weight = o.gain(p, power), huber(error, o.huber_db)[1] / NOISE_DB**2
+        side = o.target.slope(gain * power) * gain * np.maximum(power - own, 0.0)
+        pull[o.chain, index] += table @ (weight * side)
+        size[o.chain] += weight @ table[-1] ** 2  # its own gain's column stands last
+    own = np.arange(len(t.chains))
+    share = pull[own, first + own] / np.maximum(size, 1e-300)
+    moved = SIDE_LOBES_DB * np.abs((covariance[first:] * pull).sum(axis=1))
+    return share, moved
+
+
+def covariance_of(t: Training, choice: Choice) -> np.ndarray:
+    """Of what a field keeps: parameters of materials, with what they let through as it is known before where that was not free;
+    and the common gain, if that was."""
+    through = choice.effects.transmissions > 0
+    layout, whole = (
+        Layout(*choice.parameters.log_weight.shape, through=free, gain=t.options.gain_offset)
+        for free in (through, True)
+    )
+    free = np.ones(whole.size, bool)
+    free[whole.passage(np.arange(whole.groups))] = through
+    covariance = np.where(free, 0.0, THROUGH**2) * np.eye(whole.size)
+    covariance[np.ix_(free, free)] = choice.solution.covariance[: layout.size, : layout.size]
+    return covariance
+
+
+def report_of(t: Training, choice: Choice, wrong: Unexplained, seconds: float) -> dict[str, Any]:
+    """What a fit decided and found, as numbers and text."""
+    found = choice.solution
+    report: dict[str, Any] = {
+        "receivers": len(t.observations),
+        "held_out": len(t.split.held),
+        "transport_time_s": t.seconds,
+        "fit_time_s": seconds,
+        "groups": t.surface.groups,
+        "materials": int(choice.material.max()) + 1,
+        "elements": len(t.surface.element_area),
+        "steps": len(found.losses),
+        "losses": {"gain": found.losses},
+        "choices": t.log,
+        "noise_db": wrong.noise_db,
+    }
+    deviation = np.sqrt(np.diag(found.covariance))
+    if t.options.gain_offset:
+        shape, through = found.parameters.log_weight.shape, choice.effects.transmissions > 0
+        place = Layout(*shape, through=through).size
+        report["gain_offset_db"] = NEPER * found.parameters.log_gain
+        report["gain_offset_std_db"] = NEPER * float(deviation[place])
+    known = NEPER * deviation[len(deviation) - len(t.chains) :]
+    report["chains"] = {
+        name: {
+            "gain_db": NEPER * float(gain),
+            "std_db": float(np.hypot(std, moved)),
+            "side_lobe_share": float(share),
+            "side_lobe_std_db": float(moved),
+        }
+        for name, gain, std, share, moved in zip(
+            t.chains, found.parameters.log_gains, known, *side_lobes(t, choice), strict=True
+        )
+    }
+    report["unexplained"] = {}
+    for k, rows in wrong.rows.items():
+        where = t.observations[k].place
+        report["unexplained"].setdefault(t.names[where.data], []).extend(where.rows[rows].tolist())
+    return report
+
+
+def warn(data: Sequence[Measured], report: dict[str, Any]) -> None:
+    """Warn of what a report says that nobody should miss."""
+    _warn_of_unexplained(data, report["unexplained"])
+    _warn_of_side_lobes(report["chains"])
+    _warn_of_left_out(report["left_out"])
+
+
+def _warn_of_side_lobes(chains: dict[str, dict[str, float]]) -> None:
+    hanging = {name: one for name, one in chains.items() if one["side_lobe_std_db"] > HANGING_DB}
+    if hanging:
+        listed = ", ".join(
+            f"{name!r} ({100 * one['side_lobe_share']:.0f} % of its readings, {one['side_lobe_std_db']:.1f} dB)"
+            for name, one in hanging.items()
+        )
+        warnings.warn(
+            f"ds: gains of chains hang on the level of side lobes, taken to be known to {SIDE_LOBES_DB:g} dB: {listed}; "
+            "measure the pattern beyond its main lobe, or turn the antenna to what it is to see",
+            UserWarning,
+            stacklevel=users_level(),
+        )
+
+
+def _warn_of_left_out(missed: dict[str, Any]) -> None:
+    for name in ("diffraction", "transmission"):
+        large = [db for db in missed[name] if db > max(missed["error_db"], LEFT_OUT_DB)]
+        if large:
+            warnings.warn(
+                f"{name} is not modelled, but would add {np.median(large):.1f} dB to all power of {len(large)} of "
+                f"{len(missed[name])} blocked receivers, as estimated; where it is in what was read, something else was fitted to "
+                "it: warprrf.relevance tells more",
+                UserWarning,
+                stacklevel=users_level(),
+            )
+
+
+def _warn_of_unexplained(data: Sequence[Measured], wrong: dict[str, list[int]]) -> None:
+    if wrong:
+        count = sum(len(one) for one in data if isinstance(one, Readings))
+        listed = "; ".join(f"{len(rows)} of {name!r}, rows {some_of(rows)}" for name, rows in wrong.items())
+        warnings.warn(
+            f"ds: {sum(map(len, wrong.values()))} of {count} readings are taken for wrong and left out ({listed}): "
+            'report["unexplained"] lists them',
+            UserWarning,
+            stacklevel=users_level(),
+        )

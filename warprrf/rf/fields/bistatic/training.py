@@ -1,0 +1,487 @@
+"""What a fit learns from: what receivers see of the geometry, what was read there, and which of it is held out.
+
+:func:`trace` finds what is seen. A :class:`Split` says which places decide about effects and materials, and which are held
+out; a :class:`Training` has the observations of both, and fits and judges models by them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from warprrf.cache import cached_property
+from warprrf.checks import check_count
+from warprrf.cluster import each
+from warprrf.device import DeviceLike, Progress
+from warprrf.geometry.mesh import GeometryLike, as_mesh
+from warprrf.rf.channel.array_spectra import ArraySpectra
+from warprrf.rf.fields.base import Data, Measured
+from warprrf.rf.fields.bistatic.gauss_newton import KNOWN_THROUGH, THROUGH, Problem, Solution, gauss_newton
+from warprrf.rf.fields.bistatic.measured import WeighedPaths
+from warprrf.rf.fields.bistatic.needs import needed
+from warprrf.rf.fields.bistatic.observations import (
+    NOISE_DB,
+    Observation,
+    Place,
+    as_list,
+    chains_of,
+    frame_of,
+    observe,
+    places_of,
+)
+from warprrf.rf.fields.bistatic.options import SUB_PIXELS, FitOptions
+from warprrf.rf.spectra.readings import Readings
+from warprrf.rf.tracing.model import SETS, Effects, Model, Parameters
+from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.render import evaluation
+from warprrf.rf.tracing.surface import Surface
+from warprrf.rf.tracing.tracer import Tracer, View, traced
+
+HELD_OUT, MOST_HELD_OUT, LEAST_RECEIVERS = 0.25, 30, 4
+"""Share of receivers that are held out, how many at most, and of how many at least."""
+FEW = 20
+"""Receivers up to which errors are learned from every one, held out in turn."""
+MOST_TO_CHOOSE = 24
+"""Receivers that fits which only decide about something learn from."""
+MERGES = 3  # rounds of deciding what is of one material, and fitting
+UNEXPLAINED = 5.0  # standard deviations beyond which a reading of a table is taken to be wrong
+CLEAR_DB = 10.0  # above its floor a reading's decibels err as they are
+NORMAL_MEDIAN = 1.4826  # standard deviation over the median size of normal errors
+READINGS, LEAST_READINGS = 12_000, 200
+"""Readings that parameters are fitted to, spread over the training receivers, and of each at least."""
+KNOWN_BETTER = 2.0
+"""By how much more readings count that hold line of sight alone: no material is in them. They tell a chain's gain."""
+BEHIND_WALLS = 0.5
+"""How much directions count that were measured behind slabs: of what comes through these more is left out (light between
+surfaces that passes them on its way), and what a material must make up for there it lacks in the open."""
+MOST_RAYS = 500_000_000
+"""Spectra with more rays than this are refused: what rays meet is kept during a fit."""
+RAY_BYTES = 40  # kept of each ray
+MOST_KEPT = 30_000_000
+"""Rays up to which light over several surfaces is kept too, for as much again; of more it is traced when it is asked for."""
+
+
+@dataclass(frozen=True)
+class TrainingViews:
+    """What is seen of the geometry at the places that were measured, whatever the materials: traced once, used by every
+    fit.
+
+    Attributes:
+        places: receivers under their transmitters.
+        views: one for each place.
+        effects: whose mirrors, slabs and edges were sought.
+        seconds: what it took.
+    """
+
+    places: list[Place] = field(repr=False)
+    views: list[View] = field(repr=False)
+    effects: Effects
+    seconds: float
+
+    @property
+    def tracer(self) -> Tracer:
+        """Surface, transmitter and grid of the first place."""
+        return self.views[0].tracer
+
+    def subset(self, indices: Sequence[int] | np.ndarray) -> TrainingViews:
+        """Some of its places."""
+        chosen = [int(i) for i in indices]
+        return replace(self, places=[self.places[i] for i in chosen], views=[self.views[i] for i in chosen])
+
+    def check(self, places: Sequence[Place], sub_pixels: int | None) -> None:
+        """Raise ValueError if they are not those of exactly ``places``."""
+        same = len(self.places) == len(places) and all(
+            a.seen_from == b.seen_from for a, b in zip(self.places, places, strict=True)
+        )
+        if not same or sub_pixels not in (None, self.tracer.grid.sub_pixels):
+            raise ValueError(
+                f"views: got what {len(self.views)} receivers see with {self.tracer.grid.per_pixel} rays a pixel; "
+                f"expected exactly the {len(places)} receivers, transmitter, carrier, grid, beam, air and rays of this fit"
+            )
+
+
+def trace(
+    geometry: GeometryLike,
+    ds: Data,
+    *,
+    only: Sequence[int] | np.ndarray | None = None,
+    effects: Effects | None = None,
+    decides: bool = True,
+    sub_pixels: int = SUB_PIXELS,
+    client: Any = None,
+    device: DeviceLike = None,
+    progress: Progress | None = None,
+) -> TrainingViews:
+    """What the receivers of ``ds`` see of ``geometry`` (a Reconstruction, Scene, Mesh or Surface).
+
+    Args:
+        only: indices of the places that are traced, of those that :func:`places_of` lists; all by default.
+        effects: which tables are traced at once (others when they are first asked for); None for single bounces, and for
+            as many mirrors up to 3 as can be searched (2 in a city).
+        decides: whether paths pass slabs and go over edges as the scene needs it (:func:`needed`), else as ``effects`` say.
+        sub_pixels: square root of the rays per pixel.
+        client: a ``dask.distributed.Client`` whose workers trace, to the same bits; this process by default.
+        device: where rays are cast.
+        progress: called with the stages ``"patches"``, ``"mirrors"`` and ``"transport"``.
+
+    Raises:
+        ValueError: for receivers on a surface or outside the scene, numbers out of range, or more rays or chains of
+            mirrors than :data:`MOST_RAYS` and :data:`~warprrf.rf.paths.images.MOST_CHAINS`.
+        TypeError: for a geometry without a mesh.
+    """
+    started, tell = time.perf_counter(), progress or (lambda *_: None)
+    places = places_of(as_list(ds), as_mesh(geometry, "geometry"), device)
+    check_count("sub_pixels", sub_pixels, 1, 16)
+    _check_rays(places, sub_pixels)
+    places = places if only is None else [places[int(k)] for k in only]
+    wanted = replace(SETS["single"], mirrors=3) if effects is None else effects
+    tell("patches", 0, 1)
+    surface = Surface.of(geometry)
+    tell("patches", 1, 1)
+    if decides:
+        wanted = needed(wanted, surface, places, device)
+    keeps = len(places) * places[0].shape[0] * places[0].shape[1] * sub_pixels**2 <= MOST_KEPT
+    together: dict[tuple[object, ...], list[int]] = {}  # places under one transmitter
+    for k, place in enumerate(places):
+        together.setdefault((place.transmitter.tobytes(), *place.seen_from[2:]), []).append(k)
+    views: dict[int, View] = {}
+    for own in together.values():
+        first = places[own[0]]
+        loss_per_m = 0.0 if first.air is None else first.air.loss_per_m(first.frequency_hz)
+        tracer = Tracer.of(
+            surface, first.transmitter, first.frequency_hz, first.shape, sub_pixels,
+            beam_sigma_rad=first.beam_sigma_rad, loss_per_m=loss_per_m, device=device,
+        )  # fmt: skip
+        receivers = np.stack([places[k].receiver for k in own])
+        if effects is None:
+            wanted = replace(wanted, mirrors=tracer.images.affordable(receivers, wanted.mirrors))
+        found = tracer.paths(receivers, wanted, progress)
+        parts = [(receivers[r], found.subset(np.flatnonzero(found.receiver == r))) for r in range(len(own))]
+        for r, view in each(partial(traced, tracer.again, wanted, keeps), parts, client):
+            views[own[r]] = tracer.adopted(view)
+            tell("transport", len(views), len(places))
+    seconds = time.perf_counter() - started
+    every = [views[k] for k in range(len(places))]
+    return TrainingViews(places, every, wanted, seconds)
+
+
+def _check_rays(places: Sequence[Place], sub_pixels: int) -> None:
+    """Refuse places whose rays would not fit into memory."""
+    rays = sum(place.shape[0] * place.shape[1] for place in places) * sub_pixels**2
+    if rays > MOST_RAYS:
+        raise ValueError(
+            f"ds: {len(places)} spectra of {places[0].shape[0]} x {places[0].shape[1]} pixels take {rays:.2g} rays, "
+            f"{rays * RAY_BYTES / 1e9:.0f} GB and more, expected at most {MOST_RAYS:.2g}: give fewer receivers (ds.split, "
+            "ds.subset) or sub_pixels=1"
+        )
+
+
+@dataclass(frozen=True)
+class Split:
+    """Places that a fit decides by, and all that it learns from.
+
+    Attributes:
+        count: all places.
+        held, kept: places that are held out to decide by, and the others.
+        always: places that are never held out, one of each chain: without any its gain would not be known.
+    """
+
+    count: int
+    held: np.ndarray
+    kept: np.ndarray
+    always: list[int]
+
+    @classmethod
+    def of(cls, places: Sequence[Place], quick: bool, rng: np.random.Generator) -> Split:
+        """That of ``places``; if ``quick`` none is held out."""
+        count, chain = len(places), [place.chain for place in places]
+        always, held = [chain.index(name) for name in chains_of(places)], np.zeros(0, int)
+        if count >= LEAST_RECEIVERS and not quick:
+            order = rng.permutation(count)
+            held = np.sort(order[~np.isin(order, always)][: min(int(count * HELD_OUT), MOST_HELD_OUT)])
+        return cls(count, held, np.setdiff1d(np.arange(count), held), always)
+
+    def few(self, times: int) -> np.ndarray:
+        """Places that fits which only decide about something learn from, those of every chain among them."""
+        others = np.setdiff1d(self.kept, self.always)
+        chosen = others[: max(times * MOST_TO_CHOOSE - len(self.always), 0)]
+        return np.union1d(self.always, chosen).astype(int)
+
+    @property
+    def deciding(self) -> np.ndarray:
+        """Places by which effects and materials are decided: with few receivers all of them."""
+        if len(self.held) < LEAST_RECEIVERS:
+            return np.arange(self.count)
+        return np.union1d(self.few(2), self.held)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What was decided on: effects, the material of each group ``(G,)``, and parameters of materials under them."""
+
+    effects: Effects
+    material: np.ndarray
+    solution: Solution
+
+    @property
+    def parameters(self) -> Parameters:
+        """Of the materials."""
+        return self.solution.parameters
+
+
+@dataclass(frozen=True, eq=False)
+class Training:
+    """One fit: what it learns from, and how.
+
+    Attributes:
+        options: of the fit.
+        candidates: effects to choose from, the fewest first.
+        surface: of the geometry.
+        split: which places decide.
+        observations: by place, of those that were traced.
+        parts: those readings of each that parameters are fitted to.
+        chains: names of measuring chains whose gain is unknown.
+        data: the data sets.
+        lobes: exponents.
+        step: to be called after each fit.
+        seconds: what tracing took.
+        log: choices, as they are made.
+    """
+
+    options: FitOptions
+    candidates: list[Effects]
+    surface: Surface
+    split: Split
+    observations: dict[int, Observation]
+    parts: dict[int, Observation]
+    chains: list[str]
+    data: Sequence[Measured]
+    lobes: tuple[int, ...]
+    step: Callable[..., None]
+    seconds: float = 0.0
+    log: list[dict[str, Any]] = field(default_factory=list)
+
+    @classmethod
+    def of(
+        cls,
+        seen: TrainingViews,
+        split: Split,
+        data: Sequence[Measured],
+        options: FitOptions,
+        rng: np.random.Generator,
+        progress: Progress | None = None,
+    ) -> Training:
+        """What ``data`` holds of the places that decide, or of all if those are ``seen``."""
+        frequency_hz = frame_of(data).frequency_hz
+        candidates = _possible(options.candidates(frequency_hz), seen.effects, data)
+        steps = 4 + len(candidates) + MERGES + (2 * split.count if split.count <= FEW else 3)
+        found = cls(
+            options, candidates, seen.tracer.surface, split, {}, {},
+            chains_of(seen.places), data, options.exponents(frequency_hz), _Steps(progress, split.count, steps),
+        )  # fmt: skip
+        return found.and_at(
+            split.deciding if len(seen.places) < split.count else np.arange(split.count), seen, rng
+        )
+
+    def and_at(self, places: np.ndarray, seen: TrainingViews, rng: np.random.Generator) -> Training:
+        """With what was read at ``places`` (P,), where that is ``seen``, and readings of them that parameters are fitted to."""
+        frequency_hz = frame_of(self.data).frequency_hz
+        found = observe(self.data, seen.places, seen.views, frequency_hz, self.chains)
+        parts = [self._part(o, rng) for o in found]
+        own = places.tolist()
+        return replace(
+            self,
+            observations=_with(self.observations, own, found),
+            parts=_with(self.parts, own, parts),
+            seconds=self.seconds + seen.seconds,
+        )
+
+    def _part(self, o: Observation, rng: np.random.Generator) -> Observation:
+        """Readings of a place that parameters are fitted to, and what they count."""
+        trust, db = o.target.trust, o.target.db
+        known = np.arange(len(db)) if trust is None else np.flatnonzero(trust)
+        size = min(len(known), max(LEAST_READINGS, READINGS // self.split.count))
+        part = o.part(known[np.sort(rng.choice(len(known), size, replace=False))])
+        if part.sight is not None:
+            part = replace(part, target=part.target.trusted(1.0 + KNOWN_BETTER * part.sight))
+        straight = o.view.paths.order == 0
+        if not self.totals and (straight & (o.view.paths.slabs > 0)).any():
+            part = replace(part, target=part.target.trusted(np.full(len(part.target.db), BEHIND_WALLS)))
+        return part
+
+    @property
+    def names(self) -> list[str]:
+        """Of the data sets."""
+        return [getattr(one, "name", "") for one in self.data]
+
+    @cached_property
+    def totals(self) -> bool:
+        """Whether power alone was read, which cannot tell bounces or materials apart."""
+        return _are_totals(self.data)
+
+    @property
+    def area(self) -> np.ndarray:
+        """Of each group [m^2]."""
+        s = self.surface
+        return np.bincount(s.group, s.mesh.areas, minlength=s.groups)
+
+    @property
+    def transmitter(self) -> np.ndarray:
+        """Under which gains of light sent on are learned: of several transmitters none."""
+        sources = np.unique([o.place.transmitter for o in self.observations.values()], axis=0)
+        return sources[0] if len(sources) == 1 else np.full(3, np.nan)
+
+    def start(self, material: np.ndarray) -> Parameters:
+        """Parameters of materials before any measurement."""
+        prior = Parameters.prior(int(material.max()) + 1, self.lobes, reciprocal=self.options.reciprocal)
+        return replace(prior, log_through=self.passage(material)[0])
+
+    def passage(self, material: np.ndarray) -> np.ndarray:
+        """ln of the share that materials let through before any measurement, and its standard deviation, shape ``(2, M)``."""
+        eta, _, through = self.surface.slabs(frame_of(self.data).frequency_hz)
+        std = np.where(np.abs(eta) > 0, KNOWN_THROUGH, THROUGH)
+        return np.stack([np.bincount(material, own) for own in (through, std)]) / np.bincount(material)
+
+    def problem(
+        self, effects: Effects, material: np.ndarray, places: Iterable[int], p: Parameters
+    ) -> Problem:
+        """What is fitted to readings of ``places``, lit as under parameters ``p`` of materials."""
+        return Problem.of(
+            [self.parts[k] for k in places], effects, material, p, chains=len(self.chains),
+            gain_offset=self.options.gain_offset, passage=self.passage(material),
+            **({"energy": 1.0} if self.totals else {}),
+        )  # fmt: skip
+
+    def model(self, choice: Choice, *, residual: bool = False) -> Model:
+        """That of groups, without a residual yet."""
+        effects = replace(choice.effects, residual=residual)
+        none = np.zeros((2, self.surface.cells))
+        return Model(effects, choice.parameters.take(choice.material), none, self.transmitter)
+
+    def refined(self, choice: Choice, places: Iterable[int], steps: int, rounds: int = 1) -> Choice:
+        """``choice`` with parameters fitted to readings of ``places``; what surfaces get of each other is computed anew in
+        each of ``rounds``."""
+        rounds, places = rounds if choice.effects.scatterings > 1 else 1, list(places)
+        for _ in range(rounds):
+            problem = self.problem(choice.effects, choice.material, places, choice.parameters)
+            found = gauss_newton(problem, choice.parameters, max(steps // rounds, int(steps > 0)))
+            choice = replace(choice, solution=found)
+        self.step()
+        return choice
+
+    def predicted(self, model: Model, places: Iterable[int]) -> list[np.ndarray]:
+        """All readings at ``places`` under a model, in units of their floors."""
+        return [o.predicted(here, materials) for o, here, materials in self.evaluated(model, places)]
+
+    def evaluated(
+        self, model: Model, places: Iterable[int]
+    ) -> Iterable[tuple[Observation, Model, Evaluation]]:
+        """Observations with the model at their carriers, as kernels take it."""
+        known: dict[Any, tuple[Model, Evaluation]] = {}
+        for k in places:
+            o = self.observations[k]
+            key = id(o.view.tracer), o.ratio
+            if key not in known:
+                here = replace(model, parameters=model.parameters.at_ratio(o.ratio))
+                known[key] = here, evaluation(o.view.tracer, here)
+            yield o, *known[key]
+
+    def loss(self, model: Model, places: Sequence[int] | np.ndarray) -> float:
+        """Mean loss of all readings at ``places`` [dB^2]."""
+        predicted = self.predicted(model, places)
+        own = [self.observations[int(k)].losses(x).mean() for k, x in zip(places, predicted, strict=True)]
+        return float(np.mean(own))
+
+    def held_loss(self, choice: Choice) -> float:
+        """Mean square error at the places held out, without residual [dB^2]: of all readings where they are few, else of
+        those chosen."""
+        if len(self.split.held) <= LEAST_RECEIVERS:
+            return self.loss(self.model(choice), self.split.held)
+        return self.part_loss(choice, self.split.held)
+
+    def part_loss(self, choice: Choice, places: np.ndarray) -> float:
+        """The same of the readings chosen of ``places``."""
+        problem = self.problem(choice.effects, choice.material, places, choice.parameters)
+        p = choice.parameters
+        losses = [o.losses(o.gain(p, x) * x) for o, _, _, x in problem.evaluated(p)]
+        return float(np.mean(np.concatenate(losses)))
+
+    def unexplained(self, model: Model) -> Unexplained:
+        """Readings of tables that ``model`` cannot explain."""
+        tables = [k for k, o in self.observations.items() if isinstance(o.measured, WeighedPaths)]
+        rows, left = dict[int, np.ndarray](), dict[str, list[float]]()
+        for k, power in zip(tables, self.predicted(model, tables), strict=True):
+            o, target = self.observations[k], self.observations[k].target
+            if target.trust is not None and target.censored is not None:
+                error = target.error(power)
+                wrong = np.flatnonzero(np.abs(error) > UNEXPLAINED * NOISE_DB)
+                rows |= {k: wrong} if len(wrong) else {}
+                clear = ~target.censored & (target.db > CLEAR_DB)
+                left.setdefault(self.names[o.place.data], []).extend((error / target.trust)[clear])
+        noise = {
+            name: NORMAL_MEDIAN * float(np.median(np.abs(errors))) for name, errors in left.items() if errors
+        }
+        return Unexplained(rows, noise)
+
+    def without(self, wrong: Mapping[int, np.ndarray]) -> Training:
+        """The same in which readings ``wrong``, by place, count no longer."""
+        observations, parts = dict(self.observations), dict(self.parts)
+        for k, rows in wrong.items():
+            o = observations[k]
+            counts = ~np.isin(np.arange(len(o.target.db)), rows)
+            observations[k] = replace(o, target=o.target.trusted(counts))
+            parts[k] = replace(parts[k], target=parts[k].target.trusted(counts[parts[k].rows]))
+        return replace(self, observations=observations, parts=parts)
+
+    def note(self, what: str, kept: bool, loss: float) -> None:
+        """Log a choice."""
+        self.log.append({"term": what, "kept": bool(kept), "held_out_rmse_db": float(np.sqrt(loss))})
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """Readings of tables that a fit misses by more than :data:`UNEXPLAINED` of their standard deviations, ``(N,)`` by place; and
+    what it misses the others by, in the median, by table [dB]: their noise."""
+
+    rows: dict[int, np.ndarray]
+    noise_db: dict[str, float]
+
+
+@dataclass
+class _Steps:
+    """Progress of a fit whose steps are only estimated."""
+
+    progress: Progress | None
+    count: int
+    total: int
+    done: int = 0
+
+    def __call__(self, *, last: bool = False) -> None:
+        self.done = self.total if last else min(self.done + 1, self.total - 1)
+        if self.progress is not None:
+            self.progress("fit", self.done * self.count, self.total * self.count)
+
+
+def _with(
+    known: dict[int, Observation], places: list[int], more: list[Observation]
+) -> dict[int, Observation]:
+    """Observations by place, in their order."""
+    return dict(sorted([*known.items(), *zip(places, more, strict=True)]))
+
+
+def _are_totals(data: Sequence[Measured]) -> bool:
+    return all(isinstance(one, Readings) and one.total for one in data)
+
+
+def _possible(candidates: list[Effects], sought: Effects, data: Sequence[Measured]) -> list[Effects]:
+    """``candidates`` with slabs and edges as they were ``sought``, and with no more mirrors; of power alone one."""
+    rare: dict[str, Any] = {"transmissions": sought.transmissions, "diffractions": sought.diffractions}
+    found = [replace(one, mirrors=min(one.mirrors, sought.mirrors), **rare) for one in candidates]
+    if len(found) > 1 and any(isinstance(one, ArraySpectra) for one in data):
+        found = [replace(one, mirrors=sought.mirrors) for one in found]  # they hear the phases of all
+    return found[1:2] if len(found) > 1 and _are_totals(data) else found
