@@ -31,7 +31,7 @@ from warprrf.rf.paths.mirror_paths import MirrorPaths, ZoneRays, described, legs
 from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.paths.slabs import Slabs, Walls
 from warprrf.rf.spectra.spectrum import unit_beams
-from warprrf.rf.tracing.model import Effects
+from warprrf.rf.tracing.model import SETS, Effects
 from warprrf.rf.tracing.rays import NEAREST_M, Hits, Light, RayGrid
 from warprrf.rf.tracing.records import Records
 from warprrf.rf.tracing.surface import Surface
@@ -133,6 +133,10 @@ class View:
             bits[made["S"].ray] = True
             self.lit[:] = [np.packbits(bits)]
         return {name: made[name] if name in made else self.records[name] for name in wanted}
+
+    def without_records(self) -> View:
+        """The same that keeps no records but those of line of sight and mirrors."""
+        return replace(self, records={SPECULAR: self.records[SPECULAR]}, keeps=False)
 
     def kept_paths(self, effects: Effects) -> np.ndarray:
         """Which line of sight and mirror paths count, shape ``(L,)`` bool."""
@@ -539,7 +543,7 @@ def traced(
 ) -> View:
     """What a receiver (3,) of known line of sight and mirror paths sees, without what all receivers share."""
     view = again().view(part[0], effects, paths=part[1], keeps=keeps)
-    view.tables(effects)
+    view.tables(effects if keeps else SETS["single"])
     none: dict[str, Any] = {"directions": None, "solid_angle": None}
     return replace(view, tracer=None, hits=replace(view.hits, **none))  # type: ignore[arg-type]
 

@@ -23,7 +23,7 @@ from warprrf.rf.fields.base import Data, Measured
 from warprrf.rf.fields.bistatic.gauss_newton import Solution, gauss_newton
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, read
 from warprrf.rf.fields.bistatic.merging import BY_SHAPE, Merging, merge
-from warprrf.rf.fields.bistatic.needs import RARE
+from warprrf.rf.fields.bistatic.needs import RARE, evenly
 from warprrf.rf.fields.bistatic.observations import Place, as_list, frame_of, places_of
 from warprrf.rf.fields.bistatic.options import FitOptions
 from warprrf.rf.fields.bistatic.placing import moved, position_offset, with_azimuths
@@ -32,11 +32,13 @@ from warprrf.rf.fields.bistatic.residual import fit_residual, shares_of
 from warprrf.rf.fields.bistatic.training import (
     FEW,
     MERGES,
+    MOST_KEPT,
     MOST_TO_CHOOSE,
     Choice,
     Split,
     Training,
     TrainingViews,
+    rays_of,
     trace,
 )
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
@@ -48,6 +50,8 @@ from warprrf.rf.tracing.surface import Surface
 
 LEAST_HELD_OUT = 2
 """Receivers held out below which they choose no effects: one alone likes what others do not."""
+MOST_TO_JUDGE = 200
+"""Receivers that the residual is learned from to judge it: more make it no worse."""
 SHORT_STEPS = 10  # of a fit that only decides about something
 BETTER, MUCH_BETTER = 0.995, 0.8
 """Share to which further effects must lower the mean square error of receivers held out; to which single bounces must lower
@@ -130,19 +134,22 @@ def _learned(
     """
     rng = np.random.default_rng(options.seed)
     split = Split.of(places, options.quick, rng)
-    seen = views
-    if seen is None:
+    if views is None:
         candidates = options.candidates(frame_of(data).frequency_hz)
         sought = candidates[0] if len(candidates) == 1 else None
         decides = options.effects == "auto" and options.relevance is None
-        seen = look(data, only=split.deciding, effects=sought, decides=decides)
-    data, zeros = with_azimuths(data, seen.places, seen.views)
-    t = Training.of(seen, split, data, options, rng, progress)
+        views = look(data, only=split.deciding, effects=sought, decides=decides)
+    data, zeros = with_azimuths(data, views.places, views.views)
+    t, rays = Training.of(views, split, data, options, rng, progress), views.tracer.grid.sub_pixels
+    del views  # and with them records, once the training has none
     started = time.perf_counter()
     choice = choose(t)
     others = np.setdiff1d(np.arange(len(places)), list(t.observations))
     if len(others):
-        t = t.and_at(others, look(data, only=others, effects=choice.effects, decides=False), rng)
+        keeps = rays_of(places, options.rays) <= MOST_KEPT
+        t = t if keeps else t.without_records()
+        more = look(data, only=others, effects=choice.effects, decides=False, keeps=keeps)
+        t = t.and_at(others, more, rng)
     residual, errors = cross_validate(t, choice)
     choice, model = everyone(t, choice, residual)
     wrong = t.unexplained(model)
@@ -154,7 +161,6 @@ def _learned(
     missed = left_out(t, model)
     report = report_of(t, choice, wrong, time.perf_counter() - started) | {"left_out": missed}
     t.step(last=True)
-    rays = seen.tracer.grid.sub_pixels
     return t, FitResult(t.surface, model, choice.material, rays, errors, report), zeros
 
 
@@ -254,13 +260,14 @@ def cross_validate(t: Training, choice: Choice) -> tuple[bool, ErrorModel | None
     order: list[int] = []
     gaps = []
     for held in _folds(t):
-        kept = np.setdiff1d(np.arange(len(places)), held)
+        kept = evenly(np.setdiff1d(np.arange(len(places)), held), MOST_TO_JUDGE)
         own = choice if held is t.split.held else t.refined(choice, kept, SHORT_STEPS)
         order += held.tolist()
         gaps += [np.linalg.norm(places[kept] - places[r], axis=1).min() for r in held]
         for residual, found in power.items():
             model = t.model(own, residual=residual)
-            found += t.predicted(with_residual(t, model, kept) if residual else model, held)
+            learned = with_residual(t, model, kept) if residual else model
+            found += t.predicted(learned, held)
     loss = {
         residual: float(
             np.mean([t.observations[k].losses(x).mean() for k, x in zip(order, own, strict=True)])
@@ -294,10 +301,9 @@ def _folds(t: Training) -> list[np.ndarray]:
 
 def everyone(t: Training, choice: Choice, residual: bool) -> tuple[Choice, Model]:
     """The choice fitted to all places, and its model with the residual, if wanted."""
-    everywhere = list(t.observations)
-    choice = t.refined(choice, everywhere, t.options.iterations)
+    choice = t.refined(choice, t.telling, t.options.iterations)
     model = t.model(choice, residual=residual)
-    return choice, with_residual(t, model, everywhere) if residual else model
+    return choice, with_residual(t, model, list(t.observations)) if residual else model
 
 
 def with_residual(t: Training, model: Model, places: Sequence[int] | np.ndarray) -> Model:

@@ -120,9 +120,10 @@ class SpectrumPixels(ByPixels):
 
     def of_paths(self, view: View) -> np.ndarray:
         """Each path's beam."""
-        if view.beams is None:
+        beams = view.beams
+        if beams is None:
             raise ValueError("view: it was traced without a receiver's beam, expected one of a spectrum")
-        beams = view.beams.reshape(len(view.beams), int(np.prod(self.beam.shape)))
+        beams = beams.reshape(len(beams), int(np.prod(self.beam.shape)))
         return beams if self.pixels is None else beams[:, self.pixels]
 
     def part(self, index: np.ndarray) -> SpectrumPixels:

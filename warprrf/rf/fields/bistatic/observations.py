@@ -249,15 +249,17 @@ class Observation:
         """What comes over more than one surface, by the group that scatters it last or sends it on: groups ``(C,)``, and
         readings in units of the floor, shape ``(C, N)``."""
         own, count = self.ray_bins
+        surface = self.view.tracer.surface
         group, bins, power = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0)]
         for records in self.further_tables(effects):
-            group.append(records.rough_groups(self.view.tracer.surface.side_group))
+            group.append(records.rough_groups(surface.side_group))
             bins.append(own[records.ray])
             power.append(records.powers(materials))
-        every = np.concatenate(power)
-        k = np.flatnonzero((np.concatenate(bins) >= 0) & (every > 0))
-        found, column = np.unique(np.concatenate(group)[k], return_inverse=True)
-        cell = np.concatenate(bins)[k] * len(found) + column.reshape(-1)
+        every, all_bins, all_groups = map(np.concatenate, (power, bins, group))
+        k = np.flatnonzero((all_bins >= 0) & (every > 0))
+        sends = np.bincount(all_groups[k], minlength=surface.groups) > 0
+        found, column = np.flatnonzero(sends), np.cumsum(sends) - 1
+        cell = all_bins[k] * len(found) + column[all_groups[k]]
         table = np.bincount(cell, every[k], minlength=count * len(found)).reshape(count, len(found))
         return found, np.maximum(
             self.measured.of_bins(table.astype(np.float32), quick=True).T, 0.0

@@ -23,7 +23,7 @@ from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.fields.base import Data, Measured
 from warprrf.rf.fields.bistatic.gauss_newton import KNOWN_THROUGH, THROUGH, Problem, Solution, gauss_newton
 from warprrf.rf.fields.bistatic.measured import WeighedPaths
-from warprrf.rf.fields.bistatic.needs import needed
+from warprrf.rf.fields.bistatic.needs import evenly, needed
 from warprrf.rf.fields.bistatic.observations import (
     NOISE_DB,
     Observation,
@@ -54,6 +54,8 @@ CLEAR_DB = 10.0  # above its floor a reading's decibels err as they are
 NORMAL_MEDIAN = 1.4826  # standard deviation over the median size of normal errors
 READINGS, LEAST_READINGS = 12_000, 200
 """Readings that parameters are fitted to, spread over the training receivers, and of each at least."""
+MOST_READINGS = 20_000
+"""More do not tell the few parameters of materials better: they are those of some of the receivers."""
 KNOWN_BETTER = 2.0
 """By how much more readings count that hold line of sight alone: no material is in them. They tell a chain's gain."""
 BEHIND_WALLS = 0.5
@@ -62,8 +64,8 @@ surfaces that passes them on its way), and what a material must make up for ther
 MOST_RAYS = 500_000_000
 """Spectra with more rays than this are refused: what rays meet is kept during a fit."""
 RAY_BYTES = 40  # kept of each ray
-MOST_KEPT = 30_000_000
-"""Rays up to which light over several surfaces is kept too, for as much again; of more it is traced when it is asked for."""
+MOST_KEPT = 15_000_000
+"""Rays up to which records of them are kept, 200 bytes each; of more they are traced whenever they are asked for."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,7 @@ def trace(
     only: Sequence[int] | np.ndarray | None = None,
     effects: Effects | None = None,
     decides: bool = True,
+    keeps: bool = True,
     sub_pixels: int = SUB_PIXELS,
     client: Any = None,
     device: DeviceLike = None,
@@ -124,6 +127,7 @@ def trace(
         effects: which tables are traced at once (others when they are first asked for); None for single bounces, and for
             as many mirrors up to 3 as can be searched (2 in a city).
         decides: whether paths pass slabs and go over edges as the scene needs it (:func:`needed`), else as ``effects`` say.
+        keeps: whether records are kept, if they are not too many; else they are traced whenever they are asked for.
         sub_pixels: square root of the rays per pixel.
         client: a ``dask.distributed.Client`` whose workers trace, to the same bits; this process by default.
         device: where rays are cast.
@@ -145,7 +149,7 @@ def trace(
     tell("patches", 1, 1)
     if decides:
         wanted = needed(wanted, surface, places, device)
-    keeps = len(places) * places[0].shape[0] * places[0].shape[1] * sub_pixels**2 <= MOST_KEPT
+    keeps = keeps and rays_of(places, sub_pixels) <= MOST_KEPT
     together: dict[tuple[object, ...], list[int]] = {}  # places under one transmitter
     for k, place in enumerate(places):
         together.setdefault((place.transmitter.tobytes(), *place.seen_from[2:]), []).append(k)
@@ -170,9 +174,14 @@ def trace(
     return TrainingViews(places, every, wanted, seconds)
 
 
+def rays_of(places: Sequence[Place], sub_pixels: int) -> int:
+    """All rays of receivers."""
+    return sum(place.shape[0] * place.shape[1] for place in places) * sub_pixels**2
+
+
 def _check_rays(places: Sequence[Place], sub_pixels: int) -> None:
     """Refuse places whose rays would not fit into memory."""
-    rays = sum(place.shape[0] * place.shape[1] for place in places) * sub_pixels**2
+    rays = rays_of(places, sub_pixels)
     if rays > MOST_RAYS:
         raise ValueError(
             f"ds: {len(places)} spectra of {places[0].shape[0]} x {places[0].shape[1]} pixels take {rays:.2g} rays, "
@@ -313,6 +322,24 @@ class Training:
         if not self.totals and (straight & (o.view.paths.slabs > 0)).any():
             part = replace(part, target=part.target.trusted(np.full(len(part.target.db), BEHIND_WALLS)))
         return part
+
+    def without_records(self) -> Training:
+        """The same that keeps none of the records that are made again when they are asked for."""
+        observations, parts = (
+            {k: replace(o, view=o.view.without_records()) for k, o in own.items()}
+            for own in (self.observations, self.parts)
+        )
+        return replace(self, observations=observations, parts=parts)
+
+    @property
+    def telling(self) -> np.ndarray:
+        """Places whose readings parameters of materials are fitted to, those of every chain among them."""
+        readings, places = sum(len(o.target.db) for o in self.parts.values()), np.array(list(self.parts))
+        if readings <= MOST_READINGS:
+            return places
+        return np.union1d(self.split.always, evenly(places, len(places) * MOST_READINGS // readings)).astype(
+            int
+        )
 
     @property
     def names(self) -> list[str]:
