@@ -16,7 +16,7 @@ from warprrf.geometry.splats.gaussian_rays import GaussianRays
 from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
 from warprrf.kernels.radio import records
 from warprrf.rf.tracing.model import Parameters
-from warprrf.rf.tracing.records import Evaluation, Records
+from warprrf.rf.tracing.records import Materials, Records
 
 CHANNELS = 5  # take two launches
 RAYS, PLACES = 40, 3
@@ -233,7 +233,7 @@ class PathRecords(WholePath):
         p = Parameters(np.log(weight), np.log(excess), np.log(mirror), lobes, reciprocal=seed % 2 == 1)
         group = rng.integers(0, 3, 4)  # the material of each
         slabs = np.where(rng.random(4) < 0.5, 3.0 - 0.2j, 0.0), rng.uniform(0.1, 2.0, 4)
-        materials = Evaluation(p, group, rng.integers(0, 4, 6), rng.uniform(0.1, 3.0, 6), slabs)
+        materials = Materials(p, slabs, group, rng.integers(0, 4, 6), rng.uniform(0.1, 3.0, 6))
         for name in self.SEQUENCES:
             columns = 3 if name == "M" else len(name)
             kinds = {"M": records.MIRROR, "S": records.SCATTER, "E": records.SOURCE, "T": records.SLAB}

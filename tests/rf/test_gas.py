@@ -23,7 +23,7 @@ from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.spectrum import to_db
 from warprrf.rf.tracing.model import SETS, Effects, Parameters
-from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.records import Materials
 from warprrf.rf.tracing.surface import Surface
 
 F = 380.2e9
@@ -156,7 +156,7 @@ def dry_and_humid(field, shape):
 
 def powers_by_ray(view, name, materials):
     """Power of a table's records by the ray that sees them."""
-    records = view.tables(Effects())[name]
+    records = view.traced(Effects())[name]
     return np.bincount(records.ray, records.powers(materials), minlength=len(view.hits.face))
 
 
@@ -171,7 +171,7 @@ def test_scattered_light_seen_in_a_mirror_has_all_three_legs(scene, dry):
     turned = d - 2.0 * (d * normal).sum(axis=1, keepdims=True) * normal
     second = mesh.cast(first.point + 1e-4 * turned, turned)
     last = np.linalg.norm(second.point - TX, axis=1)
-    materials = Evaluation(field.parameters, None, sides, np.ones(len(sides)))
+    materials = Materials(field.parameters, views[0].tracer.slabs, None, sides, np.ones(len(sides)))
     for name, length in (("SM", first.t + second.t + last), ("EM", first.t + second.t)):
         before, after = (powers_by_ray(view, name, materials) for view in views)
         lit = before > 0
@@ -192,7 +192,7 @@ def test_light_that_mirrors_throw_has_its_images_length(dry):
     mesh, part = joined(sheet(0.0, True), sheet(4.0, False))
     field = BistaticField.prior(RadioScene(mesh, part, [SlabMaterial("floor"), SlabMaterial("lid")]), dry)
     views = dry_and_humid(field, (16, 32))
-    materials = Evaluation(field.parameters)
+    materials = Materials(field.parameters, views[0].tracer.slabs)
 
     def by_image(point):
         lid = point[:, 2:] > 2.0

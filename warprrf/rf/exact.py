@@ -49,9 +49,9 @@ from warprrf.rf.spectra.spectrum import (
 )
 from warprrf.rf.tracing.model import Effects
 from warprrf.rf.tracing.rays import Hits, RayGrid
-from warprrf.rf.tracing.records import Records, SlabEvaluation
+from warprrf.rf.tracing.records import Interactions, Records, SlabMaterials
 from warprrf.rf.tracing.surface import Surface
-from warprrf.rf.tracing.tracer import Interactions, Rays, Tracer
+from warprrf.rf.tracing.tracer import Rays, Tracer
 
 SUB_PIXELS = 8
 """Default square root of the directions per pixel.
@@ -185,7 +185,7 @@ class ExactEngine:
         # Of faces at one place rays may meet any: each is of the first one's material.
         material = np.asarray(scene.face_material, dtype=np.int32)[self.mirrors.patches.first]
         self.surface = Surface.of_materials(self.mirrors.patches, material, [m.name for m in scene.materials])
-        self.materials = SlabEvaluation(
+        self.materials = SlabMaterials(
             table, self.mirrors.wavelength_m, np.arange(len(table.scattering)), device
         )
         loss = 0.0 if self.air is None else self.air.loss_per_m(self.mirrors.frequency_hz)
@@ -315,8 +315,7 @@ class ExactEngine:
             k = np.flatnonzero(light.strength > 0)
             own, image, mirrors = row[chosen][k], image[k], mirrors.subset(k)
             way, plane = point[own] - image, self.surface.plane_normal[patch[chosen, 0][k]]
-            met_before = tracer.specular(mirrors)
-            before = Interactions(met_before.index, met_before.angle, met_before.kind)
+            before = tracer.specular(mirrors).interactions
             seen = Rays(rays.hits, np.arange(len(rays.ray)))
             records = tracer.scattered(seen, ray[own], every * light.strength[k], light.angle[k], before)
             departure = way - 2.0 * (way * plane).sum(axis=1)[:, None] * plane

@@ -224,7 +224,7 @@ class FullModel:
     @cached_property
     def longest_m(self) -> float:
         """Length of the longest path [m]."""
-        lengths = [v.single_bounce_m()[v.tables(effects_of(self.all))["S"].ray] for v in self.views]
+        lengths = [v.single_bounce_m()[v.traced(effects_of(self.all))["S"].ray] for v in self.views]
         return max(float(np.max(x, initial=0.0)) for x in (*lengths, *(v.paths.length_m for v in self.views)))
 
 

@@ -13,7 +13,7 @@ from scipy.sparse import csr_matrix
 
 from warprrf.geometry.mesh import vectors_across
 from warprrf.rf.tracing.model import Effects, Parameters
-from warprrf.rf.tracing.records import Evaluation, Records
+from warprrf.rf.tracing.records import Materials, Records
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import LIFT_M, Rays, Tracer
 
@@ -81,7 +81,7 @@ def irradiance(tracer: Tracer, p: Parameters, effects: Effects) -> np.ndarray | 
         return None
     most, sides = effects.transmissions, tracer.surface.element_sides
     light = tracer.kept.get(("interreflection", most), lambda: Interreflection(tracer.of_transmitter, most))
-    materials = Evaluation(p, slabs=tracer.slabs(most), device=tracer.grid.device)
+    materials = Materials(p, tracer.slabs, device=tracer.grid.device)
     share = p.scattered_share[tracer.surface.side_group] / np.pi
     tables = [*light.lit, *light.through, *(light.behind if effects.scatter_mirror else [])]
     got = sum(np.bincount(r.ray, r.powers(materials), minlength=sides) for r in tables)

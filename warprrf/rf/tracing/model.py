@@ -14,6 +14,7 @@ import numpy as np
 from scipy.sparse import block_diag, bsr_matrix, csr_matrix, identity
 
 from warprrf.checks import Expected, check_array, check_arrays, check_count, check_number, check_type, checked
+from warprrf.kernels.radio.records import EXCESS, MIRRORED, THROUGH
 from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.em.materials import NARROWEST_LOBE
 
@@ -257,15 +258,15 @@ class Layout:
 
     def excess(self, group: np.ndarray) -> np.ndarray:
         """Places of the permittivity of each of ``group``."""
-        return self.stride * group + self.lobes
+        return self.stride * group + self.lobes + EXCESS
 
     def mirror(self, group: np.ndarray) -> np.ndarray:
         """Places of the mirror share of each of ``group``."""
-        return self.stride * group + self.lobes + 1
+        return self.stride * group + self.lobes + MIRRORED
 
-    def passage(self, group: np.ndarray) -> np.ndarray:
+    def let_through(self, group: np.ndarray) -> np.ndarray:
         """Places of what each of ``group`` lets through, if that is free."""
-        return self.stride * group + self.lobes + 2
+        return self.stride * group + self.lobes + THROUGH
 
     def columns(self, groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where the parameters of each group begin in a table of those of ``groups`` alone, shape ``(G,)`` int32, and the places of
@@ -277,18 +278,20 @@ class Layout:
 
     def pack(self, p: Parameters) -> np.ndarray:
         """Vector of ``p``."""
-        columns = [p.log_excess, p.log_mirror, *[p.log_through] * self.through]
-        table = np.column_stack([p.log_weight, *columns]).ravel()
+        columns = {EXCESS: p.log_excess, MIRRORED: p.log_mirror, THROUGH: p.log_through}
+        shown = [columns[k] for k in range(self.stride - self.lobes)]
+        table = np.column_stack([p.log_weight, *shown]).ravel()
         single = [p.log_gain] * self.gain + [p.roughness] * self.roughness
         return np.concatenate([table, single, p.log_gains])
 
     def unpack(self, vector: np.ndarray, like: Parameters) -> Parameters:
         """Parameters of a vector; what it does not hold is as in ``like``."""
         table = vector[: self.groups * self.stride].reshape(self.groups, self.stride)
-        through = table[:, self.lobes + 2].copy() if self.through else like.log_through
+        excess, mirror = (table[:, self.lobes + k].copy() for k in (EXCESS, MIRRORED))
+        through = table[:, self.lobes + THROUGH].copy() if self.through else like.log_through
         return replace(
-            like, log_through=through, log_weight=table[:, : self.lobes].copy(), log_excess=table[:, self.lobes].copy(),
-            log_mirror=table[:, self.lobes + 1].copy(), log_gains=vector[self.first_chain :].copy(),
+            like, log_through=through, log_weight=table[:, : self.lobes].copy(), log_excess=excess,
+            log_mirror=mirror, log_gains=vector[self.first_chain :].copy(),
             log_gain=float(vector[self.common_gain]) if self.gain else like.log_gain,
             roughness=float(vector[self.carrier_power]) if self.roughness else like.roughness,
         )  # fmt: skip
@@ -296,24 +299,25 @@ class Layout:
     def slopes_at_ratio(self, p: Parameters, ratio: float) -> csr_matrix:
         """Derivatives of the vector of ``p.at_ratio(ratio)`` (rows) to that of ``p`` (columns)."""
         weight, mirror, n = p.weight, np.exp(p.log_mirror), self.lobes
+        mirrored = n + MIRRORED
         scattered = weight.sum(axis=1)
         both = scattered + mirror
         share, own = np.zeros((2, self.groups, self.stride))  # of ln both, and of ln mirror
-        share[:, :n], share[:, n + 1] = weight / both[:, None], mirror / both
-        own[:, n + 1] = 1.0
+        share[:, :n], share[:, mirrored] = weight / both[:, None], mirror / both
+        own[:, mirrored] = 1.0
         steeper = ratio**p.roughness
         smooth = steeper * (own - share)
         fall = 1.0 / np.maximum(np.expm1(-steeper * p.log_smooth), 1e-12)
         grown = share - fall[:, None] * smooth
         grown[:, :n] -= weight / scattered[:, None]
         table = np.tile(np.eye(self.stride), (self.groups, 1, 1))
-        table[:, n + 1] = smooth + share
+        table[:, mirrored] = smooth + share
         table[:, :n] += grown[:, None]
         groups = bsr_matrix((table, np.arange(self.groups), np.arange(self.groups + 1)))
         found = block_diag([groups, identity(self.size - groups.shape[0])], format="lil")
         if self.roughness:
             change = np.log(ratio) * steeper * p.log_smooth  # of ln smooth
             rows = np.zeros((self.groups, self.stride))
-            rows[:, :n], rows[:, n + 1] = (-fall * change)[:, None], change
+            rows[:, :n], rows[:, mirrored] = (-fall * change)[:, None], change
             found[: rows.size, self.carrier_power] = rows.reshape(-1, 1)
         return found.tocsr()

@@ -28,12 +28,46 @@ FINE_COSINES = 4097
 """Entries of a lobe's table for a truth: interpolation errs by 1e-6 at most up to an exponent of 100."""
 
 
+@dataclass(frozen=True)
+class Interactions:
+    """Interactions, K in a row.
+
+    Attributes:
+        index: group of each, from the transmitter on, -1 for none, shape ``(N, K)``.
+        angle: its angles, see :mod:`warprrf.kernels.radio.records`, shape ``(N, K, 3)``.
+        kind: as of :class:`Records`, shape ``(N, K)`` or ``(1, K)``; one column stands for all.
+    """
+
+    index: np.ndarray
+    angle: np.ndarray
+    kind: np.ndarray
+
+    @classmethod
+    def of_mirrors(cls, group: np.ndarray, cosine: np.ndarray) -> Interactions:
+        """One mirror each: group ``(N,)`` and cosine of incidence ``(N,)``."""
+        return cls(
+            group[:, None],
+            np.column_stack([cosine, 0.0 * cosine, 0.0 * cosine])[:, None],
+            one_kind(kernels.MIRROR),
+        )
+
+    def take(self, rows: np.ndarray) -> Interactions:
+        """Those of ``rows``."""
+        kind = self.kind if len(self.kind) == 1 else self.kind[rows]
+        return Interactions(self.index[rows], self.angle[rows], kind)
+
+
+def one_kind(kind: int) -> np.ndarray:
+    """``kind`` of all interactions of all records."""
+    return np.full((1, 1), kind, np.int32)
+
+
 @dataclass(frozen=True, eq=False)
 class Records:
     """Paths of one sequence: N records of K interactions from the transmitter to the receiver.
 
     Attributes:
-        power: path gain without interactions, shape ``(N,)``; its precision is that of the evaluation.
+        power: path gain without interactions, shape ``(N,)``; its precision is that of what is computed of it.
         ray: ray of the receiver's grid that sees it, or row of a specular path, or side of an element that is lit, ``(N,)``.
         index: group that each interaction meets, or side of the element that sends, -1 for none, shape ``(N, K)`` int32.
         angle: its angles, see :mod:`warprrf.kernels.radio.records`, shape ``(N, K, 3)``.
@@ -60,6 +94,11 @@ class Records:
         """Column of what leaves light unpolarised, K where there is none."""
         found = np.isin(self.kind[:1], (kernels.SCATTER, kernels.SOURCE)).nonzero()[1]
         return int(found[0]) if len(found) else self.index.shape[1]
+
+    @property
+    def interactions(self) -> Interactions:
+        """Those of each record."""
+        return Interactions(self.index, self.angle, self.kind)
 
     @property
     def is_sent(self) -> bool:
@@ -102,14 +141,12 @@ class Records:
         every = np.concatenate([np.zeros(0, int), *found])
         return np.unique(every[every >= 0])
 
-    def powers(self, materials: Evaluation) -> np.ndarray:
+    def powers(self, materials: Materials) -> np.ndarray:
         """Power of each under ``materials``, shape ``(N,)``."""
         if len(self) == 0:
             return np.zeros(0)
         if self.is_sent and not materials.has_sources:
-            raise ValueError(
-                "materials: got none that elements send by, expected an evaluation with their radiance"
-            )
+            raise ValueError("materials: got none that elements send by, expected those with their radiance")
         table, m, launch = self._table(materials)
         out = wp.empty(len(self), dtype=REALS[self.power.dtype], device=materials.device)
         launch(
@@ -119,22 +156,22 @@ class Records:
         )
         return np.asarray(out.numpy(), np.float64)
 
-    def add_slopes(self, materials: Evaluation, bins: Bins, place: np.ndarray, slopes: np.ndarray) -> None:
+    def add_slopes(self, materials: Materials, bins: Bins, place: np.ndarray, slopes: np.ndarray) -> None:
         """Add to ``slopes`` (B, C) the derivatives of the powers summed in ``bins`` to logarithms of parameters; those of
         material m stand from column ``place[m]`` on: lobe weights, epsilon_r - 1, mirrored share, share let through."""
-        if isinstance(materials, SlabEvaluation):
+        if isinstance(materials, SlabMaterials):
             raise TypeError("materials: got slabs, expected half-spaces, which have slopes")
         self._add(
             "bin_slopes", materials, bins, [wp.array(place, dtype=wp.int32, device=materials.device)], slopes
         )
 
-    def slopes(self, materials: Evaluation, place: np.ndarray, count: int) -> np.ndarray:
+    def slopes(self, materials: Materials, place: np.ndarray, count: int) -> np.ndarray:
         """Those of each record, shape ``(N, count)``."""
         found = np.zeros((len(self), count))
         self.add_slopes(materials, Bins.of(np.arange(len(self)), len(self)), place, found)
         return found
 
-    def components(self, materials: Evaluation, bins: Bins) -> tuple[np.ndarray, np.ndarray]:
+    def components(self, materials: Materials, bins: Bins) -> tuple[np.ndarray, np.ndarray]:
         """What groups scatter into each bin at unit weight: the groups that do, shape ``(A,)``, and sums by lobe and
         component of :class:`warprrf.rf.em.fresnel.FresnelCurves`, shape ``(B, A, L, 3)``."""
         own = bins.order[bins.first[0] : bins.first[-1]]
@@ -150,7 +187,7 @@ class Records:
         self._add("bin_components", materials, bins, more, found)
         return groups, found.reshape(bins.count, len(groups), lobes, kernels.MOMENTS)
 
-    def _add(self, kernel: str, materials: Evaluation, bins: Bins, more: list[Any], sums: np.ndarray) -> None:
+    def _add(self, kernel: str, materials: Materials, bins: Bins, more: list[Any], sums: np.ndarray) -> None:
         if sums.size == 0 or len(self) == 0:
             return
         real, where = REALS[self.power.dtype], materials.device
@@ -161,7 +198,7 @@ class Records:
         if out.ptr != sums.ctypes.data:  # it was a copy: of another precision, or on another device
             sums[...] = out.numpy()
 
-    def _table(self, materials: Evaluation) -> tuple[Any, Any, Any]:
+    def _table(self, materials: Materials) -> tuple[Any, Any, Any]:
         real, where = REALS[self.power.dtype], materials.device
 
         def upload() -> Any:
@@ -201,29 +238,30 @@ class Bins:
         return cls(np.searchsorted(own[order], np.arange(count + 1)).astype(np.int32), order)
 
 
-class Evaluation:
-    """Parameters as kernels take them.
+class Materials:
+    """Materials as kernels take them: M rows of parameters, and which of them each of G groups of faces is made of.
 
     Args:
-        parameters: of M materials.
-        material: row of each group in them, shape ``(G,)``; by default groups are rows.
+        parameters: of the materials.
+        slabs: complex permittivity of each group, 0 where it is not known, and its thickness in wavelengths, ``(G,)`` each; see
+            :attr:`~warprrf.rf.tracing.tracer.Tracer.slabs`.
+        material: row of each group in the parameters, shape ``(G,)``; by default groups are rows.
         side_group: group of each element's side, shape ``(E,)``; None where no element sends.
         radiance: that each side sends [1/(m^2 sr)], in units of (4 pi / lambda)^2, shape ``(E,)``.
-        slabs: complex permittivity of each group, 0 where it is not known, and its thickness in wavelengths, ``(G,)`` each.
         device: where powers are computed.
     """
 
     def __init__(
         self,
         parameters: Parameters,
+        slabs: tuple[np.ndarray, np.ndarray],
         material: np.ndarray | None = None,
         side_group: np.ndarray | None = None,
         radiance: np.ndarray | None = None,
-        slabs: tuple[np.ndarray, np.ndarray] | None = None,
         *,
         device: DeviceLike = None,
     ) -> None:
-        self.slabs = (np.zeros(0, complex), np.zeros(0)) if slabs is None else slabs
+        self.slabs = slabs
         self.parameters, self.device = parameters, str(_device.resolve(device))
         self.material = np.arange(len(parameters.log_excess)) if material is None else material
         self._side_group = np.zeros(0, int) if side_group is None else side_group
@@ -235,10 +273,10 @@ class Evaluation:
         """Whether it knows what elements send."""
         return len(self._radiance) > 0
 
-    def by_materials(self, parameters: Parameters, material: np.ndarray) -> Evaluation:
+    def by_materials(self, parameters: Parameters, material: np.ndarray) -> Materials:
         """The same with parameters of materials in place of those of groups; ``material`` (G,) is that of each."""
-        return Evaluation(
-            parameters, material, self._side_group, self._radiance, self.slabs, device=self.device
+        return Materials(
+            parameters, self.slabs, material, self._side_group, self._radiance, device=self.device
         )
 
     def on_device(self, real: Any) -> Any:
@@ -268,7 +306,7 @@ class Evaluation:
         return m
 
 
-class SlabEvaluation(Evaluation):
+class SlabMaterials(Materials):
     """A scene's materials as kernels take them: slabs, and lobes of either kind beside each other.
 
     Args:
@@ -283,7 +321,7 @@ class SlabEvaluation(Evaluation):
     ) -> None:
         count = len(table.scattering)
         slabs = table.permittivity, table.thickness_m / wavelength_m
-        super().__init__(Parameters.prior(count), material, slabs=slabs, device=device)
+        super().__init__(Parameters.prior(count), slabs, material, device=device)
         self._table = table
 
     def _upload(self, real: Any) -> Any:

@@ -10,7 +10,7 @@ import numpy as np
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.tracing.interreflection import irradiance
 from warprrf.rf.tracing.model import Model, Parameters
-from warprrf.rf.tracing.records import Evaluation, Records
+from warprrf.rf.tracing.records import Materials, Records
 from warprrf.rf.tracing.tracer import SPECULAR, Tracer, View
 
 
@@ -47,28 +47,27 @@ class PathGains:
         return self.by_ray(["S"])
 
 
-def evaluation(tracer: Tracer, model: Model) -> Evaluation:
+def materials_of(tracer: Tracer, model: Model) -> Materials:
     """The parameters of ``model`` under a transmitter, as kernels take them."""
     p, surface = model.parameters, tracer.surface
     got = irradiance(tracer, p, model.effects)
-    slabs = tracer.slabs(model.effects.transmissions)
     if got is None:
-        return Evaluation(p, slabs=slabs, device=tracer.grid.device)
+        return Materials(p, tracer.slabs, device=tracer.grid.device)
     radiance = got * p.scattered_share[surface.side_group] / np.pi
-    return Evaluation(p, None, surface.side_group, radiance, slabs, device=tracer.grid.device)
+    return Materials(p, tracer.slabs, None, surface.side_group, radiance, device=tracer.grid.device)
 
 
-def path_gains(view: View, model: Model, materials: Evaluation) -> PathGains:
+def path_gains(view: View, model: Model, materials: Materials) -> PathGains:
     """What the receivers of ``view`` get, residual and common gain included.
 
     Args:
         view: what they see.
         model: effects, parameters and residual.
-        materials: :func:`evaluation` of it under the view's transmitter.
+        materials: :func:`materials_of` it under the view's transmitter.
     """
     t, found = view.tracer, {}
     gains = model.cell_gains(t.transmitter)
-    tables = view.tables(model.effects)
+    tables = view.traced(model.effects)
     for name, records in tables.items():
         power = records.powers(materials)
         factor = (

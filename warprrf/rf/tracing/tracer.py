@@ -12,11 +12,11 @@ A :class:`Tracer` belongs to a surface, a transmitter and a grid of rays; what i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,7 +33,7 @@ from warprrf.rf.paths.slabs import Slabs, Walls
 from warprrf.rf.spectra.spectrum import unit_beams
 from warprrf.rf.tracing.model import SETS, Effects
 from warprrf.rf.tracing.rays import NEAREST_M, Hits, Light, RayGrid
-from warprrf.rf.tracing.records import Records
+from warprrf.rf.tracing.records import Interactions, Records, one_kind
 from warprrf.rf.tracing.surface import Surface
 
 MIRROR_SLACK_M = 0.1
@@ -41,31 +41,45 @@ MIRROR_SLACK_M = 0.1
 LIFT_M = 0.02  # rays that start on a surface start so far off it
 THROUGH_MIRRORS = 3  # rays of a pixel that look for light by way of mirrors
 INTO_MIRRORS = 2  # square root of the rays of a pixel that go on at mirrors: what these show is seen a second time already
+UNMODELLED = {("MTS", "M"), ("MTS", "T")}
+"""Ways of light and of sight that are not traced together: they bring nothing that was worth their time."""
 SPECULAR = "specular"
 """Name of the table of line of sight and mirrors."""
 _TRACED = Cache(6)  # a lobby's take up to 90 MB each; the bound is the process's, not a surface's
 
 
-def sequences(effects: Effects) -> tuple[str, ...]:
-    """Names of the tables that ``effects`` want besides :data:`SPECULAR`; a number behind a name is how many slabs at most."""
-    e, slabs = effects, effects.transmissions > 0
-    wanted = {
-        "S": True,
-        "MS": e.mirror_scatter,
-        "SM": e.scatter_mirror,
-        "MSM": e.mirror_scatter and e.scatter_mirror,
-        "E": e.scatterings > 1,
-        "EM": e.scatterings > 1 and e.scatter_mirror,
-        "TS": slabs,
-        "MTS": slabs and e.mirror_scatter,
-        "TSM": slabs and e.scatter_mirror,
-        "ST": slabs and e.scatter_mirror,
-        "TST": slabs and e.scatter_mirror,
-        "MST": slabs and e.mirror_scatter and e.scatter_mirror,
-        "ET": slabs and e.scatterings > 1 and e.scatter_mirror,
-    }
-    names = [name for name, own in wanted.items() if own and e.scatterings > 0]
-    return tuple(name + str(e.transmissions) * ("T" in name) for name in names)
+class Sequence(NamedTuple):
+    """A sequence of interactions: how a surface is lit, and how it is seen.
+
+    Attributes:
+        light: ``"S"`` by the transmitter, ``"MS"`` by its images in mirrors, ``"TS"`` through slabs, ``"MTS"`` through slabs before
+            or behind a mirror; ``"E"``: it is an element that sends on what it got of others.
+        sight: ``""`` directly, ``"M"`` in a mirror, ``"T"`` through slabs.
+        slabs: most slabs on each of those ways, 0 where there are none.
+    """
+
+    light: str
+    sight: str
+    slabs: int
+
+    @property
+    def name(self) -> str:
+        """From the transmitter to the receiver."""
+        return self.light + self.sight + str(self.slabs or "")
+
+
+def sequences(effects: Effects) -> list[Sequence]:
+    """Those of the tables that ``effects`` want besides :data:`SPECULAR`."""
+    e, found = effects, []
+    lights = {"S": True, "MS": e.mirror_scatter, "E": e.scatterings > 1}
+    lights |= {"TS": e.transmissions > 0, "MTS": e.transmissions > 0 and e.mirror_scatter}
+    sights = {"": True, "M": e.scatter_mirror, "T": e.transmissions > 0 and e.scatter_mirror}
+    for light, lit in lights.items():
+        for sight, seen in sights.items():
+            slabs = e.transmissions if "T" in light + sight else 0
+            if lit and seen and e.scatterings > 0 and (light, sight) not in UNMODELLED:
+                found.append(Sequence(light, sight, slabs))
+    return found
 
 
 @dataclass(frozen=True)
@@ -120,11 +134,10 @@ class View:
         )
         return found
 
-    def tables(self, effects: Effects) -> dict[str, Records]:
+    def traced(self, effects: Effects) -> dict[str, Records]:
         """The tables that count under ``effects``; they are traced when they are first asked for."""
-        wanted = (SPECULAR, *sequences(effects))
-        missing = [name for name in wanted if name not in self.records]
-        made = self.tracer.trace(self, missing) if missing else {}
+        wanted = [own.name for own in sequences(effects)]
+        made = self.tracer.trace(self, [own for own in sequences(effects) if own.name not in self.records])
         if made and self.keeps:
             with making:
                 self.records.update(made)
@@ -132,7 +145,7 @@ class View:
             bits = np.zeros(len(self.hits.face), bool)
             bits[made["S"].ray] = True
             self.lit[:] = [np.packbits(bits)]
-        return {name: made[name] if name in made else self.records[name] for name in wanted}
+        return {name: made[name] if name in made else self.records[name] for name in (SPECULAR, *wanted)}
 
     def without_records(self) -> View:
         """The same that keeps no records but those of line of sight and mirrors."""
@@ -144,33 +157,6 @@ class View:
         few = (order <= effects.mirrors) & (slabs <= effects.transmissions)
         few &= ~self.paths.over_edge | (effects.diffractions > 0)
         return np.asarray(few & (~self.paths.in_sight | effects.line_of_sight))
-
-
-@dataclass(frozen=True)
-class Interactions:
-    """Interactions, K in a row.
-
-    Attributes:
-        index: group of each, from the transmitter on, -1 for none, shape ``(N, K)``.
-        angle: its angles, see :mod:`warprrf.kernels.radio.records`, shape ``(N, K, 3)``.
-        kind: as of :class:`~warprrf.rf.tracing.records.Records`, shape ``(N, K)`` or ``(1, K)``; one column stands for all.
-    """
-
-    index: np.ndarray
-    angle: np.ndarray
-    kind: np.ndarray
-
-    @classmethod
-    def of_mirrors(cls, group: np.ndarray, cosine: np.ndarray) -> Interactions:
-        """One mirror each: group ``(N,)`` and cosine of incidence ``(N,)``."""
-        return cls(
-            group[:, None], np.column_stack([cosine, 0.0 * cosine, 0.0 * cosine])[:, None], one_kind(MIRROR)
-        )
-
-    def take(self, rows: np.ndarray) -> Interactions:
-        """Those of ``rows``."""
-        kind = self.kind if len(self.kind) == 1 else self.kind[rows]
-        return Interactions(self.index[rows], self.angle[rows], kind)
 
 
 @dataclass(frozen=True)
@@ -278,9 +264,10 @@ class Tracer:
         make = partial(self.surface.walls, self.frequency_hz, most, self.grid.device)
         return self._walls or self.kept.get(("walls", most), make)
 
-    def slabs(self, most: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """Permittivity and thickness in wavelengths of each group, as :class:`Evaluation` takes them; None where ``most`` is 0."""
-        return self.surface.slabs(self.frequency_hz)[:2] if most else None
+    @property
+    def slabs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Permittivity and thickness in wavelengths of each group, as :class:`Materials` takes them."""
+        return self.kept.get("slabs", lambda: self.surface.slabs(self.frequency_hz)[:2])
 
     def paths(self, receivers: np.ndarray, effects: Effects, progress: Progress | None = None) -> MirrorPaths:
         """Line of sight and mirror paths of ``receivers`` (R, 3) that ``effects`` want."""
@@ -329,37 +316,31 @@ class Tracer:
         found = self.paths(places, effects) if paths is None else paths
         return View(self, places, self.grid.hit(places), found, {SPECULAR: self.specular(found)}, keeps)
 
-    def trace(self, view: View, names: Sequence[str]) -> dict[str, Records]:
+    def trace(self, view: View, wanted: Iterable[Sequence]) -> dict[str, Records]:
         """Tables of sequences that a receiver sees, by name."""
         first = Rays(view.hits, np.arange(len(view.hits.face)))
-        seen: dict[str, Rays] = {}
-        lights: dict[str, Light] = {}
-        made = {}
-        for name in names:
-            sequence, most = name.rstrip("0123456789"), int(name[-1]) if name[-1].isdigit() else 0
-            last = sequence[-1]
-            if last not in seen:
-                seen[last] = (
-                    self._turned(view) if last == "M" else self.behind(first, most) if last == "T" else first
-                )
-            if name == "S" and view.lit:
+        seen, lights, made = {"": first}, dict[str, Light](), dict[str, Records]()
+        for light, sight, most in wanted:
+            if sight not in seen:
+                seen[sight] = self._turned(view) if sight == "M" else self.behind(first, most)
+            rays = seen[sight]
+            if light in ("S", "TS") and sight not in lights and not (view.lit and light + sight == "S"):
+                lights[sight] = self.light(rays)
+            if light == "E":
+                table = self.seen(rays)
+            elif light == "MS":
+                table = self.lit_by_mirrors(rays)
+            elif light == "MTS":
+                table = self.lit_by_mirrors(rays, most)
+            elif light == "TS":
+                table = self.lit_through(rays, lights[sight], most)
+            elif sight in lights:
+                table = self.lit(rays, lights[sight])
+            else:
                 row = np.flatnonzero(np.unpackbits(view.lit[0], count=len(first.ray)))
                 known = self.grid.light_through(first.hits, self.transmitter, row)
-                made[name] = self.scattered(first, row, known.strength, known.angle)
-            elif sequence[0] == "E":
-                made[name] = self.seen(seen[last])
-            elif sequence[0] == "M":
-                made[name] = self.lit_by_mirrors(
-                    seen[last], most if sequence[1] == "T" and last == "S" else 0
-                )
-            else:
-                if last not in lights:
-                    lights[last] = self.light(seen[last])
-                made[name] = (
-                    self.lit_through(seen[last], lights[last], most)
-                    if sequence[0] == "T"
-                    else self.lit(seen[last], lights[last])
-                )
+                table = self.scattered(first, row, known.strength, known.angle)
+            made[Sequence(light, sight, most).name] = table
         return made
 
     def specular(self, p: MirrorPaths) -> Records:
@@ -528,22 +509,17 @@ class Tracer:
         return Rays(found, pixel * per_pixel + place, Interactions.of_mirrors(s.group[face], cosine))
 
     def adopted(self, view: View) -> View:
-        """What :func:`traced` found, as a view of this tracer."""
+        """What :func:`view_of` found, as a view of this tracer."""
         own: dict[str, Any] = {"directions": self.grid.directions, "solid_angle": self.grid.solid_angle}
         return replace(view, tracer=self, hits=replace(view.hits, **own))
 
 
-def one_kind(kind: int) -> np.ndarray:
-    """``kind`` of all interactions of all records."""
-    return np.full((1, 1), kind, np.int32)
-
-
-def traced(
+def view_of(
     again: Callable[[], Tracer], effects: Effects, keeps: bool, part: tuple[np.ndarray, MirrorPaths]
 ) -> View:
     """What a receiver (3,) of known line of sight and mirror paths sees, without what all receivers share."""
     view = again().view(part[0], effects, paths=part[1], keeps=keeps)
-    view.tables(effects if keeps else SETS["single"])
+    view.traced(effects if keeps else SETS["single"])
     none: dict[str, Any] = {"directions": None, "solid_angle": None}
     return replace(view, tracer=None, hits=replace(view.hits, **none))  # type: ignore[arg-type]
 
@@ -595,7 +571,7 @@ class MirroredLight:
         face, patch, point, normal = face[chosen], patch[chosen], point[chosen], normal[chosen]
         found = face, patch, point, np.ones(len(face))
         paths = tracer.specular(described(s.patches, transmitter, centre, found, 1, walls, slabs))
-        self.before = Interactions(paths.index, paths.angle, paths.kind)
+        self.before = paths.interactions
         patch = patch[:, 0]
         self.image, self.patch = image[patch], patch
         self._first = np.searchsorted(face, np.arange(len(s.mesh.faces) + 1))

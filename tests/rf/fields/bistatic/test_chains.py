@@ -12,7 +12,7 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.kernels.radio.records import MIRROR
 from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.tracing.model import Parameters
-from warprrf.rf.tracing.records import Evaluation, Records
+from warprrf.rf.tracing.records import Materials, Records
 from warprrf.rf.tracing.surface import POSITION_ERROR_M, Surface
 
 RX = RECEIVERS[0]
@@ -39,7 +39,8 @@ def reflected(excess, cosine, turn):
     p = Parameters(none[:, None], np.log(np.where(excess > 0, excess, 1.0)).ravel(), none, (0,))
     angle = np.stack([cosine, turn, 0.0 * turn], axis=2)
     kind = np.full((1, excess.shape[1]), MIRROR, np.int32)
-    return Records(np.ones(len(excess)), np.arange(len(excess)), index, angle, kind).powers(Evaluation(p))
+    records = Records(np.ones(len(excess)), np.arange(len(excess)), index, angle, kind)
+    return records.powers(Materials(p, (none + 0j, none)))
 
 
 def test_a_mirror_met_head_on_has_no_plane_of_incidence():

@@ -23,7 +23,7 @@ from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.readings import Readings, horn, path_weights
 from warprrf.rf.tracing.interreflection import irradiance
 from warprrf.rf.tracing.model import SETS, Effects, Layout
-from warprrf.rf.tracing.records import Bins, Evaluation
+from warprrf.rf.tracing.records import Bins, Materials
 from warprrf.rf.tracing.tracer import SPECULAR
 
 RX = RECEIVERS[0]
@@ -164,13 +164,13 @@ def test_slopes_of_records_of_every_sequence_are_those_of_differences(scene, rec
 
     def materials(x):
         p = layout.unpack(x, field.parameters)
-        return Evaluation(p, None, side, got * p.scattered_share[side] / np.pi)
+        return Materials(p, view.tracer.slabs, None, side, got * p.scattered_share[side] / np.pi)
 
     def sums(records, own, x):
         return np.bincount(own, records.powers(materials(x)))
 
     where = layout.stride * np.arange(groups)
-    for name, records in view.tables(EVERYTHING).items():
+    for name, records in view.traced(EVERYTHING).items():
         exact = replace(records, power=records.power.astype(float))
         own = records.ray if name == SPECULAR else records.ray // view.tracer.grid.per_pixel
         bins = Bins.of(own, int(own.max()) + 1)

@@ -39,7 +39,7 @@ def planted_shares(field, planted):
     for receiver in RECEIVERS:
         view, power = field.view(receiver), textured.spectrum(receiver).path_gain.ravel() / field.floor
         o = observation(view, MEASURED, field.floor, NEPER * np.log1p(power))
-        found.append(shares_of(o, field.state, field.evaluation(view.tracer)))
+        found.append(shares_of(o, field.state, field.materials_of(view.tracer)))
         again = MEASURED.of_bins((found[-1].power @ np.exp(planted).ravel())[:, None])[:, 0] + found[-1].rest
         np.testing.assert_allclose(again, power, rtol=1e-4, atol=1e-6 * power.max())
     return found
@@ -119,7 +119,7 @@ def test_links_have_the_same_gains(field):
 
     def totals(asked):
         tracer, options = asked.tracer(), LinkOptions(asked.beam_sigma_rad, SHAPE)
-        links = LinkTracer(tracer, asked.state, asked.evaluation(tracer), options, SHAPE)(RECEIVERS)
+        links = LinkTracer(tracer, asked.state, asked.materials_of(tracer), options, SHAPE)(RECEIVERS)
         return links.total_path_gain, np.array([asked.spectrum(r).path_gain.sum() for r in RECEIVERS])
 
     bare = totals(field)

@@ -44,7 +44,7 @@ def test_columns_are_the_sums_of_their_records(scene, reciprocal):
     )
     view, beam, p = field.view(RECEIVERS[0]), BeamOperator(SHAPE, np.radians(5.0)), field.parameters
     gains, o = field.path_gains(view), observation(view, SpectrumPixels(beam), field.floor)
-    columns = columns_of(o, EVERYTHING, field.evaluation(view.tracer))
+    columns = columns_of(o, EVERYTHING, field.materials_of(view.tracer))
     single = replace(columns, senders=columns.senders[:0], further=columns.further[:0]).power(p)
 
     def image(by_ray):

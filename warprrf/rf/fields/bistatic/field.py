@@ -71,8 +71,8 @@ from warprrf.rf.spectra.readings import check_gains, check_turned
 from warprrf.rf.spectra.spectrum import Spectrum, default_floor, directions_from_angles, to_db
 from warprrf.rf.tracing.model import ARRAYS as PARAMETER_ARRAYS
 from warprrf.rf.tracing.model import MOST_NEPERS, SETS, Effects, Layout, Model, Parameters
-from warprrf.rf.tracing.records import Evaluation
-from warprrf.rf.tracing.render import PathGains, evaluation, images, path_gains
+from warprrf.rf.tracing.records import Materials
+from warprrf.rf.tracing.render import PathGains, images, materials_of, path_gains
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import Tracer, View
 
@@ -463,7 +463,7 @@ class BistaticField(RadioField):
     def path_gains(self, view: View) -> PathGains:
         """Path gain of all that is seen, by sequence of interactions."""
         check_type("view", view, View)
-        return path_gains(view, self.state, self.evaluation(view.tracer))
+        return path_gains(view, self.state, self.materials_of(view.tracer))
 
     def tracer(self, transmitter: ArrayLike | None = None) -> Tracer:
         """The geometry under ``transmitter`` (3,) [m], by default the fitted one; that of the last few is kept."""
@@ -473,10 +473,10 @@ class BistaticField(RadioField):
             loss_per_m=0.0 if self.air is None else self.air.loss_per_m(self.frequency_hz), device=self.device,
         )  # fmt: skip
 
-    def evaluation(self, tracer: Tracer) -> Evaluation:
+    def materials_of(self, tracer: Tracer) -> Materials:
         """Its parameters under a transmitter as kernels take them, what surfaces get of each other included."""
         key = tracer.transmitter.tobytes(), tracer.frequency_hz, tracer.grid.loss_per_m
-        return self._evaluated.get(key, lambda: evaluation(tracer, self.state))
+        return self._evaluated.get(key, lambda: materials_of(tracer, self.state))
 
     def suggest(
         self,
@@ -514,14 +514,14 @@ class BistaticField(RadioField):
 
     def _sensitivity(self, transmitter: np.ndarray) -> tuple[Sensitivity, Unknowns]:
         tracer = self.tracer(transmitter)
-        materials, tracer = self.evaluation(tracer), tracer.on_grid(SUGGEST_SHAPE, 1)
+        materials, tracer = self.materials_of(tracer), tracer.on_grid(SUGGEST_SHAPE, 1)
         floor = self.floor * np.prod(self.shape) / np.prod(SUGGEST_SHAPE)
         return Sensitivity(tracer, self.state, materials, floor), Unknowns.of(tracer, self.material)
 
     def trace_links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
         """:meth:`links` at positions that were checked, several at a time."""
         tracer = self.tracer(transmitter)
-        work = LinkTracer(tracer, self.state, self.evaluation(tracer), options, self.shape)
+        work = LinkTracer(tracer, self.state, self.materials_of(tracer), options, self.shape)
         return options.in_batches(receivers, work.batch, work)
 
     @property
@@ -536,7 +536,7 @@ class BistaticField(RadioField):
                 "error is not known; fit whole spectra of four or more, without quick=True"
             )
         rows = np.unique(self.material, return_index=True)[1]
-        lit = self.evaluation(view.tracer)
+        lit = self.materials_of(view.tracer)
         materials = lit.by_materials(self.parameters.take(rows), self.material)
         layout = Layout(len(rows), len(self.parameters.lobes), through=True)
         place = Place(

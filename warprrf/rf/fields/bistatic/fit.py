@@ -230,7 +230,7 @@ def merged(t: Training, best: Choice, least: float) -> Choice:
     for _ in range(MERGES):
         material, start = merge(problem, trial.parameters, t.surface.appearance, t.area, options)
         # What surfaces get of each other changes little with who is of which material: it is held.
-        problem = replace(problem, material=material, passage=t.passage(material))
+        problem = replace(problem, material=material, known_through=t.known_through(material))
         trial = Choice(best.effects, material, gauss_newton(problem, start, SHORT_STEPS))
         t.step()
     loss = t.held_loss(trial)

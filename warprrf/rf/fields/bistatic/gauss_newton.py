@@ -28,8 +28,8 @@ from warprrf.rf.fields.bistatic.observations import (
     huber,
 )
 from warprrf.rf.tracing.model import ROUGHNESS, Effects, Layout, Model, Parameters
-from warprrf.rf.tracing.records import Evaluation, Records
-from warprrf.rf.tracing.render import evaluation
+from warprrf.rf.tracing.records import Materials, Records
+from warprrf.rf.tracing.render import materials_of
 from warprrf.rf.tracing.tracer import SPECULAR
 
 WEIGHT, EXCESS, MIRROR = 2.0, 0.8, 1.5
@@ -59,7 +59,7 @@ class Problem:
         chains: measuring chains whose gain is unknown.
         gain_offset: whether a gain common to all paths is free.
         energy: deviation of scattered and mirrored shares from a sum of one.
-        passage: ln of the share that materials let through before any measurement, and its deviation, shape ``(2, M)``; None
+        known_through: ln of the share that materials let through before any measurement, and its deviation, shape ``(2, M)``; None
             for that of the start.
     """
 
@@ -70,7 +70,7 @@ class Problem:
     chains: int = 0
     gain_offset: bool = False
     energy: float = ENERGY
-    passage: np.ndarray | None = None
+    known_through: np.ndarray | None = None
 
     @classmethod
     def of(
@@ -82,14 +82,14 @@ class Problem:
         **settings: Any,
     ) -> Problem:
         """That of observations where light comes as under parameters ``p`` of materials."""
-        known: dict[Any, Evaluation] = {}
+        known: dict[Any, Materials] = {}
         columns = []
         for o in observations:
             key = id(o.view.tracer), o.ratio
             if key not in known:
                 groups = p.at_ratio(o.ratio).take(material)
                 model = Model(effects, groups, np.zeros((2, 0)), o.place.transmitter)
-                known[key] = evaluation(o.view.tracer, model)
+                known[key] = materials_of(o.view.tracer, model)
             columns.append(columns_of(o, effects, known[key]))
         return cls(observations, columns, effects, material, **settings)
 
@@ -105,18 +105,17 @@ class Problem:
         ends = np.cumsum([0, *map(len, tables)])
         return Records.joined(tables), [slice(*own) for own in pairwise(ends)]
 
-    def materials(self, p: Parameters, ratio: float) -> Evaluation:
+    def materials(self, p: Parameters, ratio: float) -> Materials:
         """Parameters ``p`` at ``ratio`` times their carrier, as kernels take them."""
         tracer = next(o.view.tracer for o in self.observations if o.ratio == ratio)
-        slabs = tracer.slabs(self.effects.transmissions)
-        return Evaluation(p.at_ratio(ratio), self.material, slabs=slabs, device=tracer.grid.device)
+        return Materials(p.at_ratio(ratio), tracer.slabs, self.material, device=tracer.grid.device)
 
-    def evaluated(self, p: Parameters) -> Iterator[tuple[Observation, Columns, Evaluation, np.ndarray]]:
+    def evaluated(self, p: Parameters) -> Iterator[tuple[Observation, Columns, Materials, np.ndarray]]:
         """Observations with the columns of their materials, the parameters ``p`` at their carriers as kernels take them,
         and predictions without the gains of chains, in units of each floor."""
         if not self.observations:
             return
-        known: dict[float, tuple[Evaluation, np.ndarray]] = {}
+        known: dict[float, tuple[Materials, np.ndarray]] = {}
         for o, columns, own in zip(self.observations, self.by_materials, self.direct[1], strict=True):
             if o.ratio not in known:
                 materials = self.materials(p, o.ratio)
@@ -209,7 +208,7 @@ def layout_of(problem: Problem, start: Parameters) -> Layout:
 
 
 def priors(
-    p: Parameters, start: Parameters, layout: Layout, energy: float, passage: np.ndarray | None = None
+    p: Parameters, start: Parameters, layout: Layout, energy: float, known_through: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Residuals of the priors ``(K,)`` and their Jacobian ``(K, F)``: distance to the start, energy kept."""
     own = np.arange(layout.groups)
@@ -226,8 +225,10 @@ def priors(
     add((p.log_excess - start.log_excess) / EXCESS, layout.excess(own), 1.0 / EXCESS)
     add((p.log_mirror - start.log_mirror) / MIRROR, layout.mirror(own), 1.0 / MIRROR)
     if layout.through:
-        centre, std = (start.log_through, np.full(layout.groups, THROUGH)) if passage is None else passage
-        add((p.log_through - centre) / std, layout.passage(own), 1.0 / std[:, None])
+        centre, std = (
+            (start.log_through, np.full(layout.groups, THROUGH)) if known_through is None else known_through
+        )
+        add((p.log_through - centre) / std, layout.let_through(own), 1.0 / std[:, None])
     if layout.gain:
         add(np.array([p.log_gain / GAIN]), np.array([layout.common_gain]), 1.0 / GAIN)
     if layout.roughness:
@@ -258,12 +259,12 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
     hessian, losses = np.eye(layout.size), []
     if steps == 0:
         hessian = _normal_equations(problem, start, layout)[0]
-        slopes = priors(start, start, layout, problem.energy, problem.passage)[1]
+        slopes = priors(start, start, layout, problem.energy, problem.known_through)[1]
         hessian += slopes.T @ slopes
 
     def total(x: np.ndarray) -> float:
         p = layout.unpack(x, start)
-        prior = priors(p, start, layout, problem.energy, problem.passage)[0]
+        prior = priors(p, start, layout, problem.energy, problem.known_through)[0]
         own = zip(problem.observations, problem.errors_db(p), strict=True)
         return weight * sum(float(huber(e, o.huber_db)[0].sum()) for o, e in own) + float((prior**2).sum())
 
@@ -271,7 +272,7 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
     for _ in range(steps):
         p = layout.unpack(vector, start)
         hessian, gradient = _normal_equations(problem, p, layout)
-        r, j = priors(p, start, layout, problem.energy, problem.passage)
+        r, j = priors(p, start, layout, problem.energy, problem.known_through)
         hessian += j.T @ j
         gradient += j.T @ r
         improved = False

@@ -18,7 +18,7 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links
 from warprrf.rf.spectra.spectrum import check_shape
 from warprrf.rf.tracing.model import Model
-from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.records import Materials
 from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.tracer import Tracer
 
@@ -34,7 +34,7 @@ class LinkTracer:
     Args:
         tracer: geometry under the transmitter.
         model: what is modelled.
-        materials: evaluation of it under the transmitter.
+        materials: those of it under the transmitter.
         options: beam, grid and mirrors.
         shape: of the field's spectra, whose pixels are its diffuse paths.
 
@@ -46,7 +46,7 @@ class LinkTracer:
         self,
         tracer: Tracer,
         model: Model,
-        materials: Evaluation,
+        materials: Materials,
         options: LinkOptions,
         shape: tuple[int, int],
     ) -> None:

@@ -21,7 +21,7 @@ from warprrf.rf.paths.polarisation import chain_amplitude, vertical_ends
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.tracing.model import Parameters
 from warprrf.rf.tracing.rays import RayGrid
-from warprrf.rf.tracing.records import Evaluation, Records
+from warprrf.rf.tracing.records import Materials, Records
 from warprrf.rf.tracing.render import PathGains
 from warprrf.rf.tracing.tracer import SPECULAR, View
 
@@ -403,4 +403,4 @@ def _passage(view: View) -> np.ndarray:
     index = np.where(specular.kind == SLAB, specular.index, -1)
     alone = replace(specular, index=index, power=np.ones(len(specular)))
     prior = replace(Parameters.prior(tracer.surface.groups), log_mirror=np.zeros(tracer.surface.groups))
-    return np.sqrt(alone.powers(Evaluation(prior, slabs=tracer.slabs(1), device=tracer.grid.device)))
+    return np.sqrt(alone.powers(Materials(prior, tracer.slabs, device=tracer.grid.device)))

@@ -16,7 +16,7 @@ from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.fields.bistatic.gauss_newton import Problem
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, Observation, huber
 from warprrf.rf.tracing.model import Parameters
-from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.records import Materials
 from warprrf.rf.tracing.tracer import SPECULAR
 
 
@@ -133,27 +133,33 @@ def _costs(problem: Problem, p: Parameters, unit_of: np.ndarray, owner: np.ndarr
 
 
 def _mirror_changes(
-    o: Observation, problem: Problem, materials: Evaluation, unit_of: np.ndarray
+    o: Observation, problem: Problem, materials: Materials, unit_of: np.ndarray
 ) -> dict[int, np.ndarray]:
     """By unit the change of readings, shape ``(materials, N)``, by paths that meet it if it became each material."""
     p, specular, found = materials.parameters, o.view.records[SPECULAR], {}
     specular = specular.take(np.flatnonzero(o.view.kept_paths(problem.effects)))
     meets, count = specular.index >= 0, len(p.log_excess)
-    unit = np.where(meets, unit_of[np.maximum(specular.index, 0)], -1)
-    now = np.where(meets, materials.material[np.maximum(specular.index, 0)], -1).astype(np.int32)
+    group = np.maximum(specular.index, 0)
+    unit = np.where(meets, unit_of[group], -1)
+    now = np.where(meets, materials.material[group], -1).astype(np.int32)
     path = o.path[o.view.kept_paths(problem.effects)]
-    rows = Evaluation(p, device=materials.device)
-    before = replace(specular, index=now).powers(rows)
+    # Each group as if it were made of each material, as a slab of its own.
+    slabs = np.repeat(materials.slabs[0], count), np.repeat(materials.slabs[1], count)
+    every = Materials(p, slabs, np.tile(np.arange(count), len(unit_of)), device=materials.device)
+
+    def index_of(rows: np.ndarray | slice, material: np.ndarray) -> np.ndarray:
+        return np.where(material >= 0, group[rows] * count + material, -1).astype(np.int32)
+
+    before = replace(specular, index=index_of(slice(None), now)).powers(every)
     for one in np.unique(unit[meets]):
         if o.measured.together is not None:
             found[int(one)] = _heard(o, problem, now, unit == one, p)
             continue
         own = np.flatnonzero((unit == one).any(axis=1))
         trial = np.where(unit[own] == one, np.arange(count, dtype=np.int32)[:, None, None], now[own])
-        several = replace(
-            specular.take(np.tile(own, count)), index=trial.reshape(-1, now.shape[1]).astype(np.int32)
-        )
-        new = several.powers(rows).reshape(count, -1)
+        several = specular.take(np.tile(own, count))
+        several = replace(several, index=index_of(np.tile(own, count), trial.reshape(-1, now.shape[1])))
+        new = several.powers(every).reshape(count, -1)
         found[int(one)] = (new - before[own]).astype(np.float32) @ path[own]
     return found
 

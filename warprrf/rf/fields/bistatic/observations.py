@@ -18,7 +18,7 @@ import numpy as np
 from warprrf.cache import cached_property
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
-from warprrf.kernels.radio.records import MIRROR
+from warprrf.kernels.radio.records import EXCESS, MIRROR, MIRRORED, THROUGH
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.fresnel import fresnel_curves
@@ -38,7 +38,7 @@ from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings, fading_db, path_weights, question_readings
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, to_db
 from warprrf.rf.tracing.model import SETS, Effects, Layout, Model, Parameters
-from warprrf.rf.tracing.records import Bins, Evaluation, Records
+from warprrf.rf.tracing.records import Bins, Materials, Records
 from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.tracer import SPECULAR, View
 
@@ -222,7 +222,7 @@ class Observation:
             return self.target.gain(power)
         return float(np.exp(p.log_gains[self.chain])) if self.chain >= 0 else 1.0
 
-    def predicted(self, model: Model, materials: Evaluation) -> np.ndarray:
+    def predicted(self, model: Model, materials: Materials) -> np.ndarray:
         """Readings under a model of groups, residual and gains included, in units of the floor, shape ``(N,)``."""
         power = np.maximum(read(path_gains(self.view, model, materials), self.measured), 0.0) / self.floor
         return self.gain(model.parameters, power) * power
@@ -232,20 +232,20 @@ class Observation:
         """Readings of unit power on each line of sight and mirror path, in units of the floor, shape ``(L, N)``."""
         return self._once("path", lambda: self.measured.of_paths(self.view) / np.float32(self.floor))
 
-    def single(self, materials: Evaluation) -> tuple[np.ndarray, np.ndarray]:
+    def single(self, materials: Materials) -> tuple[np.ndarray, np.ndarray]:
         """What groups scatter straight from the transmitter, in units of the floor: groups ``(A,)``, and readings at unit
         weight by lobe and Fresnel component, shape ``(A, L, 3, N)`` float32."""
 
         def components() -> tuple[np.ndarray, np.ndarray]:
             own, count = self.ray_bins
-            (records,) = (t for name, t in self.view.tables(SETS["single"]).items() if name != SPECULAR)
+            (records,) = (t for name, t in self.view.traced(SETS["single"]).items() if name != SPECULAR)
             groups, sums = records.components(materials, Bins.of(own[records.ray], count))
             found = self.measured.of_bins(sums.reshape(count, -1), quick=True) / np.float32(self.floor)
             return groups, np.ascontiguousarray(found.T).reshape(*sums.shape[1:], found.shape[0])
 
         return self._once((materials.parameters.lobes, materials.parameters.reciprocal), components)
 
-    def further(self, effects: Effects, materials: Evaluation) -> tuple[np.ndarray, np.ndarray]:
+    def further(self, effects: Effects, materials: Materials) -> tuple[np.ndarray, np.ndarray]:
         """What comes over more than one surface, by the group that scatters it last or sends it on: groups ``(C,)``, and
         readings in units of the floor, shape ``(C, N)``."""
         own, count = self.ray_bins
@@ -267,10 +267,10 @@ class Observation:
 
     def further_tables(self, effects: Effects) -> list[Records]:
         """Of paths over more than one surface, at least one of which scatters."""
-        single = self.view.tables(SETS["single"])
-        return [table for name, table in self.view.tables(effects).items() if name not in single]
+        single = self.view.traced(SETS["single"])
+        return [table for name, table in self.view.traced(effects).items() if name not in single]
 
-    def direct(self, effects: Effects, materials: Evaluation, power: np.ndarray) -> np.ndarray:
+    def direct(self, effects: Effects, materials: Materials, power: np.ndarray) -> np.ndarray:
         """Readings of line of sight and mirrors of ``power`` (L,) in units of the floor, shape ``(N,)``."""
         kept, together = self.view.kept_paths(effects), self.measured.together
         if together is None:
@@ -280,11 +280,9 @@ class Observation:
         )[0]
         return together.received(np.where(kept, amplitude, 0.0)) / self.floor
 
-    def slopes(
-        self, effects: Effects, materials: Evaluation, layout: Layout
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def slopes(self, effects: Effects, materials: Materials, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of readings to the parameters of materials ``(C, N)`` float32, and their places ``(C,)``."""
-        tables, (own, count) = self.view.tables(effects), self.ray_bins
+        tables, (own, count) = self.view.traced(effects), self.ray_bins
         side, specular = self.view.tracer.surface.side_group, tables.pop(SPECULAR)
         groups = [records.groups(side) for records in (specular, *tables.values())]
         place, index = layout.columns(materials.material[np.concatenate(groups)])
@@ -296,7 +294,7 @@ class Observation:
         return self.direct_slopes(effects, materials, place, rise) + scattered, index
 
     def direct_slopes(
-        self, effects: Effects, materials: Evaluation, place: np.ndarray, rise: np.ndarray
+        self, effects: Effects, materials: Materials, place: np.ndarray, rise: np.ndarray
     ) -> np.ndarray:
         """Derivatives of what is read of line of sight and mirrors ``(C, N)`` float32, of whose powers they are ``rise``
         (L, C); those to the parameters of material m stand from ``place[m]`` on."""
@@ -310,10 +308,9 @@ class Observation:
             )
             for path, mirror in zip(*np.nonzero(specular.index >= 0), strict=True):
                 at = place[materials.material[specular.index[path, mirror]]] + len(p.lobes)
-                if specular.kind[path, mirror] == MIRROR:
-                    rise[path, at : at + 2] += slope[path, mirror], 0.5 * amplitude[path]
-                else:
-                    rise[path, at + 2] += 0.5 * amplitude[path]
+                rise[path, at + EXCESS] += slope[path, mirror]
+                share = MIRRORED if specular.kind[path, mirror] == MIRROR else THROUGH
+                rise[path, at + share] += 0.5 * amplitude[path]
         return np.asarray((rise * kept[:, None]).T.astype(np.float32) @ columns)
 
     @cached_property
@@ -375,17 +372,19 @@ class Columns:
             row[: layout.lobes] += (
                 p.weight[g] * np.einsum("c,lcn->nl", alpha[g].astype(np.float32), columns)
             ).T
-            row[layout.lobes] += p.weight[g] @ np.einsum("c,lcn->ln", rise[g].astype(np.float32), columns)
+            row[layout.lobes + EXCESS] += p.weight[g] @ np.einsum(
+                "c,lcn->ln", rise[g].astype(np.float32), columns
+            )
         even, steeper = curves.even(p.log_excess)
         for g, column in zip(self.senders, self.further, strict=True):
             row = found[np.searchsorted(seen, g)]
             row[: layout.lobes] += (p.weight[g] * even[g])[:, None] * column
-            row[layout.lobes] += p.weight[g].sum() * steeper[g] * column
+            row[layout.lobes + EXCESS] += p.weight[g].sum() * steeper[g] * column
         index = layout.stride * seen[:, None] + np.arange(layout.stride)
         return found.reshape(index.size, found.shape[-1]), index.ravel()
 
 
-def columns_of(o: Observation, effects: Effects, materials: Evaluation) -> Columns:
+def columns_of(o: Observation, effects: Effects, materials: Materials) -> Columns:
     """Those of an observation's groups, as light comes to them under ``materials``."""
     p, count = materials.parameters, len(o.target.db)
     groups, single = np.zeros(0, int), np.zeros((0, len(p.lobes), 3, count), np.float32)
@@ -557,7 +556,10 @@ class _Arrays(Kind):
         target, chain = Target(NEPER * np.log1p(power[known] / one.floor)), OWN_GAIN if one.relative else -1
         bare = Observation(place, view, measured.part(known), target, unit * one.floor, chain)
         start = Parameters.prior(view.tracer.surface.groups)
-        materials, single = Evaluation(start, device=view.tracer.grid.device), SETS["single"]
+        materials, single = (
+            Materials(start, view.tracer.slabs, device=view.tracer.grid.device),
+            SETS["single"],
+        )
         scattered = columns_of(bare, single, materials).power(start)
         total = scattered + bare.direct(single, materials, view.records[SPECULAR].powers(materials))
         gain = bare.gain(start, total)
@@ -621,7 +623,7 @@ def _shares(o: Observation) -> tuple[np.ndarray, np.ndarray]:
     surface = o.view.tracer.surface
     none = np.zeros((2, surface.cells))
     model = Model(SETS["single"], Parameters.prior(surface.groups), none, o.place.transmitter)
-    materials = Evaluation(model.parameters, device=o.view.tracer.grid.device)
+    materials = Materials(model.parameters, o.view.tracer.slabs, device=o.view.tracer.grid.device)
     single = o.view.records[SPECULAR].powers(materials)[:, None] * o.path
     share = single / np.maximum(o.predicted(model, materials), np.maximum(single.sum(axis=0), 1e-300))
     return share[o.view.paths.in_sight].sum(axis=0), (share**2).sum(axis=0)

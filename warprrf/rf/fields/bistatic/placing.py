@@ -21,7 +21,7 @@ from warprrf.rf.fields.bistatic.measured import direct_paths
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, Observation, Place
 from warprrf.rf.spectra.readings import Readings, path_weights
 from warprrf.rf.tracing.model import Parameters
-from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.records import Materials
 from warprrf.rf.tracing.tracer import SPECULAR, View
 
 STRONGEST = 20  # paths that count
@@ -74,8 +74,9 @@ def _zero(one: Readings, seen: Sequence[tuple[Place, View]]) -> float:
 
 def _strongest(view: View) -> tuple[np.ndarray, ...]:
     """Powers of its strongest direct paths before any measurement, directions of arrival and departure, delays."""
-    prior = Parameters.prior(view.tracer.surface.groups)
-    power = view.records[SPECULAR].powers(Evaluation(prior, device=view.tracer.grid.device))
+    tracer = view.tracer
+    prior = Materials(Parameters.prior(tracer.surface.groups), tracer.slabs, device=tracer.grid.device)
+    power = view.records[SPECULAR].powers(prior)
     kept = np.argsort(-power)[:STRONGEST]
     return power[kept], *(values[kept] for values in direct_paths(view))
 

@@ -106,7 +106,7 @@ def covariance_of(t: Training, choice: Choice) -> np.ndarray:
         for free in (through, True)
     )
     free = np.ones(whole.size, bool)
-    free[whole.passage(np.arange(whole.groups))] = through
+    free[whole.let_through(np.arange(whole.groups))] = through
     covariance = np.where(free, 0.0, THROUGH**2) * np.eye(whole.size)
     covariance[np.ix_(free, free)] = choice.solution.covariance[: layout.size, : layout.size]
     return covariance

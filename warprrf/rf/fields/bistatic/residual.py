@@ -21,7 +21,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from warprrf.rf.fields.bistatic.measured import Measurement, read
 from warprrf.rf.fields.bistatic.observations import HUBER_DB, NOISE_DB, Observation, Target, huber
 from warprrf.rf.tracing.model import Model
-from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.records import Materials
 from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import SPECULAR
@@ -55,7 +55,7 @@ class Shares:
     huber_db: float = HUBER_DB
 
 
-def shares_of(o: Observation, model: Model, materials: Evaluation) -> Shares:
+def shares_of(o: Observation, model: Model, materials: Materials) -> Shares:
     """What cells give the readings of one receiver under ``model``, whose residual does not count."""
     bare = replace(model, effects=replace(model.effects, residual=False))
     gains, view = path_gains(o.view, bare, materials), o.view

@@ -20,7 +20,7 @@ from warprrf.rf.fields.bistatic.observations import NOISE_DB, READING_ERROR_DB
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_of
 from warprrf.rf.tracing.model import Model
-from warprrf.rf.tracing.records import Evaluation
+from warprrf.rf.tracing.records import Materials
 from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.tracer import SPECULAR, Tracer
 
@@ -80,11 +80,11 @@ class Sensitivity:
     Args:
         tracer: the geometry under the transmitter, on a grid of :data:`SHAPE`.
         model: of its surfaces.
-        materials: evaluation of it under the transmitter.
+        materials: those of it under the transmitter.
         floor: path gain of a pixel, and of a reading, below which nothing is told.
     """
 
-    def __init__(self, tracer: Tracer, model: Model, materials: Evaluation, floor: float) -> None:
+    def __init__(self, tracer: Tracer, model: Model, materials: Materials, floor: float) -> None:
         self.tracer, self.model, self.materials, self.floor = tracer, model, materials, floor
 
     def powers(self, place: np.ndarray) -> tuple[csr_matrix, np.ndarray]:

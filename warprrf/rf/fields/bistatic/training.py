@@ -37,10 +37,10 @@ from warprrf.rf.fields.bistatic.observations import (
 from warprrf.rf.fields.bistatic.options import SUB_PIXELS, FitOptions
 from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.tracing.model import SETS, Effects, Model, Parameters
-from warprrf.rf.tracing.records import Evaluation
-from warprrf.rf.tracing.render import evaluation
+from warprrf.rf.tracing.records import Materials
+from warprrf.rf.tracing.render import materials_of
 from warprrf.rf.tracing.surface import Surface
-from warprrf.rf.tracing.tracer import Tracer, View, traced
+from warprrf.rf.tracing.tracer import Tracer, View, view_of
 
 HELD_OUT, MOST_HELD_OUT, LEAST_RECEIVERS = 0.25, 30, 4
 """Share of receivers that are held out, how many at most, and of how many at least."""
@@ -166,7 +166,7 @@ def trace(
             wanted = replace(wanted, mirrors=tracer.images.affordable(receivers, wanted.mirrors))
         found = tracer.paths(receivers, wanted, progress)
         parts = [(receivers[r], found.subset(np.flatnonzero(found.receiver == r))) for r in range(len(own))]
-        for r, view in each(partial(traced, tracer.again, wanted, keeps), parts, client):
+        for r, view in each(partial(view_of, tracer.again, wanted, keeps), parts, client):
             views[own[r]] = tracer.adopted(view)
             tell("transport", len(views), len(places))
     seconds = time.perf_counter() - started
@@ -366,9 +366,9 @@ class Training:
     def start(self, material: np.ndarray) -> Parameters:
         """Parameters of materials before any measurement."""
         prior = Parameters.prior(int(material.max()) + 1, self.lobes, reciprocal=self.options.reciprocal)
-        return replace(prior, log_through=self.passage(material)[0])
+        return replace(prior, log_through=self.known_through(material)[0])
 
-    def passage(self, material: np.ndarray) -> np.ndarray:
+    def known_through(self, material: np.ndarray) -> np.ndarray:
         """ln of the share that materials let through before any measurement, and its standard deviation, shape ``(2, M)``."""
         eta, _, through = self.surface.slabs(frame_of(self.data).frequency_hz)
         std = np.where(np.abs(eta) > 0, KNOWN_THROUGH, THROUGH)
@@ -380,7 +380,7 @@ class Training:
         """What is fitted to readings of ``places``, lit as under parameters ``p`` of materials."""
         return Problem.of(
             [self.parts[k] for k in places], effects, material, p, chains=len(self.chains),
-            gain_offset=self.options.gain_offset, passage=self.passage(material),
+            gain_offset=self.options.gain_offset, known_through=self.known_through(material),
             **({"energy": 1.0} if self.totals else {}),
         )  # fmt: skip
 
@@ -407,15 +407,15 @@ class Training:
 
     def evaluated(
         self, model: Model, places: Iterable[int]
-    ) -> Iterable[tuple[Observation, Model, Evaluation]]:
+    ) -> Iterable[tuple[Observation, Model, Materials]]:
         """Observations with the model at their carriers, as kernels take it."""
-        known: dict[Any, tuple[Model, Evaluation]] = {}
+        known: dict[Any, tuple[Model, Materials]] = {}
         for k in places:
             o = self.observations[k]
             key = id(o.view.tracer), o.ratio
             if key not in known:
                 here = replace(model, parameters=model.parameters.at_ratio(o.ratio))
-                known[key] = here, evaluation(o.view.tracer, here)
+                known[key] = here, materials_of(o.view.tracer, here)
             yield o, *known[key]
 
     def loss(self, model: Model, places: Sequence[int] | np.ndarray) -> float:
