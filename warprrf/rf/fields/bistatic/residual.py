@@ -65,7 +65,7 @@ def shares_of(o: Observation, model: Model, materials: Materials) -> Shares:
     (bins, count), cells = o.measured.bins(view), view.tracer.surface.cells
     # Gains of light sent on are learned under one transmitter alone.
     learned = 1 + np.array_equal(view.tracer.transmitter, model.transmitter)
-    rows, columns, powers = [], [], []
+    rows, columns, powers = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0, np.float32)]
     for name, power in gains.tables.items():
         records = gains.records[name]
         if name == SPECULAR or not 0 <= records.residual_row < learned:
@@ -74,12 +74,9 @@ def shares_of(o: Observation, model: Model, materials: Materials) -> Shares:
         ray = records.ray[k]
         rows.append(bins[ray])
         columns.append(cells * records.residual_row + view.cell[ray])
-        powers.append(power[k] / unit)
-    if not rows:
-        own = csr_matrix((count, 2 * cells), dtype=np.float32)
-    else:
-        places = np.concatenate(rows), np.concatenate(columns)
-        own = csr_matrix((np.concatenate(powers).astype(np.float32), places), shape=(count, 2 * cells))
+        powers.append((power[k] / unit).astype(np.float32))
+    places = np.concatenate(rows), np.concatenate(columns)
+    own = csr_matrix((np.concatenate(powers), places), shape=(count, 2 * cells))
     known = np.asarray(own.sum(axis=1)).reshape(-1, 1)
     rest = np.maximum(read(gains, o.measured) / unit - o.measured.of_bins(known)[:, 0], 0.0)
     return Shares(own, rest, o.measured, o.target, o.huber_db)
