@@ -91,10 +91,8 @@ class PathArrays:
                 )
         if self.interactions.size == 0:
             there = np.isfinite(self.vertices[..., 0])
-            codes, last = (
-                np.where(there, MIRROR, 0),
-                np.cumsum(there, axis=-1) == there.sum(-1, keepdims=True),
-            )
+            codes = np.where(there, MIRROR, 0)
+            last = np.cumsum(there, axis=-1) == there.sum(-1, keepdims=True)
             for kind, code in _LAST.items():
                 codes[there & last & (self.kind == kind)[..., None]] = code
             object.__setattr__(self, "interactions", codes.astype(np.int8))
@@ -325,10 +323,9 @@ class PathArrays:
             receiver = np.stack([np.asarray(p.receiver) for p in parts])
         sources = [p.transmitter for p in parts if p.transmitter is not None]
         common = _common([replace(p, transmitter=None) for p in parts])
-        if sources and len(sources) == len(parts) and not all(np.array_equal(s, sources[0]) for s in sources):
-            common["transmitter"] = np.stack(sources)
-        elif sources:
-            common["transmitter"] = sources[0]
+        if sources:
+            alike = len(sources) < len(parts) or all(np.array_equal(s, sources[0]) for s in sources)
+            common["transmitter"] = sources[0] if alike else np.stack(sources)
         return cls(**stacked, **common, receiver=receiver)
 
 
@@ -375,8 +372,6 @@ def _common(parts: Sequence[PathArrays]) -> dict[str, Any]:
     Raises:
         ValueError: if they differ in carrier, transmitter or air.
     """
-    if not parts:
-        return {}
     first = parts[0]
     for p in parts[1:]:
         same = p.frequency_hz == first.frequency_hz and p.air == first.air

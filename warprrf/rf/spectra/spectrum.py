@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from types import EllipsisType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -177,6 +178,21 @@ def transverse_basis(directions: ArrayLike) -> np.ndarray:
     return np.stack([up, around], axis=-2)
 
 
+def unit_vectors(
+    name: str, value: ArrayLike, shape: tuple[int | EllipsisType | None, ...] = (None, 3)
+) -> np.ndarray:
+    """Vectors of ``shape``, made of length one.
+
+    Raises:
+        TypeError, ValueError: naming the argument, for another shape, numbers not finite, or a vector of no length.
+    """
+    vectors = check_array(name, value, shape)
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    if not (length > 0).all():
+        raise ValueError(f"{name}: got a vector of length zero, expected ones with a length")
+    return vectors / length
+
+
 def pixel_of(directions: ArrayLike, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Row and column of the pixel that each direction ``(..., 3)`` falls in."""
     rows, columns = check_shape(shape)
@@ -267,11 +283,7 @@ def spread_paths(
     positive = np.flatnonzero(power > 0)
     if len(positive) == 0:
         return SpreadPaths(np.zeros((rows, columns)), np.full((rows, columns), -1, dtype=np.int32))
-    d, power = d[positive], power[positive]
-    length = np.linalg.norm(d, axis=1, keepdims=True)
-    if (length == 0).any():
-        raise ValueError("directions: got a vector of length zero, expected directions of arrival")
-    d = d / length
+    d, power = unit_vectors("directions", d[positive]), power[positive]
     row, column = pixel_of(d, (rows, columns))
     cell = (row * columns + column).astype(np.int32)
     order = np.argsort(cell, kind="stable")
