@@ -27,10 +27,11 @@ from warprrf.rf.spectra.spectrum import (
     pixel_of,
     pixel_solid_angles,
 )
+from warprrf.rows import Rows
 
 
 @dataclass(frozen=True)
-class Links:
+class Links(Rows):
     """Links of several receivers, arrays ``(R,)``; or one, numbers.
 
     Attributes:
@@ -48,14 +49,7 @@ class Links:
     delay_spread_s: np.ndarray
     best_beam_gain: np.ndarray
 
-    def __getitem__(self, chosen: Any) -> Links:
-        """Those of some receivers, or of one."""
-        return Links(*(array[chosen] for array in vars(self).values()))
-
-    @classmethod
-    def joined(cls, parts: Sequence[Links]) -> Links:
-        """One after another."""
-        return cls(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in cls.__dataclass_fields__})
+    __getitem__ = Rows.take
 
 
 @checked

@@ -8,7 +8,7 @@ coefficient's terms, and the rest is tested as mirror paths are. Slabs do not be
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -23,16 +23,17 @@ from warprrf.rf.channel.path_arrays import EDGE, MIRROR, SLAB
 from warprrf.rf.em.diffraction import EdgeRays, Pair, boundary_fields, diffraction_matrices
 from warprrf.rf.em.fresnel import SurfaceTable, slab_passage, slab_reflection
 from warprrf.rf.paths.images import EdgeLeaves, MirrorImages
-from warprrf.rf.paths.mirror_paths import MirrorPaths, distinct, joined, passed, unobstructed
+from warprrf.rf.paths.mirror_paths import MirrorPaths, distinct, passed, unobstructed
 from warprrf.rf.paths.slabs import Walls
 from warprrf.rf.spectra.spectrum import transverse_basis
+from warprrf.rows import Rows
 
 LEAST_DB = -80.0
 """Paths that are weaker than this, over an unobstructed straight path between the ends, are left out [dB]."""
 
 
 @dataclass(frozen=True)
-class EdgePaths:
+class EdgePaths(Rows):
     """L paths over one edge each, with a mirror or a slab before it, behind it, or none.
 
     Attributes:
@@ -108,23 +109,16 @@ class EdgePaths:
             self.receiver, filled(-1, np.int32), filled(-1, np.int32), point, share, self.length_m, self.excess_m, self.arrival,
             filled(np.nan, float, 3), filled(0.0, float), filled(0.0, float), filled(np.nan, float), code,
         )  # fmt: skip
-        return joined([found, edges.subset(np.flatnonzero(share > 0))])
-
-    def take(self, rows: np.ndarray) -> EdgePaths:
-        """The paths ``rows``."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in _ARRAYS})
+        return MirrorPaths.joined([found, edges.subset(np.flatnonzero(share > 0))])
 
 
-_ARRAYS = tuple(f.name for f in fields(EdgePaths) if f.name != "wavelength_m")
-
-
-def patch_edges(patches: PlanarPatches, **options: Any) -> Edges:
+def patch_edges(patches: PlanarPatches) -> Edges:
     """Edges between planar patches: what is one patch has none, however its faces are bent by errors."""
     own = patches.face_patch >= 0
     normal = np.where(own[:, None], patches.normal[np.maximum(patches.face_patch, 0)], 0.0)
     turned = (normal * patches.mesh.face_normals).sum(axis=1) < 0
     group = patches.group[np.maximum(patches.face_patch, 0)]
-    return mesh_edges(patches.mesh, np.where(turned[:, None], -normal, normal), group, **options)
+    return mesh_edges(patches.mesh, np.where(turned[:, None], -normal, normal), group)
 
 
 class EdgeFinder:
@@ -135,10 +129,8 @@ class EdgeFinder:
         wavelength_m: Wavelength [m].
         table: Radio properties of the patches' groups; None for a bare mesh: fields without polarisation, reflected
             without a sign change.
-        edges: Those of the patches by default.
         walls: What may be passed, if anything.
         group: Row of ``table`` of each face, if there are walls.
-        least_db: See :data:`LEAST_DB`.
     """
 
     def __init__(
@@ -147,14 +139,11 @@ class EdgeFinder:
         wavelength_m: float,
         table: SurfaceTable | None = None,
         *,
-        edges: Edges | None = None,
         walls: Walls | None = None,
         group: np.ndarray | None = None,
-        least_db: float = LEAST_DB,
     ) -> None:
         self.images, self.wavelength_m, self.table = images, wavelength_m, table
-        self.edges = patch_edges(images.patches) if edges is None else edges
-        self.walls, self.group, self.least_db = walls, group, least_db
+        self.edges, self.walls, self.group = patch_edges(images.patches), walls, group
         self._leaves = EdgeLeaves(self.edges, images.device)
 
     def find(self, receivers: np.ndarray, mirrors: int = 1, progress: Progress | None = None) -> EdgePaths:
@@ -167,15 +156,18 @@ class EdgeFinder:
         """
         check_count("mirrors", mirrors, 0, 1)
         points = np.asarray(receivers, float).reshape(-1, 3)
-        parts = [self._described(_Ways.none(self.images.transmitter), np.zeros(0, int))]
+        place = self.images.transmitter
+        none = _Ways.over(
+            self.edges, np.zeros(0, int), np.zeros((0, 2), int), self.images.patches, place, place
+        )
+        parts = [self._described(none, none.edge)]
         for k, receiver in enumerate(points):
             ways = self._ways(receiver, mirrors)
             part = self._described(ways, np.full(len(ways.edge), k))
             parts.append(part.take(np.argsort(part.length_m, kind="stable")))
             if progress is not None:
                 progress("edges", k + 1, len(points))
-        every = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _ARRAYS}
-        return EdgePaths(**every, wavelength_m=self.wavelength_m)
+        return EdgePaths.joined(parts)
 
     def _ways(self, receiver: np.ndarray, mirrors: int) -> _Ways:
         """What reaches a receiver, unobstructed."""
@@ -193,7 +185,7 @@ class EdgeFinder:
         for sieve in (self._in_reach, partial(self._strong, direct), self._on_mirrors):
             ways = ways.take(np.flatnonzero(sieve(ways)))
         free = self._unobstructed(ways)
-        ways = ways.take(np.flatnonzero(free)).and_(self._passing(ways.take(np.flatnonzero(~free))))
+        ways = _Ways.joined([ways.take(free), self._passing(ways.take(~free))])
         # Wedges before the borders of their faces.
         ways = ways.take(np.argsort(self.edges.n[ways.edge], kind="stable"))
         return ways.take(ways.distinct(3.0 * patches.tolerance_m))
@@ -212,7 +204,7 @@ class EdgeFinder:
     def _strong(self, direct: float, ways: _Ways) -> np.ndarray:
         """Whether paths reach the level even if every face and mirror reflects all."""
         most = np.abs(boundary_fields(self._rays(ways))).sum(axis=0) * direct / ways.leg.sum(axis=1)
-        return np.asarray(20.0 * np.log10(np.maximum(most, 1e-300)) > self.least_db)
+        return np.asarray(20.0 * np.log10(np.maximum(most, 1e-300)) > LEAST_DB)
 
     def _on_mirrors(self, ways: _Ways) -> np.ndarray:
         found = np.ones(len(ways.edge), bool)
@@ -339,7 +331,7 @@ class EdgeFinder:
 
 
 @dataclass(frozen=True)
-class _Ways:
+class _Ways(Rows):
     """L ways over an edge each: the ``patch`` that mirrors or the face of the ``slab`` (L, 2) before and behind, -1 for none, where
     that ``stop`` is (L, 2, 3), and the ``thickness_m`` of a solid (L, 2); the ``point`` on the edge (L, 3) and ``at`` how far along
     (L,); and of both legs, unfolded at mirrors, lengths ``leg`` (L, 2), ``angle`` about the edge (L, 2) and ``direction`` of
@@ -392,23 +384,6 @@ class _Ways:
         stop = np.where(mirrored, point[:, None] + share * (image - point[:, None]), np.nan)
         slab, solid = np.full(patch.shape, -1), np.full(patch.shape, np.nan)
         return cls(edge, patch, slab, stop, solid, point, at, leg, angle, direction, end)
-
-    @classmethod
-    def none(cls, transmitter: np.ndarray) -> _Ways:
-        """No ways."""
-        shapes = {"edge": (), "at": (), "point": (3,), "stop": (2, 3), "direction": (2, 3), "end": (2, 3)}
-        found = {f.name: np.zeros((0, *shapes.get(f.name, (2,)))) for f in fields(cls)}
-        return cls(**found | {name: found[name].astype(int) for name in ("edge", "patch", "slab")})
-
-    def take(self, rows: np.ndarray) -> _Ways:
-        """The ways ``rows``."""
-        return _Ways(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
-
-    def and_(self, more: _Ways) -> _Ways:
-        """These ways, then ``more``."""
-        return _Ways(
-            **{f.name: np.concatenate([getattr(self, f.name), getattr(more, f.name)]) for f in fields(self)}
-        )
 
     def distinct(self, distance_m: float) -> np.ndarray:
         """Indices of ways that no earlier one repeats, with mirrors on the same sides and all points within ``distance_m``: edges
