@@ -19,7 +19,6 @@ from warprrf.checks import (
     check_count,
     check_number,
     check_seed,
-    check_type,
     checked,
 )
 from warprrf.cluster import each
@@ -42,8 +41,6 @@ from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, DEFAULT_SHAPE, check_beam, check_shape
 from warprrf.rf.tracing.model import Effects
 from warprrf.steps import Steps, digest
-
-ENGINES = ("exact", "sionna")
 
 
 @checked
@@ -107,8 +104,7 @@ def simulate(
     """
     if not hasattr(scene, "materials"):
         raise TypeError(f"scene: got {type(scene).__name__}, expected a Scene (a mesh and its materials)")
-    check_choice("engine", engine, ENGINES)
-    check_type("effects", effects, Effects)
+    check_choice("engine", engine, ("exact", "sionna"))
     sampling = Sampling(depth=depth, samples=samples, refraction=refraction, seed=seed)
     points = np.atleast_2d(check_receivers("receivers", receivers))
     source = check_array("transmitter", transmitter, (3,))
@@ -129,8 +125,11 @@ def simulate(
     common |= {"shape": check_shape(shape), "beam_sigma_rad": check_beam(beam_sigma_rad)}
     surfaces = (scene.mesh.vertices, scene.mesh.faces, scene.face_material, *vars(table).values())
     solver: Any = sampling, _versions(engine, solver_only=True)
-    if engine == "exact":
+    settings = {"depth": depth, "samples": samples, "refraction": int(refraction)}
+    if exact:
         solver = asdict(effects), seed if effects.scatterings > 1 else 0
+        named = {f"effects_{name}": int(value) for name, value in asdict(effects).items()}
+        settings = {"sub_pixels": SUB_PIXELS} | named
     inputs = digest(engine, common, air, surfaces, solver)
     results: dict[int, Any] = {}  # ReceivedPaths
     if workspace is not None:
@@ -139,18 +138,13 @@ def simulate(
     tell = progress or (lambda *_: None)
     tell("simulate", len(results), len(points))
     missing = [k for k in range(len(points)) if k not in results]
-    receiver = _Receiver(scene, common, effects if engine == "exact" else sampling, seed, air, device)
+    receiver = _Receiver(scene, common, effects if exact else sampling, seed, air, device)
     for at, found in each(receiver, [points[k] for k in missing], client):
         k = missing[at]
         results[k] = found if workspace is None else _kept(workspace, inputs, points[k], found)
         tell("simulate", len(results), len(points))
     names = ("path_gain", "delay_s", "aod", "line_of_sight")
     columns: Any = {n: np.stack([getattr(results[k], n) for k in range(len(points))]) for n in names}
-    settings = {"depth": depth, "samples": samples, "refraction": int(refraction)}
-    if engine == "exact":
-        settings = {"sub_pixels": SUB_PIXELS} | {
-            f"effects_{name}": int(value) for name, value in asdict(effects).items()
-        }
     return SpectrumDataset.from_spectra(
         receivers=points,
         transmitter=source,

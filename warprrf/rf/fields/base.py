@@ -22,6 +22,7 @@ from warprrf.cache import Cache
 from warprrf.checks import (
     LARGEST_M,
     check_array,
+    check_choice,
     check_count,
     check_number,
     check_positive,
@@ -121,8 +122,7 @@ class RadioField(ABC):
         Warns:
             UserWarning: below 100 GHz and outdoors, of diffraction and transmission where they are not modelled.
         """
-        if not isinstance(model, str) or model not in cls.models:
-            raise ValueError(f"model: got {model!r}, expected one of {', '.join(cls.models)}")
+        check_choice("model", model, cls.models)
         return cls.models[model].fit(geometry, ds, model, **options)
 
     @classmethod

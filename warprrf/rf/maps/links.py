@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.checks import checked, one_line
+from warprrf.checks import check_choice, checked, one_line
 from warprrf.cluster import each
 from warprrf.device import Progress
 from warprrf.rf.channel.dispersion import delay_spread
@@ -76,8 +76,7 @@ class LinkOptions:
         if self.shape is not None:
             object.__setattr__(self, "shape", check_shape(self.shape))
         check_beam(self.beam_sigma_rad)
-        if self.mirror_order not in (None, 0, 1, 2, 3):
-            raise ValueError(f"mirror_order: got {self.mirror_order!r}, expected 0 to 3, or None")
+        check_choice("mirror_order", self.mirror_order, (None, 0, 1, 2, 3))
 
     def in_batches(self, receivers: np.ndarray, batch: int, trace: Callable[[np.ndarray], Links]) -> Links:
         """Links of ``receivers`` (R, 3), at most ``batch`` of them at a time."""

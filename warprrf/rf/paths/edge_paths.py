@@ -21,7 +21,7 @@ from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.rf.channel.path_arrays import EDGE, MIRROR, SLAB
 from warprrf.rf.em.diffraction import EdgeRays, Pair, boundary_fields, diffraction_matrices
-from warprrf.rf.em.fresnel import SurfaceTable, slab_passage, slab_reflection
+from warprrf.rf.em.fresnel import SurfaceTable
 from warprrf.rf.paths.images import EdgeLeaves, MirrorImages
 from warprrf.rf.paths.mirror_paths import MirrorPaths, distinct, passed, unobstructed
 from warprrf.rf.paths.slabs import Walls
@@ -84,8 +84,8 @@ class EdgePaths(Rows):
         falls (Kirchhoff's approximation). There, up to a detour of a wavelength, paths over an edge only bring what is
         left of theirs.
         """
-        found = found.widened(2)
-        count = found.patch.shape[1]
+        count = max(2, found.patch.shape[1])
+        found = found.of_width(count)
         friis = self.wavelength_m / (4.0 * np.pi * self.length_m)
         share = np.sqrt(self.power) / friis
         mirror = self.patch.max(axis=1, initial=-1)
@@ -261,46 +261,30 @@ class EdgeFinder:
         """TE and TM of mirrors and faces of the patches ``(L,)``."""
         if self.table is None:
             return -np.ones(len(patch)), np.ones(len(patch))
-        group = self.images.patches.group[patch]
-        te, tm = slab_reflection(
-            cosine, self.table.permittivity[group], self.table.thickness_m[group], self.wavelength_m
-        )
-        smooth = np.sqrt(1.0 - self.table.scattering[group] ** 2)
-        return smooth * te, smooth * tm
-
-    def _passage(
-        self, group: np.ndarray, cosine: np.ndarray, thickness_m: np.ndarray | float = np.nan
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """TE and TM of slabs of ``group`` (L,), and by how much they make a path longer [m]; ``thickness_m`` of solids."""
-        if self.table is None:
-            raise ValueError("table: got None, expected materials beside walls")
-        solid = np.where(np.isnan(thickness_m), self.table.thickness_m[group], thickness_m)
-        return slab_passage(cosine, self.table.permittivity[group], solid, self.wavelength_m)
-
-    def _sheet(self, group: np.ndarray, cosine: np.ndarray, sheet: np.ndarray) -> Pair:
-        """TE and TM of a field behind a sheet over that of the way in air, 0 of what is no ``sheet``."""
-        te, tm, longer = self._passage(group, cosine)
-        late = np.where(sheet, np.exp(-2j * np.pi / self.wavelength_m * longer), 0.0)
-        return te * late, tm * late
+        return self.table.reflection(self.images.patches.group[patch], cosine, self.wavelength_m)
 
     def _described(self, ways: _Ways, receiver: np.ndarray) -> EdgePaths:
         edges, patches, rays = self.edges.take(ways.edge), self.images.patches, self._rays(ways)
         faces, cosines = patches.face_patch[edges.face], rays.incidence_cosines()
         reflected = [self._reflection(faces[:, j], cosines[2 + j]) for j in range(2)]
-        through = None
-        if self.walls is not None:
-            through = [self._sheet(patches.group[faces[:, j]], cosines[j], edges.n > 1.99) for j in range(2)]
+        through: list[Pair] | None = None
+        if self.walls is not None and self.table is not None:
+            through = []
+            for j in range(2):  # of the way in air, behind a sheet; nothing passes a wedge
+                te, tm, longer = self.table.passage(patches.group[faces[:, j]], cosines[j], self.wavelength_m)
+                late = np.where(edges.n > 1.99, np.exp(-2j * np.pi / self.wavelength_m * longer), 0.0)
+                through.append((te * late, tm * late))
         bent = diffraction_matrices(rays, reflected, through)
         before, behind = (_edge_basis(edges.along, ways.direction[:, j]) for j in range(2))
         field, sign = np.swapaxes(behind, 1, 2) @ bent @ before, bent[:, 0, 0].copy()
         outer, excess = ways.direction.copy(), np.zeros(len(ways.edge))
         for j in range(2):
             own = np.flatnonzero(ways.slab[:, j] >= 0)
-            if len(own) and self.walls is not None and self.group is not None:
+            if len(own) and self.walls is not None and self.group is not None and self.table is not None:
                 normal, way = self.walls.mesh.face_normals[ways.slab[own, j]], ways.direction[own, j]
                 cosine = np.abs((way * normal).sum(axis=1))
-                te, tm, excess[own] = self._passage(
-                    self.group[ways.slab[own, j]], cosine, ways.thickness_m[own, j]
+                te, tm, excess[own] = self.table.passage(
+                    self.group[ways.slab[own, j]], cosine, self.wavelength_m, ways.thickness_m[own, j]
                 )
                 slab = _at_plane(normal, way, way, te, tm)
                 field[own] = field[own] @ slab if j == 0 else slab @ field[own]

@@ -103,10 +103,6 @@ class MirrorPaths(Rows):
 
     subset = Rows.take
 
-    def widened(self, most: int) -> MirrorPaths:
-        """The same with ``most`` columns at least, empty ones behind."""
-        return self.of_width(max(most, self.patch.shape[1]))
-
     def of_width(self, most: int) -> MirrorPaths:
         """The same with ``most`` columns, the last ones left off or empty ones behind."""
         wide: dict[str, Any] = {}

@@ -23,7 +23,7 @@ from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
     DEFAULT_SHAPE,
     Spectrum,
-    check_pixels,
+    check_departures,
     check_range_db,
     check_shape,
     check_whole,
@@ -102,16 +102,15 @@ class SpectrumDataset:
         """Check shapes and values; ValueError or TypeError names the field."""
         receivers = check_array("receivers", self.receivers, (None, 3))
         count = len(receivers)
-        gain = check_array("path_gain", self.path_gain, (count, None, None), dtype=np.float32, finite=False)
-        if np.isinf(gain).any():
-            raise ValueError("path_gain: got infinite values, expected linear gains, NaN where not measured")
+        spectra = (count, None, None)
+        gain = check_array("path_gain", self.path_gain, spectra, np.float32, finite=False, least=0.0)
         shape = check_shape(gain.shape[1:])
         fields: dict[str, Any] = {
             "receivers": receivers,
             "transmitter": check_array("transmitter", self.transmitter, (3,)),
             "frequency_hz": check_frequency(self.frequency_hz),
             "path_gain": gain,
-            "delay_s": check_array("delay_s", self.delay_s, (count, *shape), finite=False),
+            "delay_s": check_array("delay_s", self.delay_s, (count, *shape), finite=False, least=0.0),
             "aod": check_array("aod", self.aod, (count, *shape, 2), dtype=np.float32, finite=False),
             "floor": check_positive("floor", self.floor, "linear noise floor"),
             "range_db": check_range_db(self.range_db),
@@ -121,7 +120,7 @@ class SpectrumDataset:
             "line_of_sight": _check_flags("line_of_sight", self.line_of_sight, count),
             "attributes": _check_attributes(self.attributes),
         }
-        check_pixels(gain, fields["delay_s"], fields["aod"])
+        check_departures(fields["aod"])
         for name, value in fields.items():
             object.__setattr__(self, name, value)
 
@@ -170,7 +169,7 @@ class SpectrumDataset:
             UserWarning: naming receivers that get far more than line of sight would give; see
                 :data:`~warprrf.rf.spectra.levels.MARGIN_DB`.
         """
-        gain = check_array("path_gain", path_gain, (None, None, None), dtype=np.float32, finite=False)
+        gain = check_array("path_gain", path_gain, (None, None, None), np.float32, finite=False, least=0.0)
         if len(gain) == 0 or np.isnan(gain).all():
             raise ValueError("path_gain: got no spectra, expected one receiver's or more")
         places = check_array("receivers", receivers, (len(gain), 3))
@@ -178,10 +177,6 @@ class SpectrumDataset:
         if line_of_sight is None:
             frequency, beam = check_frequency(frequency_hz), check_positive("beam_sigma_rad", beam_sigma_rad)
             line_of_sight = _sees(places, source, gain, frequency, beam)
-        if (gain < 0).any():
-            raise ValueError(
-                f"path_gain: got {np.nanmin(gain)}, expected linear gains of at least 0 (of decibels, 10 ** (x / 10))"
-            )
         noise = default_floor(gain) if floor is None else check_positive("floor", floor, "linear noise floor")
         found = cls(
             receivers=receivers,

@@ -79,25 +79,18 @@ def check_range_db(range_db: Sequence[float]) -> tuple[float, float]:
     return low, high
 
 
-def check_pixels(path_gain: np.ndarray, delay_s: np.ndarray | None, aod: np.ndarray | None) -> None:
-    """Refuse what no pixel holds; NaN is an empty delay or direction.
+def check_departures(aod: np.ndarray) -> None:
+    """Refuse angles of departure ``(..., 2)`` that are none; NaN is an empty one.
 
     Raises:
-        ValueError: naming the array, for negative gains, negative or infinite delays, angles that are out of range.
+        ValueError: for angles that are out of range, or known in part.
     """
-    if (path_gain < 0).any():
-        bad = int((path_gain < 0).sum())
-        raise ValueError(f"path_gain: got {bad} negative values, expected linear path gain")
-    if delay_s is not None and not (np.isnan(delay_s) | (delay_s >= 0) & (delay_s < np.inf)).all():
-        raise ValueError("delay_s: got negative or infinite values, expected seconds, or NaN where empty")
-    angle_rounding = 1e-3  # radians by which angles of departure may lie out of range: by compact files
-    if aod is not None:
-        check_known_whole("aod", aod)
-        zenith, azimuth, most = aod[..., 0], aod[..., 1], np.pi + angle_rounding
-        if ((zenith < -angle_rounding) | (zenith > most) | (azimuth < -most) | (azimuth > most)).any():
-            raise ValueError(
-                "aod: got angles out of range, expected zeniths 0 to pi and azimuths -pi to pi, or NaN where empty"
-            )
+    check_known_whole("aod", aod)
+    zenith, azimuth, rounding = aod[..., 0], aod[..., 1], 1e-3  # by as much compact files are out of range
+    if ((zenith < -rounding) | (zenith > np.pi + rounding) | (np.abs(azimuth) > np.pi + rounding)).any():
+        raise ValueError(
+            "aod: got angles out of range, expected zeniths 0 to pi and azimuths -pi to pi, or NaN where empty"
+        )
 
 
 def check_whole(name: str, path_gain: ArrayLike) -> None:
@@ -276,10 +269,8 @@ def spread_paths(
     """
     shape = rows, columns = check_shape(shape)
     d = check_array("directions", directions, (None, 3))
-    power = check_array("powers", powers, (len(d),))
+    power = check_array("powers", powers, (len(d),), least=0.0)
     check_positive("sigma", sigma, "beam width in radians")
-    if (power < 0).any():
-        raise ValueError(f"powers: got {int((power < 0).sum())} negative path gains, expected linear power")
     positive = np.flatnonzero(power > 0)
     if len(positive) == 0:
         return SpreadPaths(np.zeros((rows, columns)), np.full((rows, columns), -1, dtype=np.int32))
@@ -495,9 +486,11 @@ class Spectrum:
         shape = check_array("path_gain", self.path_gain, (..., None, None)).shape
         for name, value in self._arrays().items():
             if value is not None:
-                check_array(name, value, (*shape, 2) if name == "aod" else shape, finite=False)
+                least = 0.0 if name != "aod" else None
+                check_array(name, value, (*shape, 2) if name == "aod" else shape, finite=False, least=least)
                 object.__setattr__(self, name, np.asarray(value))
-        check_pixels(self.path_gain, self.delay_s, self.aod)
+        if self.aod is not None:
+            check_departures(self.aod)
         check_number("floor", self.floor, least=0.0)
         if self.range_db is not None:
             check_range_db(self.range_db)

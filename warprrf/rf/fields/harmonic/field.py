@@ -310,11 +310,8 @@ class HarmonicField(RadioField):
 
     def _line_of_sight(self, receiver: np.ndarray, transmitter: np.ndarray) -> tuple[bool, float]:
         """Whether the mesh lets them see each other, and their Friis gain, less absorption."""
-        distance = float(np.linalg.norm(receiver - transmitter))
-        if distance == 0:
-            raise ValueError("receivers: got the transmitter's own position; expected them apart")
         visible = self.mesh is not None and self.mesh.visible(receiver, transmitter, device=self.device)[0]
-        return bool(visible), float(self._free_space(distance))
+        return bool(visible), float(self._free_space(float(np.linalg.norm(receiver - transmitter))))
 
     def _beam(self, receiver: np.ndarray, transmitter: np.ndarray) -> np.ndarray | None:
         """The explicit line of sight's beam on the grid, or None."""
