@@ -62,8 +62,6 @@ Error of the total diffuse power at 60 x 120 over 17 places in a furnished room,
 """
 FURTHER_SUB_PIXELS = 3
 """That for light over more than one surface."""
-THROUGH_MIRRORS = 3
-"""Of how many rays one looks for light by way of mirrors: a search for each."""
 SINGLE = replace(SETS["single"], residual=False)
 """Line of sight, one mirror, scattering once: what has no noise."""
 REVISION = 5
@@ -269,10 +267,10 @@ class ExactEngine:
             yield self._paths(rays, records, np.linalg.norm(out, axis=1), out, name, tracer)
 
     def _lit_by_mirrors(self, rays: _Beams) -> Iterator[DiffusePaths]:
-        """What images of the transmitter light there, and what they light through slabs, by one ray of
-        :data:`THROUGH_MIRRORS`."""
+        """What images of the transmitter light there, and what they light through slabs, by one ray of three: each takes a
+        search."""
         tracer, patches = self._coarse, self.mirrors.patches
-        every = min(THROUGH_MIRRORS, tracer.grid.per_pixel)
+        every = min(3, tracer.grid.per_pixel)
         ray = np.flatnonzero((rays.hits.face >= 0) & (rays.ray % every == every // 2))
         point, direction, face = rays.take(ray)
         row, patch, met = self.mirrors.images.candidates(point, 1)

@@ -19,7 +19,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from warprrf.checks import check_array, check_count, check_type, checked, one_line
+from warprrf.checks import check_array, check_chosen, check_count, check_type, checked, one_line
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 from warprrf.rf.spectra.spectrum import angles_from_directions, directions_from_angles
@@ -145,8 +145,7 @@ class PathArrays:
         """
         if not self.batched:
             raise TypeError("paths of one receiver cannot be indexed by receiver; expected paths of several")
-        if not -len(self.gain) <= receiver < len(self.gain):
-            raise ValueError(f"receiver: got {receiver}, expected one of {len(self.gain)}")
+        check_count("receiver", receiver, -len(self.gain), len(self.gain) - 1)
         point = None if self.receiver is None else self.receiver[receiver]
         source = self.transmitter
         if source is not None and source.ndim == 2:
@@ -180,19 +179,9 @@ class PathArrays:
             raise TypeError(
                 "paths of several receivers cannot be selected from at once; index a receiver first"
             )
-        index: Any = chosen
-        if not isinstance(chosen, slice):
-            index = np.asarray(chosen)
-            index = index if index.size else index.astype(int)
-        try:
-            found = np.arange(len(self.gain))[index]
-        except (IndexError, OverflowError) as error:
-            raise ValueError(
-                f"chosen: {error}; expected indices of {len(self.gain)} paths, or a mask"
-            ) from error
-        if found.ndim != 1:
-            raise ValueError(f"chosen: got shape {found.shape}, expected a list of paths")
-        return self._taken(index)
+        if isinstance(chosen, slice):
+            return self._taken(chosen)
+        return self._taken(check_chosen("chosen", chosen, len(self.gain)))
 
     def with_gas(self, gas: Gas = True) -> Self:
         """The same paths with the absorption of ``gas`` in their gains, in place of what was in them.

@@ -28,9 +28,6 @@ from warprrf.rf.paths.slabs import Walls
 from warprrf.rf.spectra.spectrum import transverse_basis
 from warprrf.rows import Rows
 
-LEAST_DB = -80.0
-"""Paths that are weaker than this, over an unobstructed straight path between the ends, are left out [dB]."""
-
 
 @dataclass(frozen=True)
 class EdgePaths(Rows):
@@ -202,9 +199,10 @@ class EdgeFinder:
         return found
 
     def _strong(self, direct: float, ways: _Ways) -> np.ndarray:
-        """Whether paths reach the level even if every face and mirror reflects all."""
+        """Whether paths reach -80 dB of an unobstructed straight path between the ends, even if every face and mirror reflects
+        all."""
         most = np.abs(boundary_fields(self._rays(ways))).sum(axis=0) * direct / ways.leg.sum(axis=1)
-        return np.asarray(20.0 * np.log10(np.maximum(most, 1e-300)) > LEAST_DB)
+        return np.asarray(20.0 * np.log10(np.maximum(most, 1e-300)) > -80.0)
 
     def _on_mirrors(self, ways: _Ways) -> np.ndarray:
         found = np.ones(len(ways.edge), bool)

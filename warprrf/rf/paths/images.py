@@ -124,7 +124,14 @@ class MirrorImages:
         Raises:
             ValueError: before anything is traced, if more than ``max_chains`` chains would be tried.
         """
-        ends = np.cumsum([0.0, *self._work(np.asarray(points, float).reshape(-1, 3), order)])
+        work, seconds = self._work(np.asarray(points, float).reshape(-1, 3), order)
+        if sum(work) > self.max_chains:
+            raise ValueError(
+                f"mirror_order: order {order} would try about {sum(work):.2g} chains of the mesh's {len(self.patches)} "
+                f"planar patches, some {seconds:.2g} seconds; expected at most {self.max_chains:.3g}: lower mirror_order, "
+                "simplify the mesh (fewer, larger planar patches), or give more max_chains to MirrorTracer"
+            )
+        ends = np.cumsum([0.0, *work])
 
         def tick(share: float) -> None:
             if progress is not None:
@@ -208,26 +215,12 @@ class MirrorImages:
 
     def affordable(self, points: np.ndarray, order: int) -> int:
         """The most reflections, up to ``order``, whose :meth:`search` is not refused."""
-        work, _ = self._estimated(np.asarray(points, float).reshape(-1, 3), order)
+        work, _ = self._work(np.asarray(points, float).reshape(-1, 3), order)
         return int((np.cumsum(work) <= self.max_chains).sum())
 
-    def _work(self, points: np.ndarray, order: int) -> list[float]:
-        """Number of chains that each search of 1, 2 ... ``order`` reflections tries: estimated if they are many.
-
-        Raises:
-            ValueError: if it is more than ``max_chains``.
-        """
-        work, seconds = self._estimated(points, order)
-        if sum(work) > self.max_chains:
-            raise ValueError(
-                f"mirror_order: order {order} would try about {sum(work):.2g} chains of the mesh's {len(self.patches)} "
-                f"planar patches, some {seconds:.2g} seconds; expected at most {self.max_chains:.3g}: lower mirror_order, "
-                "simplify the mesh (fewer, larger planar patches), or give more max_chains to MirrorTracer"
-            )
-        return work
-
-    def _estimated(self, points: np.ndarray, order: int) -> tuple[list[float], float]:
-        """What :meth:`_work` gives, and the seconds of what is estimated; nothing is refused."""
+    def _work(self, points: np.ndarray, order: int) -> tuple[list[float], float]:
+        """Number of chains that each search of 1, 2 ... ``order`` reflections tries, estimated if they are many, and the
+        seconds of what is estimated."""
         if len(points) == 0 or len(self.patches) == 0:
             return [0.0] * order, 0.0
         kept, rng, ends = self._keep(order), np.random.default_rng(0), _Ends(points, self.device)

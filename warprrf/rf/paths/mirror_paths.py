@@ -18,6 +18,7 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
@@ -27,8 +28,6 @@ from warprrf.rf.paths.images import MirrorImages
 from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.paths.slabs import Slabs, Walls
 from warprrf.rows import Rows
-
-LEAST_SHARE = 0.05  # paths that keep less of their field are dropped: -26 dB
 
 
 @dataclass(frozen=True)
@@ -194,7 +193,7 @@ def zone_paths(
         walls: What may be passed.
 
     Returns:
-        Rows by order. Those with less than :data:`LEAST_SHARE` of their field are left out.
+        Rows by order. Those with less than a twentieth of their field, -26 dB, are left out.
 
     Raises:
         ValueError: before anything is traced, if more chains would be tried than ``images`` allow.
@@ -410,16 +409,11 @@ def distinct(row: np.ndarray, point: np.ndarray, distance_m: float) -> np.ndarra
     """Indices of paths that no earlier one of the same receiver repeats, all points within ``distance_m``, sorted."""
     if point.shape[1] == 0 or len(row) < 2:
         return np.arange(len(row))
+    # Other receivers' points are further away than any of its own that count.
+    place = np.column_stack([3.0 * distance_m * row, point[:, 0]])
+    a, b = cKDTree(place).query_pairs(distance_m, output_type="ndarray").T
     same = np.zeros(len(row), bool)
-    key = np.lexsort((point[:, 0, 0], row))
-    for step in range(1, len(key)):
-        a, b = key[:-step], key[step:]
-        close = (row[a] == row[b]) & (np.abs(point[a, 0, 0] - point[b, 0, 0]) <= distance_m)
-        if not close.any():
-            break
-        a, b = a[close], b[close]
-        equal = (np.linalg.norm(point[a] - point[b], axis=2) <= distance_m).all(axis=1)
-        same[np.maximum(a, b)[equal]] = True
+    same[b[(np.linalg.norm(point[a] - point[b], axis=2) <= distance_m).all(axis=1)]] = True
     return np.flatnonzero(~same)
 
 
@@ -434,7 +428,7 @@ def described(
 ) -> MirrorPaths:
     """Rows of paths of one order (receiver, patch, point, share) over what ``slabs`` each leg passes, what they lack of all
     columns filled up."""
-    kept = np.flatnonzero(found[3] >= LEAST_SHARE)
+    kept = np.flatnonzero(found[3] >= 0.05)
     row, patch, point, share = (a[kept] for a in found)
     most = max(order, 1) + (walls.most if walls else 0)
     normal, slab = patches.normal[patch], np.full(patch.shape, -1, np.int32)

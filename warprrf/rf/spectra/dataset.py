@@ -472,9 +472,7 @@ class SpectrumDataset:
 
         Numbers in the header are text, because EXR headers hold 32-bit floats only.
         """
-        if not -len(self) <= index < len(self):
-            raise ValueError(f"index: got {index}, expected a receiver from 0 to {len(self) - 1}")
-        spectrum = self[index]
+        spectrum = self[check_count("index", index, -len(self), len(self) - 1)]
         dataset_files.export_exr(
             path, replace(spectrum, attributes={**spectrum.attributes, "polarisation": self.polarisation})
         )

@@ -197,7 +197,13 @@ class HarmonicField(RadioField):
             fitted_on=receivers.copy(),
             device=device,
         )
-        seen = blank._seen_from(receivers, transport, progress)
+        seen = blank._seen_from(receivers, progress) if transport is None else transport
+        rule = chosen.transmittance
+        if seen.shape != blank.shape or seen.rule != rule or not np.array_equal(seen.receivers, receivers):
+            raise ValueError(
+                f"transport: got weights of {len(seen.receivers)} receivers, shape {seen.shape}, rule {seen.rule!r}; "
+                f"expected those of exactly the {len(receivers)} receivers of ds, shape {blank.shape}, rule {rule!r}"
+            )
         ready = time.perf_counter()
         trained = _train(blank, ds, images, seen, checkpoint=chosen.checkpoint, progress=progress)
         report = {
@@ -231,40 +237,15 @@ class HarmonicField(RadioField):
             )
         return ends
 
-    def spectrum(
-        self,
-        receivers: ArrayLike,
-        transmitter: ArrayLike | None = None,
-        *,
-        shape: tuple[int, int] | None = None,
-        transport: Transport | None = None,
-    ) -> Spectrum:
-        """The spatial spectrum of every receiver; see :meth:`RadioField.spectrum`.
-
-        Gaussians that no ray of the fitted grid met learned nothing: on a finer one they are guesses.
-
-        Args:
-            receivers, transmitter, shape: as there.
-            transport: blending weights of exactly this receiver, on this grid, if they were computed before.
-
-        Raises:
-            ValueError: as for :meth:`check_positions`; or another transmitter with ``rf3dgs``, whose delays and gains
-                hold only for the one it was fitted for.
-        """
-        field = self.on_grid(shape)
-        return field._looked(
-            receivers, transmitter, lambda at, source: field._view_from(at, source, transport).spectrum
-        )
-
     def _trace_spectrum(self, receiver: np.ndarray, transmitter: np.ndarray) -> Spectrum:
-        return self._view_from(receiver, transmitter, None).spectrum
+        return self._view_from(receiver, transmitter).spectrum
 
     def _trace_paths(self, receiver: np.ndarray, transmitter: np.ndarray, max_paths: int | None) -> Paths:
         """At least one diffuse path is kept to carry what is below the floor. With ``line_of_sight="explicit"`` the ``los``
         path carries Friis gain; without, the power of the pixels within 3 beam sigmas of the transmitter's direction,
         merged. Direction and delay of ``los`` are exact; a diffuse path arrives from its pixel's centre."""
         found = paths_of(
-            self._view_from(receiver, transmitter, None),
+            self._view_from(receiver, transmitter),
             beam_sigma_rad=self.beam_sigma_rad,
             frequency_hz=self.frequency_hz,
             max_paths=max_paths,
@@ -329,22 +310,12 @@ class HarmonicField(RadioField):
             gain = (SPEED_OF_LIGHT / self.frequency_hz / (4 * np.pi * length_m)) ** 2
         return gain if self.air is None else gain * self.air.transmittance(self.frequency_hz, length_m)
 
-    def _seen_from(
-        self, receivers: np.ndarray, seen: Transport | None, progress: Progress | None
-    ) -> Transport:
-        """Blending weights of ``receivers`` (R, 3): ``seen`` if given, once it is sure that they are theirs."""
-        rule = self.options.transmittance
-        if seen is None:
-            return transport(
-                self.gaussians, receivers, self.shape, range_db=self.range_db, rule=rule, top_k=self.options.top_k,
-                device=self.device, progress=progress,
-            )  # fmt: skip
-        if seen.shape != self.shape or seen.rule != rule or not np.array_equal(seen.receivers, receivers):
-            raise ValueError(
-                f"transport: got weights of {len(seen.receivers)} receivers, shape {seen.shape}, rule {seen.rule!r}; "
-                f"expected those of exactly the {len(receivers)} receivers asked for, shape {self.shape}, rule {rule!r}"
-            )
-        return seen
+    def _seen_from(self, receivers: np.ndarray, progress: Progress | None) -> Transport:
+        """Blending weights of ``receivers`` (R, 3)."""
+        return transport(
+            self.gaussians, receivers, self.shape, range_db=self.range_db, rule=self.options.transmittance,
+            top_k=self.options.top_k, device=self.device, progress=progress,
+        )  # fmt: skip
 
     def _blend(self, name: str, seen: Transport) -> np.ndarray:
         """The blended layer ``name`` of one receiver, shape ``(H, W)`` float64."""
@@ -364,9 +335,9 @@ class HarmonicField(RadioField):
         _device.launch(kernels.predict, len(out), inputs, device=device)
         return out.numpy().reshape(self.shape).astype(np.float64)
 
-    def _view_from(self, receiver: np.ndarray, source: np.ndarray, seen: Transport | None) -> View:
+    def _view_from(self, receiver: np.ndarray, source: np.ndarray) -> View:
         """Spectrum at one receiver and what it was made of."""
-        seen = self._seen_from(receiver[None], seen, None)
+        seen = self._seen_from(receiver[None], None)
         visible, friis = self._line_of_sight(receiver, source)
         lengths = self._lengths(seen, source)
         power = self._factor(lengths)[0] * self.gain_unit * self._blend("gain", seen)
