@@ -39,6 +39,7 @@ from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.slabs import Slabs
 from warprrf.rf.paths.trace import MirrorTracer
 from warprrf.rf.scene import Scene
+from warprrf.rf.spectra.dataset import Received
 from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
     angles_from_directions,
@@ -66,23 +67,6 @@ SINGLE = replace(SETS["single"], residual=False)
 """Line of sight, one mirror, scattering once: what has no noise."""
 REVISION = 5
 """Raised whenever the engine's numbers change: finished receivers of another revision are not used."""
-
-
-@dataclass(frozen=True)
-class ReceivedPaths:
-    """What one receiver gets, as pixels.
-
-    Attributes:
-        path_gain: Path gain per pixel [linear], shape ``(H, W)``, float64.
-        delay_s: Delay of the pixel's strongest path [s], shape ``(H, W)``; NaN where empty.
-        aod: Its zenith and azimuth of departure [rad], shape ``(H, W, 2)``; NaN where empty.
-        line_of_sight: Whether the transmitter is seen.
-    """
-
-    path_gain: np.ndarray
-    delay_s: np.ndarray
-    aod: np.ndarray
-    line_of_sight: bool
 
 
 @dataclass(frozen=True)
@@ -216,7 +200,7 @@ class ExactEngine:
                     break
                 rays = self._scattered_on(rays, depth)
 
-    def receive(self, receiver: ArrayLike) -> ReceivedPaths:
+    def receive(self, receiver: ArrayLike) -> Received:
         """The spectrum of one receiver (3,)."""
         point = check_array("receiver", receiver, (3,))
         specular = together(self.mirrors.trace(point, self.effects.mirrors).with_gas(self.air))
@@ -229,7 +213,7 @@ class ExactEngine:
         )  # fmt: skip
         departure = np.column_stack([specular.theta_t, specular.phi_t])
         aod = np.column_stack(angles_from_directions(scattered.departure))
-        return ReceivedPaths(
+        return Received(
             path_gain=spread.path_gain,
             delay_s=spread.of_strongest(np.concatenate([specular.tau, scattered.length_m / SPEED_OF_LIGHT])),
             aod=spread.of_strongest(np.concatenate([departure, aod])),

@@ -27,7 +27,7 @@ from warprrf.geometry.mesh import as_mesh
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.fresnel import surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
-from warprrf.rf.exact import REVISION, SINGLE, SUB_PIXELS, ExactEngine, ReceivedPaths
+from warprrf.rf.exact import REVISION, SINGLE, SUB_PIXELS, ExactEngine
 from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
 from warprrf.rf.positions import (
     check_positions,
@@ -37,7 +37,7 @@ from warprrf.rf.positions import (
     warn_of_unmodelled,
 )
 from warprrf.rf.scene import Scene
-from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.dataset import Received, SpectrumDataset
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, DEFAULT_SHAPE, check_beam, check_shape
 from warprrf.rf.tracing.model import Effects
 from warprrf.steps import Steps, digest
@@ -131,7 +131,7 @@ def simulate(
         named = {f"effects_{name}": int(value) for name, value in asdict(effects).items()}
         settings = {"sub_pixels": SUB_PIXELS} | named
     inputs = digest(engine, common, air, surfaces, solver)
-    results: dict[int, Any] = {}  # ReceivedPaths
+    results: dict[int, Any] = {}
     if workspace is not None:
         known = {k: _kept(workspace, inputs, point) for k, point in enumerate(points)}
         results = {k: held for k, held in known.items() if held is not None}
@@ -143,8 +143,6 @@ def simulate(
         k = missing[at]
         results[k] = found if workspace is None else _kept(workspace, inputs, points[k], found)
         tell("simulate", len(results), len(points))
-    names = ("path_gain", "delay_s", "aod", "line_of_sight")
-    columns: Any = {n: np.stack([getattr(results[k], n) for k in range(len(points))]) for n in names}
     return SpectrumDataset.from_spectra(
         receivers=points,
         transmitter=source,
@@ -157,7 +155,7 @@ def simulate(
         attributes=settings
         | ({} if air is None else air.attributes)
         | {f"version_{name}": value for name, value in _versions(engine).items()},
-        **columns,
+        **Received.columns([results[k] for k in range(len(points))]),
     )
 
 
@@ -239,7 +237,7 @@ class _Receiver:
     device: DeviceLike
     _running: Cache = field(default_factory=lambda: Cache(1))
 
-    def __call__(self, point: np.ndarray) -> ReceivedPaths:
+    def __call__(self, point: np.ndarray) -> Received:
         how, common = self.how, {**self.common, "gas": self.air, "device": self.device}
         if isinstance(how, Effects):
             ours = partial(ExactEngine, self.scene, **common, effects=how, seed=self.seed)
@@ -253,10 +251,10 @@ class _Receiver:
 
 
 def _kept(
-    workspace: str | os.PathLike[str], inputs: str, point: np.ndarray, found: ReceivedPaths | None = None
-) -> ReceivedPaths | None:
+    workspace: str | os.PathLike[str], inputs: str, point: np.ndarray, found: Received | None = None
+) -> Received | None:
     """What is on file for ``point``: what an earlier run left there, else what was ``found``."""
     make: Any = None if found is None else partial(vars, found)
     with Steps(workspace, shared=True) as steps:
         held: Any = steps.arrays(digest(inputs, point)[:24], make, version=REVISION, inputs=[inputs, point])
-    return ReceivedPaths(**held) if held else None
+    return Received(**held) if held else None

@@ -247,5 +247,11 @@ def _pattern_gain(pattern: str | Pattern, local: np.ndarray) -> np.ndarray:
     return 10.0 ** (0.1 * (8.0 - np.minimum(-(vertical + horizontal), 30.0)))
 
 
+def check_unpolarised(name: str, array: PlanarArray, why: str) -> None:
+    """Raise ValueError, naming the argument, for an array with a polarisation; ``why`` there may be none."""
+    if array.polarisation is not None:
+        raise ValueError(f"{name}: got polarisation {array.polarisation!r}, expected None: {why}")
+
+
 ISOTROPIC = PlanarArray(1, 1)
 """One isotropic element without polarisation."""

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_count, check_positive, checked, one_line
-from warprrf.rf.channel.arrays import ISOTROPIC, PlanarArray
+from warprrf.rf.channel.arrays import ISOTROPIC, PlanarArray, check_unpolarised
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.waves import carrier_phase
 from warprrf.rf.spectra.spectrum import Spectrum, directions_from_angles, pixel_directions, unit_vectors
@@ -144,7 +144,7 @@ def dft_codebook(array: PlanarArray, oversampling: int = 1) -> Codebook:
     Raises:
         ValueError: for a polarised array, or oversampling below 1.
     """
-    _unpolarised("array", array)
+    check_unpolarised("array", array, "powers choose beams")
     times = check_count("oversampling", oversampling)
     return Codebook(array, (_dft(array.cols, times), _dft(array.rows, times)))
 
@@ -167,7 +167,7 @@ def steering_codebook(
     Raises:
         ValueError: naming the argument; for a polarised array.
     """
-    _unpolarised("array", array)
+    check_unpolarised("array", array, "powers choose beams")
     if (directions is None) == (points is None):
         raise ValueError("directions: expected either directions or points, and got both or neither")
     name, given = ("directions", directions) if points is None else ("points", points)
@@ -432,16 +432,9 @@ def codebook_of(name: str, value: Ends) -> Codebook:
     if value is None:
         return Codebook(ISOTROPIC, (np.ones((1, 1), dtype=complex),))
     if isinstance(value, PlanarArray):
-        _unpolarised(name, value)
+        check_unpolarised(name, value, "powers choose beams")
         return dft_codebook(value)
     return value
-
-
-def _unpolarised(name: str, array: PlanarArray) -> None:
-    if array.polarisation is not None:
-        raise ValueError(
-            f"{name}: got polarisation {array.polarisation!r}, expected None: powers choose beams"
-        )
 
 
 def squared(values: np.ndarray) -> np.ndarray:

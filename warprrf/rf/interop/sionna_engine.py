@@ -11,7 +11,6 @@ import os
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
@@ -20,11 +19,11 @@ from warprrf.device import DeviceLike
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.waves import check_frequency
-from warprrf.rf.exact import ReceivedPaths
 from warprrf.rf.paths.sionna import by_delay
 from warprrf.rf.scene import Scene
 from warprrf.rf.scene_sionna import select_variant, sionna_rt
-from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape, spread_paths
+from warprrf.rf.spectra.dataset import Received
+from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape
 
 
 @checked
@@ -154,14 +153,6 @@ class SionnaEngine:
             drjit.flush_kernel_cache()
         return found.with_gas(self.air)
 
-    def receive(self, receiver: ArrayLike) -> ReceivedPaths:
+    def receive(self, receiver: ArrayLike) -> Received:
         """The spectrum of one receiver (3,)."""
-        found = self.solve(receiver)
-        beam = self.shape, self.beam_sigma_rad
-        spread = spread_paths(found.arrival, found.power, *beam, device=self.device)
-        return ReceivedPaths(
-            path_gain=spread.path_gain,
-            delay_s=spread.of_strongest(found.tau),
-            aod=spread.of_strongest(np.column_stack([found.theta_t, found.phi_t])),
-            line_of_sight=bool((found.kind == "los").any()),
-        )
+        return Received.of(self.solve(receiver), self.shape, self.beam_sigma_rad, self.device)

@@ -60,8 +60,10 @@ class LinkOptions:
     Attributes:
         beam_sigma_rad: width of the receiver's beam, kappa = 1 / sigma^2: array gain 2 / sigma^2, that of a planar
             array of 2 / (pi sigma^2) elements half a wavelength apart (522 at 2 degrees).
-        shape: rows and columns of the grid that rays fill; None for the model's default.
-        mirror_order: most reflections on a mirror path, 0 to 3; None for the field's own.
+        shape: rows and columns of the grid that rays fill; 20 x 40 by default, the field's own for other models than
+            ``bistatic``.
+        mirror_order: most reflections on a mirror path of a ``bistatic`` field, 0 to 3, if fewer than it was fitted with: chains
+            of three mirrors take most of the time and carry little.
         client: a ``dask.distributed.Client`` whose workers compute; this process by default.
         progress: called as ``progress("links", done, total)``.
     """

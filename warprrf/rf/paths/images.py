@@ -208,7 +208,7 @@ class MirrorImages:
         """All chains of 0, 1 ... reflections, up to ``order`` or as far as they are few; found once."""
         kept = self._kept
         while len(kept) <= order and len(kept[-1]) * len(self.patches) <= MOST_KEPT:
-            blocks = [block for block, _ in self._extended(kept[-1], np.zeros(3), -1.0, BLOCK)]
+            blocks = [block for block, _ in self._extended(kept[-1], np.zeros(3), -1.0)]
             kept = [*kept, Chains.joined([Chains.none(len(kept)), *blocks])]
         self._kept = kept
         return kept
@@ -230,7 +230,7 @@ class MirrorImages:
             sample = sample.take(np.sort(rng.permutation(len(sample))[:_SAMPLE]))
             each = many / max(len(sample), 1)
             begin = time.perf_counter()
-            last = sum(len(block) for block, _ in self._extended(sample, ends.middle, ends.radius, BLOCK))
+            last = sum(len(block) for block, _ in self._extended(sample, ends.middle, ends.radius))
             work.append(shorter + each * last)
             seconds += each * (time.perf_counter() - begin)
             if k < order:  # later searches go on from all of them
@@ -243,7 +243,7 @@ class MirrorImages:
     def _some_longer(self, chains: Chains, rng: np.random.Generator) -> tuple[Chains, int]:
         """About ``_SAMPLE`` of the chains of one reflection more that follow ``chains``, and how many these are."""
         parts = []
-        for block, _ in self._extended(chains, np.zeros(3), -1.0, BLOCK):
+        for block, _ in self._extended(chains, np.zeros(3), -1.0):
             parts.append((block.take(rng.permutation(len(block))[:_SAMPLE]), len(block)))
         whole = sum(size for _, size in parts)
         share = min(1.0, _SAMPLE / max(whole, 1))
@@ -259,15 +259,13 @@ class MirrorImages:
                 yield chains.take(slice(k, k + BLOCK)), min((k + BLOCK) / len(chains), 1.0)
             return
         before = 0.0
-        for block, share in self._extended(chains, middle, reach if steps == 1 else -1.0, BLOCK):
+        for block, share in self._extended(chains, middle, reach if steps == 1 else -1.0):
             for some, within in self._descendants(block, steps - 1, middle, reach):
                 yield some, before + within * (share - before)
             before = share
 
-    def _extended(
-        self, chains: Chains, middle: np.ndarray, reach: float, most: int
-    ) -> Iterator[tuple[Chains, float]]:
-        """Chains of one reflection more, about ``most`` at a time, and the share of ``chains`` that is done."""
+    def _extended(self, chains: Chains, middle: np.ndarray, reach: float) -> Iterator[tuple[Chains, float]]:
+        """Chains of one reflection more, about :data:`BLOCK` at a time, and the share of ``chains`` that is done."""
         last = chains.patch[:, -1] if chains.patch.shape[1] else np.full(len(chains), -1)
         size = 16_384  # of a launch: a second or so in a city, after which the caller is told
         for first in range(0, len(chains), size):
@@ -276,7 +274,7 @@ class MirrorImages:
             ends, done = np.cumsum(count, dtype=np.int64), 0
             while done < len(count):
                 before = ends[done - 1] if done else 0
-                stop = max(done + 1, int(np.searchsorted(ends, before + most, side="right")))
+                stop = max(done + 1, int(np.searchsorted(ends, before + BLOCK, side="right")))
                 some = slice(first + done, first + stop)
                 parents = chains.take(some)
                 _, parent, patch, image, axis, sine = self._extend(

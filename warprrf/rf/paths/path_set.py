@@ -29,7 +29,6 @@ from warprrf.checks import (
 from warprrf.netcdf_files import Variable
 from warprrf.rf.channel import dispersion as dispersions
 from warprrf.rf.channel import response
-from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.path_arrays import PADDING, PathArrays
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.paths import sionna
@@ -54,16 +53,7 @@ class Paths(PathArrays):
     diffuse_power = response.diffuse_power
     dispersion = dispersions.dispersion
 
-    def to_sionna(
-        self,
-        tx_array: PlanarArray | None = None,
-        rx_array: PlanarArray | None = None,
-        *,
-        diffuse: str | None = None,
-        seed: int = 0,
-    ) -> sionna.SionnaPaths:
-        """Arrays in the shapes and conventions of Sionna RT; see :func:`warprrf.rf.paths.sionna.to_sionna`."""
-        return sionna.to_sionna(self, tx_array, rx_array, diffuse=diffuse, seed=seed)
+    to_sionna = sionna.to_sionna
 
     @classmethod
     def from_sionna(

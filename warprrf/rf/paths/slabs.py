@@ -20,7 +20,6 @@ from warprrf.rows import Rows
 
 THICKEST_M = 1.0
 """Thicker solids are taken to be hollow, a cabinet's or a room's: two sheets."""
-THIN_M = 0.01  # that a solid is perhaps only as thick as
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,8 @@ class Walls:
     ) -> Walls:
         """Those of which slabs of ``permittivity`` (F,) and ``thickness_m`` (F,), if they are sheets, let more than a
         millionth of the power through."""
-        thickness = np.where(mesh.closed_part_of >= 0, np.minimum(thickness_m, THIN_M), thickness_m)
+        # A solid is perhaps only a centimetre thick.
+        thickness = np.where(mesh.closed_part_of >= 0, np.minimum(thickness_m, 0.01), thickness_m)
         te = slab_transmission(1.0, permittivity, thickness, wavelength_m)[0]
         return cls(mesh, np.abs(te) ** 2 > 1e-6, most, clearance_m, device)
 

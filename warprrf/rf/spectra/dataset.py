@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -58,6 +58,38 @@ class PathsLike(Protocol):
         """The paths of one receiver after another."""
 
 
+@dataclass(frozen=True)
+class Received:
+    """What one receiver gets, as pixels.
+
+    Attributes:
+        path_gain: Path gain per pixel [linear], shape ``(H, W)``, float64.
+        delay_s: Delay of the pixel's strongest path [s], shape ``(H, W)``; NaN where empty.
+        aod: Its zenith and azimuth of departure [rad], shape ``(H, W, 2)``; NaN where empty.
+        line_of_sight: Whether the transmitter is seen.
+    """
+
+    path_gain: np.ndarray
+    delay_s: np.ndarray
+    aod: np.ndarray
+    line_of_sight: bool
+
+    @classmethod
+    def of(
+        cls, paths: PathsLike, shape: tuple[int, int], beam_sigma_rad: float, device: DeviceLike = None
+    ) -> Received:
+        """Paths of one receiver, spread by its beam."""
+        spread = spread_paths(paths.arrival, paths.power, shape, beam_sigma_rad, device=device)
+        aod = spread.of_strongest(np.column_stack([paths.theta_t, paths.phi_t]))
+        line_of_sight = bool((paths.kind == "los").any())
+        return cls(spread.path_gain, spread.of_strongest(paths.tau), aod, line_of_sight)
+
+    @staticmethod
+    def columns(found: Sequence[Received]) -> dict[str, Any]:
+        """Those of several receivers, stacked by name."""
+        return {f.name: np.stack([getattr(one, f.name) for one in found]) for f in fields(Received)}
+
+
 @checked
 @dataclass(frozen=True, repr=False)
 class SpectrumDataset:
@@ -105,7 +137,7 @@ class SpectrumDataset:
         spectra = (count, None, None)
         gain = check_array("path_gain", self.path_gain, spectra, np.float32, finite=False, least=0.0)
         shape = check_shape(gain.shape[1:])
-        fields: dict[str, Any] = {
+        values: dict[str, Any] = {
             "receivers": receivers,
             "transmitter": check_array("transmitter", self.transmitter, (3,)),
             "frequency_hz": check_frequency(self.frequency_hz),
@@ -120,8 +152,8 @@ class SpectrumDataset:
             "line_of_sight": _check_flags("line_of_sight", self.line_of_sight, count),
             "attributes": _check_attributes(self.attributes),
         }
-        check_departures(fields["aod"])
-        for name, value in fields.items():
+        check_departures(values["aod"])
+        for name, value in values.items():
             object.__setattr__(self, name, value)
 
     def __repr__(self) -> str:
@@ -235,18 +267,13 @@ class SpectrumDataset:
             )
         if np.ndim(paths.transmitter) != 1:
             raise ValueError("paths: got ones of several transmitters, expected those of one")
-        several = list(paths.each())
         grid = check_shape(shape)
-        spread = [spread_paths(p.arrival, p.power, grid, beam_sigma_rad, device=device) for p in several]
-        aod = [np.column_stack([p.theta_t, p.phi_t]) for p in several]
+        found = [Received.of(p, grid, beam_sigma_rad, device) for p in paths.each()]
         return cls.from_spectra(
             receivers=np.atleast_2d(paths.receiver),
             transmitter=paths.transmitter,
             frequency_hz=paths.frequency_hz,
-            path_gain=np.stack([s.path_gain for s in spread]),
-            delay_s=np.stack([s.of_strongest(p.tau) for s, p in zip(spread, several, strict=True)]),
-            aod=np.stack([s.of_strongest(angles) for s, angles in zip(spread, aod, strict=True)]),
-            line_of_sight=np.array([(p.kind == "los").any() for p in several]),
+            **Received.columns(found),
             beam_sigma_rad=beam_sigma_rad,
             engine="paths",
             seed=seed,

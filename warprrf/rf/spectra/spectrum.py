@@ -112,14 +112,6 @@ def pixel_directions(shape: tuple[int, int]) -> np.ndarray:
     return directions_from_angles(zenith[:, None], azimuth[None, :])
 
 
-@lru_cache(maxsize=8)
-def _pixel_list(shape: tuple[int, int]) -> np.ndarray:
-    """:func:`pixel_directions` as rows, not to be written to."""
-    pixels = pixel_directions(shape).reshape(-1, 3)
-    pixels.setflags(write=False)
-    return pixels
-
-
 def pixel_solid_angles(shape: tuple[int, int]) -> np.ndarray:
     """Solid angle of one pixel of each row [sr], shape ``(H,)``; exact, so that all pixels sum to 4 pi."""
     rows, columns = check_shape(shape)
@@ -359,7 +351,7 @@ def unit_beams(directions: np.ndarray, shape: tuple[int, int], sigma: float) -> 
     """
     rows, columns = check_shape(shape)
     out = np.zeros((len(directions), rows * columns), np.float32)
-    pixels = _pixel_list((rows, columns))
+    pixels = pixel_directions(shape).reshape(-1, 3)
     solid_angle = np.repeat(pixel_solid_angles(shape), columns)
     limit = 4.0 * np.sin(0.5 * _cutoff(shape, sigma)) ** 2 * (1.0 + 1e-12)
     for k, d in enumerate(directions):

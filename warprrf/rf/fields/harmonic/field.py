@@ -55,7 +55,7 @@ from warprrf.rf.fields.harmonic.fitting import (
     targets,
 )
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining, list_responses
-from warprrf.rf.fields.harmonic.options import FieldOptions, Rates
+from warprrf.rf.fields.harmonic.options import CHANNEL_RATES, GAIN_RATES, FieldOptions
 from warprrf.rf.fields.harmonic.paths import View, near_line_of_sight, paths_of
 from warprrf.rf.fields.harmonic.problem import Problem, harmonics
 from warprrf.rf.fields.harmonic.transport import (
@@ -73,7 +73,6 @@ from warprrf.steps import digest
 
 LAYERS = {"rf3dgs+": ("gain",), "rf3dgs": ("gain", "delay", "aod_x", "aod_y", "aod_z")}
 """Layers that each model may have."""
-CHANNEL_RATES = Rates(constant=0.1, directional=0.05, ridge=0.02, ridge_directional=0.1)
 
 
 @checked
@@ -262,7 +261,6 @@ class HarmonicField(RadioField):
 
     @classmethod
     def _put_together(cls, tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict[str, Any]:
-        options = dict(header["options"])
         layers = {n.removeprefix("layer/"): t for n, t in tensors.items() if n.startswith("layer/")}
         if "gain" not in layers:
             raise ValueError("it has no layer of gain")
@@ -271,7 +269,7 @@ class HarmonicField(RadioField):
             "mesh": Mesh(tensors["mesh/vertices"], tensors["mesh/faces"])
             if "mesh/faces" in tensors
             else None,
-            "options": FieldOptions(**options | {"rates": Rates(**options.get("rates", {}))}),
+            "options": FieldOptions(**header["options"]),
             "layers": layers,
             "gain_unit": header["gain_unit"],
             "delay_unit": header["delay_unit"],
@@ -434,7 +432,7 @@ def _train(
             logits = None if state is None else state.opacity
             opacity = OpacityTraining(problem, listed, gaussians.opacities, logits)
         states[name] = state = fit_layer(
-            problem, target, steps=steps[name], rates=options.rates if is_gain else CHANNEL_RATES,
+            problem, target, steps=steps[name], rates=GAIN_RATES if is_gain else CHANNEL_RATES,
             degree=options.sh_degree, opacity=opacity, state=state, each=partial(each, name),
         )  # fmt: skip
         before += steps[name]

@@ -25,7 +25,7 @@ from warprrf.kernels.adam import build_adam, corrections
 from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.kernels.raster.sh import COEFFICIENTS as DEGREE_TO_COUNT
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining
-from warprrf.rf.fields.harmonic.options import FieldOptions, Rates
+from warprrf.rf.fields.harmonic.options import GAIN_RATES, FieldOptions, Rates
 from warprrf.rf.fields.harmonic.problem import Problem
 from warprrf.rf.fields.harmonic.transport import Transport
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -224,7 +224,7 @@ def fit_layer(
     target: Target,
     *,
     steps: int,
-    rates: Rates | None = None,
+    rates: Rates = GAIN_RATES,
     degree: int = 3,
     opacity: OpacityTraining | None = None,
     state: State | None = None,
@@ -245,7 +245,6 @@ def fit_layer(
     Returns:
         Final state; coefficients of the Gaussians ``problem.seen``, shape ``(G, 16)``.
     """
-    rates = rates or Rates()
     p, k = problem, problem.kernels
     active = np.arange(_kernels.COEFFICIENTS) < DEGREE_TO_COUNT[degree]
     rate = np.where(active, rates.directional, 0.0)
