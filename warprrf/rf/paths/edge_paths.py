@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -97,15 +96,11 @@ class EdgePaths(Rows):
         near = self.detour_m < self.wavelength_m
         share = share * np.where(near & (left < 1.0), left, 1.0)
 
-        def filled(value: float, dtype: Any, *shape: int) -> np.ndarray:
-            return np.full((len(self), count, *shape), value, dtype)
-
-        point, code = filled(np.nan, float, 3), filled(0, np.int8)
-        point[:, :2], code[:, :2] = self.point, self.code
+        none, zero = np.full(self.code.shape, -1, np.int32), np.zeros(self.code.shape)
         edges = MirrorPaths(
-            self.receiver, filled(-1, np.int32), filled(-1, np.int32), point, share, self.length_m, self.excess_m, self.arrival,
-            filled(np.nan, float, 3), filled(0.0, float), filled(0.0, float), filled(np.nan, float), code,
-        )  # fmt: skip
+            self.receiver, none, none, self.point, share, self.length_m, self.excess_m, self.arrival,
+            np.full_like(self.point, np.nan), zero, zero, np.full_like(zero, np.nan), self.code,
+        ).of_width(count)  # fmt: skip
         return MirrorPaths.joined([found, edges.subset(np.flatnonzero(share > 0))])
 
 

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from warprrf import device as _device
 from warprrf.checks import (
     check_array,
+    check_count,
     check_known_whole,
     check_number,
     check_positive,
@@ -48,11 +49,11 @@ def check_shape(shape: Sequence[int]) -> tuple[int, int]:
         ValueError: otherwise.
     """
     try:
-        rows, columns = (int(n) for n in shape)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"shape: got {shape!r}, expected (rows, columns) such as (90, 180)") from error
-    if rows < 2 or columns < 2 or (rows, columns) != tuple(shape):
-        raise ValueError(f"shape: got {shape!r}, expected two whole numbers of at least 2, such as (90, 180)")
+        rows, columns = (check_count("shape", n, 2) for n in shape)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"shape: got {shape!r}, expected two whole numbers of at least 2, such as (90, 180)"
+        ) from error
     if rows * columns > 1 << 24:
         raise ValueError(f"shape: got {rows} x {columns} pixels, expected at most {1 << 24} in all")
     return rows, columns
