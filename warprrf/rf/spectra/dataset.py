@@ -76,9 +76,9 @@ class Received:
 
     @classmethod
     def of(
-        cls, paths: PathsLike, shape: tuple[int, int], beam_sigma_rad: float, device: DeviceLike = None
+        cls, paths: Any, shape: tuple[int, int], beam_sigma_rad: float, device: DeviceLike = None
     ) -> Received:
-        """Paths of one receiver, spread by its beam."""
+        """:class:`PathsLike` of one receiver, spread by its beam."""
         spread = spread_paths(paths.arrival, paths.power, shape, beam_sigma_rad, device=device)
         aod = spread.of_strongest(np.column_stack([paths.theta_t, paths.phi_t]))
         line_of_sight = bool((paths.kind == "los").any())
