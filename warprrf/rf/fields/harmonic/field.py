@@ -141,6 +141,7 @@ class HarmonicField(RadioField):
         ds: SpectrumDataset,
         model: str = "rf3dgs+",
         *,
+        options: FieldOptions | None = None,
         transport: Transport | None = None,
         device: DeviceLike = None,
         progress: Progress | None = None,
@@ -153,11 +154,12 @@ class HarmonicField(RadioField):
                 discs first.
             ds: training set.
             model: ``"rf3dgs+"`` or ``"rf3dgs"``.
+            options: what the field computes and how it is fitted.
             transport: blending weights of ``ds.receivers``, if they were computed before.
             device: where to compute.
             progress: called with the stages ``"transport"`` and ``"fit"``.
-            settings: attributes of :class:`~warprrf.rf.fields.harmonic.options.FieldOptions`: ``gain="linear"``,
-                ``iterations=600``, ``seed=1``, ...
+            settings: attributes of :class:`~warprrf.rf.fields.harmonic.options.FieldOptions`, in place of those of
+                ``options``: ``gain="linear"``, ``iterations=600``, ``seed=1``, ...
 
         Raises:
             TypeError: if ``geometry`` has no Gaussians and is no mesh, or for an unknown option.
@@ -169,7 +171,7 @@ class HarmonicField(RadioField):
                 f"ds: got {type(ds).__name__}, expected a SpectrumDataset: model {model!r} is fitted to whole spectra; "
                 'a model="bistatic" takes readings and arrays too'
             )
-        chosen = with_settings(FieldOptions(), {**settings, "model": model})
+        chosen = with_settings(options or FieldOptions(), {**settings, "model": model})
         started = time.perf_counter()
         gaussians, mesh = _geometry(geometry)
         receivers, transmitter = check_dataset(mesh, ds, device=device)
