@@ -135,7 +135,7 @@ class Geometry:
 
     def __init__(self, room: Path, xml: Path, device: Any = None) -> None:
         self.room, self.xml, self.device = room, xml, device
-        self._weights: dict[str, tuple[str, Transport, float]] = {}
+        self._weights: tuple[str, Transport, float] | None = None
 
     @cached_property
     def reconstruction(self) -> wr.Reconstruction:
@@ -156,14 +156,12 @@ class Geometry:
         """Digest of what is known of the room."""
         return digest(self.room) if self.room.is_dir() else digest(self.reconstruction.mesh.triangles)
 
-    def weights(
-        self, ds: SpectrumDataset, *, slot: str = "train", progress: Progress | None = None
-    ) -> tuple[Transport, float]:
-        """Blending weights of the receivers of ``ds`` and the seconds that they took; one set is kept per slot, which also
-        serves some of its receivers."""
+    def weights(self, ds: SpectrumDataset, progress: Progress | None = None) -> tuple[Transport, float]:
+        """Blending weights of the receivers of ``ds`` and the seconds that they took; one set is kept, which also serves some
+        of its receivers."""
         # Cutoffs follow from the range, so two truths share weights only if the range is the same.
         key = digest(list(ds.range_db), list(ds.shape))
-        kept = self._weights.get(slot)
+        kept = self._weights
         if kept is not None and kept[0] == key:
             order = {tuple(place): k for k, place in enumerate(kept[1].receivers)}
             rows = [order.get(tuple(place), -1) for place in ds.receivers]
@@ -171,7 +169,7 @@ class Geometry:
                 return kept[1:]
             if min(rows) >= 0:
                 return kept[1].subset(rows), kept[2] * len(rows) / len(order)
-        self._weights.pop(slot, None)  # hundreds of receivers fill gigabytes: not two sets at once
+        self._weights = None  # hundreds of receivers fill gigabytes: not two sets at once
         start = time.perf_counter()
         seen = transport(
             self.reconstruction.gaussians,
@@ -181,8 +179,8 @@ class Geometry:
             device=self.device,
             progress=progress,
         )
-        self._weights[slot] = key, seen, time.perf_counter() - start
-        return self._weights[slot][1:]
+        self._weights = key, seen, time.perf_counter() - start
+        return self._weights[1:]
 
 
 def checked(name: str, value: int, least: int) -> int:

@@ -68,7 +68,6 @@ class Task:
         geometry: what is known of the room.
         scratch: folder for files that a method needs meanwhile.
         progress: called with ``"transport"``, ``"fit"`` and ``"evaluate"``.
-        slot: where the geometry keeps what the test receivers see.
         variant: which of the method's variants.
         seed: of every random choice.
         effort: how long.
@@ -81,7 +80,6 @@ class Task:
     geometry: Geometry
     scratch: Path
     progress: Progress
-    slot: str = "test"
     variant: str = ""
     seed: int = 0
     effort: Effort = Effort()
@@ -97,7 +95,6 @@ class Fitted:
         predict: from a receiver position (3,) [m] to a :class:`Spectrum`.
         transport_s: seconds that tracing the training receivers took; None where nothing is traced.
         fit_s: seconds that learning took; None where nothing is learned.
-        before_s: seconds that each prediction took beforehand, for all test receivers together.
         field: what can be saved (anything with ``.save(path)``), or None.
         size_bytes: what a prediction needs, where there is nothing to save.
     """
@@ -105,7 +102,6 @@ class Fitted:
     predict: Callable[[Any], Spectrum] = field(repr=False)
     transport_s: float | None = None
     fit_s: float | None = None
-    before_s: float = 0.0
     field: Any = None
     size_bytes: int | None = None
 
@@ -148,7 +144,6 @@ def score(method: str, task: Task, keep: Path | None = None) -> tuple[Fitted, Ro
         write_atomically(keep, fitted.field.save)
     row: Row = {"transport_s": fitted.transport_s, "fit_s": fitted.fit_s}
     row |= metrics.evaluate(task.test, fitted.predict, progress=task.progress)
-    row["seconds_per_spectrum"] += fitted.before_s
     return fitted, row
 
 
@@ -166,28 +161,17 @@ def _bistatic(task: Task, quick: bool = False) -> Fitted:
 def _harmonic(task: Task, model: str, **options: Any) -> Fitted:
     """RF-3DGS+ or RF-3DGS on the reconstruction.
 
-    Blending weights of the test receivers are computed beforehand for all variants; the time of a spectrum from nothing
-    includes them. Where opacity was trained they are the field's own, computed as it is asked.
+    Blending weights of the training receivers are kept for all variants.
     """
     place, progress = task.geometry, task.progress
     if task.effort.harmonic_iterations is not None:
         options["iterations"] = task.effort.harmonic_iterations
-    weights, seconds = place.weights(task.train, progress=progress)
+    weights, seconds = place.weights(task.train, progress)
     learned: Any = wr.RadioField.fit(
         place.reconstruction, task.train, model=model, transport=weights, gain=task.variant, seed=task.seed,
         device=place.device, progress=progress, **options,
     )  # fmt: skip
-    fitted = Fitted(learned.spectrum, transport_s=seconds, fit_s=learned.report["fit_time_s"], field=learned)
-    if learned.report["train_opacity"]:
-        return fitted
-    seen, seconds = place.weights(task.test, slot=task.slot, progress=progress)
-    return replace(
-        fitted,
-        predict=lambda rx: learned.spectrum(
-            rx, transport=seen.subset((seen.receivers == rx).all(axis=1).nonzero()[0])
-        ),
-        before_s=seconds / len(task.test),
-    )
+    return Fitted(learned.spectrum, transport_s=seconds, fit_s=learned.report["fit_time_s"], field=learned)
 
 
 def _lookup(task: Task, name: str) -> Fitted:

@@ -108,7 +108,7 @@ def called(call):
     return [inspect.signature(f.__get__(0) if inspect.isfunction(f) else f) for f in own if callable(f)]
 
 
-OPTIONS = [FitOptions, FieldOptions, MapOptions, Setting, ResponseOptions, wr.Readings]
+OPTIONS = [FitOptions, FieldOptions, MapOptions, Setting, ResponseOptions, wr.Readings, wr.Material]
 """What ``**options`` are."""
 SOURCES = [ROOT / "README.md", *PAGES, *(ROOT / "notebooks").glob("*.py"), *(ROOT / "warprrf").rglob("*.py")]
 

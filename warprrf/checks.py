@@ -26,6 +26,7 @@ def check_array(
     shape: tuple[int | EllipsisType | None, ...] | None = None,
     dtype: DTypeLike = np.float64,
     finite: bool = True,
+    least: float | None = None,
 ) -> np.ndarray:
     """``value`` (NumPy, Warp, torch or nested lists) as a contiguous NumPy array of ``shape`` and ``dtype``.
 
@@ -34,6 +35,7 @@ def check_array(
             altogether skips the check.
         dtype: of whole numbers: what is not whole, or too large for it, is refused.
         finite: refuse NaN and infinities.
+        least: refuse smaller numbers, and infinities; not NaN.
 
     Raises:
         TypeError: if it cannot be read as numbers of that kind.
@@ -71,6 +73,9 @@ def check_array(
         if bad.any():
             number, kinds = int(np.count_nonzero(bad)), "NaN, infinite or " if finite else ""
             raise ValueError(f"{name}: got {number} values that are {kinds}above {most:g}, expected finite")
+    if least is not None and (bad := (array < least) | (array == np.inf)).any():
+        linear = " (powers and gains are linear: of decibels, 10 ** (x / 10))" if least == 0 else ""
+        raise ValueError(f"{name}: got {array[bad][0]:g}, expected numbers of at least {least:g}{linear}")
     return array
 
 

@@ -214,7 +214,7 @@ class _GradientEngine(SionnaEngine):
         self._scene.add(self._rt.Receiver("rx", position=receiver.tolist()))
         try:
             paths = self._solver(
-                self._scene, max_depth=self.sampling.depth, max_num_paths_per_src=self._path_cap,
+                self._scene, max_depth=self.sampling.depth, max_num_paths_per_src=self._most,
                 samples_per_src=self.sampling.samples, synthetic_array=True, los=True, specular_reflection=True,
                 diffuse_reflection=True, refraction=self.sampling.refraction, seed=seed,
             )  # fmt: skip

@@ -304,7 +304,7 @@ class Lobby:
         """Figures of a method on ``count`` spectra; a field is left in its file."""
         train, test = self.split(truth, count)
         task = Task(
-            train, test, self.place, attempt.folder, attempt.progress, slot=truth, variant=COMPARED[method],
+            train, test, self.place, attempt.folder, attempt.progress, variant=COMPARED[method],
             seed=self.job.seed, effort=Effort(harmonic_iterations=self.sizes.steps),
         )  # fmt: skip
         name = field_name(method, count, truth, max(self.sizes.counts))

@@ -10,10 +10,12 @@ from small_room import small_room
 
 import warprrf as wr
 from benchmarks.baselines.sionna_calibration import Calibration, calibrate_sionna
+from warprrf.rf.interop import sionna_engine
 from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
+from warprrf.rf.paths.sionna import by_delay
 
 
-def test_calibration_lowers_the_error_and_finds_what_scatters(tmp_path):
+def test_calibration_lowers_the_error_and_finds_what_scatters(tmp_path, monkeypatch):
     folder = small_room(tmp_path)
     train = wr.SpectrumDataset.load(folder / "spectra.nc").split(4)[0]
     true = wr.Scene.load(folder / "scene.xml")
@@ -31,12 +33,12 @@ def test_calibration_lowers_the_error_and_finds_what_scatters(tmp_path):
     drjit = pytest.importorskip("drjit")
     recorded = []
 
-    class Engine(SionnaEngine):
-        def _read(self, paths):
-            recorded.append(any(drjit.grad_enabled(part) for part in paths.a))
-            return super()._read(paths)
+    def watched(paths, *rest):
+        recorded.append(any(drjit.grad_enabled(part) for part in paths.a))
+        return by_delay(paths, *rest)
 
-    Engine(
+    monkeypatch.setattr(sionna_engine, "by_delay", watched)
+    SionnaEngine(
         found.scene, transmitter=train.transmitter, frequency_hz=train.frequency_hz, shape=train.shape,
         sampling=Sampling(depth=1, samples=20_000), device="cpu",
     ).solve(train.receivers[0])  # fmt: skip

@@ -8,11 +8,12 @@ edge between coplanar faces, in a room's corner, or where a partition stands on 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
 from warprrf.geometry.mesh import Mesh, components, vectors_across
+from warprrf.rows import Rows
 
 LEAST_BEND_RAD = np.radians(1.0)
 """Faces that are bent less make no edge."""
@@ -23,7 +24,7 @@ _SIDE = np.array([0.5377, 0.6391, 0.5498])  # edges point to its side: no plane 
 
 
 @dataclass(frozen=True)
-class Edges:
+class Edges(Rows):
     """E edges of a mesh.
 
     Attributes:
@@ -45,10 +46,6 @@ class Edges:
 
     def __len__(self) -> int:
         return len(self.length)
-
-    def take(self, rows: np.ndarray) -> Edges:
-        """The edges ``rows``."""
-        return Edges(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     @property
     def outward(self) -> np.ndarray:

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_seed
+from warprrf.checks import check_array, check_count, check_seed
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
 from warprrf.kernels.radio.records import MIRROR, SCATTER, SLAB
@@ -39,6 +39,7 @@ from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.slabs import Slabs
 from warprrf.rf.paths.trace import MirrorTracer
 from warprrf.rf.scene import Scene
+from warprrf.rf.spectra.dataset import Received
 from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
     angles_from_directions,
@@ -47,11 +48,12 @@ from warprrf.rf.spectra.spectrum import (
     spread_paths,
     sub_pixel_directions,
 )
-from warprrf.rf.tracing.model import Effects
+from warprrf.rf.tracing.model import SETS, Effects
 from warprrf.rf.tracing.rays import Hits, RayGrid
 from warprrf.rf.tracing.records import Interactions, Records, SlabMaterials
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import Rays, Tracer
+from warprrf.rows import Rows
 
 SUB_PIXELS = 8
 """Default square root of the directions per pixel.
@@ -61,44 +63,14 @@ Error of the total diffuse power at 60 x 120 over 17 places in a furnished room,
 """
 FURTHER_SUB_PIXELS = 3
 """That for light over more than one surface."""
-THROUGH_MIRRORS = 3
-"""Of how many rays one looks for light by way of mirrors: a search for each."""
-QUADRATURE = 1.125
-"""Wavelengths of detour up to which a path over an edge and the straight one are added field by field: there they are in
-quadrature, so that nothing jumps."""
-SINGLE = Effects(
-    mirrors=1,
-    scatterings=1,
-    mirror_scatter=False,
-    scatter_mirror=False,
-    transmissions=0,
-    diffractions=0,
-    residual=False,
-)
+SINGLE = replace(SETS["single"], residual=False)
 """Line of sight, one mirror, scattering once: what has no noise."""
 REVISION = 5
 """Raised whenever the engine's numbers change: finished receivers of another revision are not used."""
 
 
 @dataclass(frozen=True)
-class ReceivedPaths:
-    """What one receiver gets, as pixels.
-
-    Attributes:
-        path_gain: Path gain per pixel [linear], shape ``(H, W)``, float64.
-        delay_s: Delay of the pixel's strongest path [s], shape ``(H, W)``; NaN where empty.
-        aod: Its zenith and azimuth of departure [rad], shape ``(H, W, 2)``; NaN where empty.
-        line_of_sight: Whether the transmitter is seen.
-    """
-
-    path_gain: np.ndarray
-    delay_s: np.ndarray
-    aod: np.ndarray
-    line_of_sight: bool
-
-
-@dataclass(frozen=True)
-class DiffusePaths:
+class DiffusePaths(Rows):
     """Paths of one receiver that scatter, in rows.
 
     Attributes:
@@ -116,10 +88,6 @@ class DiffusePaths:
     departure: np.ndarray
     beams: np.ndarray
     sequence: str
-
-
-_ARRAYS = {"direction": (3,), "power": (), "length_m": (), "departure": (3,), "beams": (2,)}
-_NO_PATHS = {name: np.zeros((0, *size)) for name, size in _ARRAYS.items()}
 
 
 @dataclass(frozen=True)
@@ -168,9 +136,8 @@ class ExactEngine:
         gas: Gas = False,
         device: DeviceLike = None,
     ) -> None:
-        if sub_pixels < 1:
-            raise ValueError(f"sub_pixels: got {sub_pixels!r}, expected at least 1")
-        self.shape, self.beam_sigma_rad, self.sub_pixels = check_shape(shape), beam_sigma_rad, sub_pixels
+        check_count("sub_pixels", sub_pixels)
+        self.shape, self.beam_sigma_rad = check_shape(shape), beam_sigma_rad
         self.effects, self.seed, self.air = effects, check_seed(seed), air_of(gas)
         self.mirrors = MirrorTracer(
             scene, transmitter=transmitter, frequency_hz=frequency_hz, transmissions=effects.transmissions,
@@ -189,36 +156,32 @@ class ExactEngine:
             table, self.mirrors.wavelength_m, np.arange(len(table.scattering)), device
         )
         loss = 0.0 if self.air is None else self.air.loss_per_m(self.mirrors.frequency_hz)
-        self._tracers = {
-            n: Tracer(
-                self.surface, self.mirrors.transmitter, self.mirrors.frequency_hz,
-                RayGrid(self.surface, self.shape, n, loss_per_m=loss, dtype=np.float64, device=device),
-                walls=self.mirrors.walls,
-            )
-            for n in {sub_pixels, min(sub_pixels, FURTHER_SUB_PIXELS)}
-        }  # fmt: skip
+
+        def tracer(n: int) -> Tracer:
+            grid = RayGrid(self.surface, self.shape, n, loss_per_m=loss, dtype=np.float64, device=device)
+            source, frequency = self.mirrors.transmitter, self.mirrors.frequency_hz
+            return Tracer(self.surface, source, frequency, grid, walls=self.mirrors.walls)
+
+        self._fine = tracer(sub_pixels)
+        self._coarse = tracer(FURTHER_SUB_PIXELS) if sub_pixels > FURTHER_SUB_PIXELS else self._fine
 
     def diffuse(self, receiver: np.ndarray) -> DiffusePaths:
         """Paths of one receiver (3,) that scatter, one sequence after another."""
+        empty = np.zeros((0, 3))
+        none = DiffusePaths(empty, empty[:, 0], empty[:, 0], empty, empty[:, :2], "")
         every = list(self.sequences(receiver))
-        joined = (
-            {n: np.concatenate([getattr(paths, n) for paths in every]) for n in _ARRAYS}
-            if every
-            else _NO_PATHS
-        )
-        return DiffusePaths(**joined, sequence=", ".join(paths.sequence for paths in every))
+        names = ", ".join(paths.sequence for paths in every)
+        return replace(DiffusePaths.joined([none, *every]), sequence=names)
 
     def sequences(self, receiver: np.ndarray) -> Iterator[DiffusePaths]:
         """Paths of one receiver (3,) that scatter, by sequence."""
         e = self.effects
         if not e.scatterings:
             return
-        sizes = self.sub_pixels, min(self.sub_pixels, FURTHER_SUB_PIXELS)
-        fine, coarse = (self._first(n, receiver) for n in sizes)
-        for rays in self._and_behind(fine, self.sub_pixels):
-            yield from self._lit(rays, self.sub_pixels)
+        for rays in self._and_behind(self._first(self._fine, receiver), self._fine):
+            yield from self._lit(rays, self._fine)
         starts: list[_Beams] = []
-        for rays in self._and_behind(coarse, FURTHER_SUB_PIXELS):
+        for rays in self._and_behind(self._first(self._coarse, receiver), self._coarse):
             if e.mirror_scatter:
                 yield from self._lit_by_mirrors(rays)
             if e.scatterings > 1:
@@ -228,8 +191,8 @@ class ExactEngine:
         for rays in starts:
             depth = rays.sequence.count("S")
             while True:
-                for own in self._and_behind(rays, FURTHER_SUB_PIXELS):
-                    yield from self._lit(own, FURTHER_SUB_PIXELS)
+                for own in self._and_behind(rays, self._coarse):
+                    yield from self._lit(own, self._coarse)
                     if e.mirror_scatter:
                         yield from self._lit_by_mirrors(own)
                 depth += 1
@@ -237,7 +200,7 @@ class ExactEngine:
                     break
                 rays = self._scattered_on(rays, depth)
 
-    def receive(self, receiver: ArrayLike) -> ReceivedPaths:
+    def receive(self, receiver: ArrayLike) -> Received:
         """The spectrum of one receiver (3,)."""
         point = check_array("receiver", receiver, (3,))
         specular = together(self.mirrors.trace(point, self.effects.mirrors).with_gas(self.air))
@@ -250,24 +213,23 @@ class ExactEngine:
         )  # fmt: skip
         departure = np.column_stack([specular.theta_t, specular.phi_t])
         aod = np.column_stack(angles_from_directions(scattered.departure))
-        return ReceivedPaths(
+        return Received(
             path_gain=spread.path_gain,
             delay_s=spread.of_strongest(np.concatenate([specular.tau, scattered.length_m / SPEED_OF_LIGHT])),
             aod=spread.of_strongest(np.concatenate([departure, aod])),
             line_of_sight=bool((specular.kind == "los").any()),
         )
 
-    def _first(self, sub_pixels: int, receiver: np.ndarray) -> _Beams:
+    def _first(self, tracer: Tracer, receiver: np.ndarray) -> _Beams:
         """Rays that fill the sphere around a receiver."""
-        hits = self._tracers[sub_pixels].grid.hit(receiver)
+        hits = tracer.grid.hit(receiver)
         return _Beams(hits, np.arange(len(hits.face)), np.zeros(len(hits.face)), "")
 
-    def _and_behind(self, rays: _Beams, sub_pixels: int) -> Iterator[_Beams]:
+    def _and_behind(self, rays: _Beams, tracer: Tracer) -> Iterator[_Beams]:
         """``rays``, and what those of them that pass slabs meet behind."""
         yield rays
         if self.mirrors.walls is None or not self.effects.scatter_mirror:
             return
-        tracer = self._tracers[min(sub_pixels, self.sub_pixels)]
         behind = tracer.behind(Rays(rays.hits, np.arange(len(rays.ray))), self.effects.transmissions)
         hits, after = behind.hits, behind.after
         if after is not None and len(behind.ray):
@@ -277,9 +239,8 @@ class ExactEngine:
             length = rays.length_m[behind.ray]
             yield _Beams(replace(hits, solid_angle=passed), rays.ray[behind.ray], length, "T" + rays.sequence)
 
-    def _lit(self, rays: _Beams, sub_pixels: int) -> Iterator[DiffusePaths]:
+    def _lit(self, rays: _Beams, tracer: Tracer) -> Iterator[DiffusePaths]:
         """What the transmitter lights where rays hit, and what it lights through slabs."""
-        tracer = self._tracers[min(sub_pixels, self.sub_pixels)]
         seen = Rays(rays.hits, np.arange(len(rays.ray)))
         light = tracer.light(seen)
         lit = {"S": tracer.lit(seen, light)}
@@ -290,10 +251,10 @@ class ExactEngine:
             yield self._paths(rays, records, np.linalg.norm(out, axis=1), out, name, tracer)
 
     def _lit_by_mirrors(self, rays: _Beams) -> Iterator[DiffusePaths]:
-        """What images of the transmitter light there, and what they light through slabs, by one ray of
-        :data:`THROUGH_MIRRORS`."""
-        tracer, patches = self._tracers[min(FURTHER_SUB_PIXELS, self.sub_pixels)], self.mirrors.patches
-        every = min(THROUGH_MIRRORS, tracer.grid.per_pixel)
+        """What images of the transmitter light there, and what they light through slabs, by one ray of three: each takes a
+        search."""
+        tracer, patches = self._coarse, self.mirrors.patches
+        every = min(3, tracer.grid.per_pixel)
         ray = np.flatnonzero((rays.hits.face >= 0) & (rays.ray % every == every // 2))
         point, direction, face = rays.take(ray)
         row, patch, met = self.mirrors.images.candidates(point, 1)
@@ -334,16 +295,12 @@ class ExactEngine:
         row, ray = records.ray, rays.ray[records.ray]
         length = rays.length_m[row] + rays.hits.range_m[row] + legs
         beams = _lattice_beams(tracer.grid.sub_pixels, self.shape, self.beam_sigma_rad, str(self.device))[ray]
-        power = records.powers(self.materials)
-        return DiffusePaths(
-            tracer.grid.directions[ray], power, length, departure, beams, name + rays.sequence
-        )
+        power, direction = records.powers(self.materials), tracer.grid.directions[ray]
+        return DiffusePaths(direction, power, length, departure, beams, name + rays.sequence)
 
     def _turned(self, rays: _Beams) -> _Beams:
         """Rays turned at the mirrors that they hit."""
-        ray = np.flatnonzero(
-            (rays.hits.face >= 0) & (self.surface.patch.take(rays.hits.face, mode="wrap") >= 0)
-        )
+        ray = np.flatnonzero((rays.hits.face >= 0) & (self.surface.patch[rays.hits.face] >= 0))
         point, direction, face = rays.take(ray)
         normal = self._toward(face, direction)
         cosine = -(direction * normal).sum(axis=1)
@@ -352,15 +309,8 @@ class ExactEngine:
             np.array([[MIRROR]], np.int32),
         )
         onward = direction + 2.0 * cosine[:, None] * normal
-        return self._on(
-            rays,
-            ray,
-            point,
-            normal,
-            onward,
-            Records(self._left(rays, ray), ray, mirror.index, mirror.angle, kind),
-            "M",
-        )
+        records = Records(self._left(rays, ray), ray, mirror.index, mirror.angle, kind)
+        return self._on(rays, ray, point, normal, onward, records, "M")
 
     def _scattered_on(self, rays: _Beams, depth: int) -> _Beams:
         """Rays scattered where they hit, one direction each, drawn by the cosine."""
@@ -370,16 +320,15 @@ class ExactEngine:
         u, v = np.random.default_rng([self.seed, depth, len(rays.sequence)]).random((2, len(ray)))
         a, b = vectors_across(normal)
         radius, turn, up = np.sqrt(u), 2.0 * np.pi * v, np.sqrt(1.0 - u)
-        onward = (
-            (radius * np.cos(turn))[:, None] * a + (radius * np.sin(turn))[:, None] * b + up[:, None] * normal
-        )
+        along = np.stack([radius * np.cos(turn), radius * np.sin(turn), up], axis=1)
+        onward = np.einsum("nk,knc->nc", along, np.stack([a, b, normal]))
         cos_out = np.clip(-(direction * normal).sum(axis=1), 0.0, 1.0)
         cos_mirror = np.clip(2.0 * up * cos_out + (onward * direction).sum(axis=1), -1.0, 1.0)
         angle = np.column_stack([up, cos_out, cos_mirror])[:, None]
         records = Records(
             np.pi * self._left(rays, ray), ray, self.surface.group[face][:, None], angle,
             np.array([[SCATTER]], np.int32),
-            half_width=self._tracers[min(FURTHER_SUB_PIXELS, self.sub_pixels)].grid.half_width,
+            half_width=self._coarse.grid.half_width,
         )  # fmt: skip
         return self._on(rays, ray, point, normal, onward, records, "S")
 
@@ -387,18 +336,16 @@ class ExactEngine:
         self, rays: _Beams, ray: np.ndarray, point: np.ndarray, normal: np.ndarray, onward: np.ndarray, weighed: Records, name: str
     ) -> _Beams:  # fmt: skip
         """Rays that go on from where the rows ``ray`` hit, with the power of ``weighed`` in the place of solid angles."""
-        grid = self._tracers[min(FURTHER_SUB_PIXELS, self.sub_pixels)].grid
-        hits = grid.hit_along(point + ENDPOINT_CLEARANCE * normal, onward, weighed.powers(self.materials))
+        hits = self._coarse.grid.hit_along(
+            point + ENDPOINT_CLEARANCE * normal, onward, weighed.powers(self.materials)
+        )
         length = rays.length_m[ray] + rays.hits.range_m[ray]
         return _Beams(hits, rays.ray[ray], length, name + rays.sequence)
 
     def _left(self, rays: _Beams, ray: np.ndarray) -> np.ndarray:
         """Solid angles, less what the air absorbs up to where the rays hit, shape ``(N,)``."""
-        grid = self._tracers[min(FURTHER_SUB_PIXELS, self.sub_pixels)].grid
-        left = rays.hits.solid_angle[ray % len(rays.hits.solid_angle)] * grid.transmittance(
-            rays.hits.range_m[ray]
-        )
-        return np.asarray(left)
+        angle = rays.hits.solid_angle[ray % len(rays.hits.solid_angle)]
+        return np.asarray(angle * self._coarse.grid.transmittance(rays.hits.range_m[ray]))
 
     def _toward(self, face: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Normals of faces on the side that a ray of ``direction`` (N, 3) meets."""
@@ -413,9 +360,10 @@ def together(paths: Paths) -> Paths:
         return paths
     jones, gain, kept = paths.jones.copy(), paths.gain.copy(), np.full(len(paths.gain), True)
     mirrors = (paths.interactions == MIRROR).sum(axis=1)
+    quadrature = 1.125  # wavelengths of detour at which the two are, so that nothing jumps
     for k in np.flatnonzero(paths.kind == "edge"):
         near = (paths.kind != "edge") & (mirrors == mirrors[k]) & (paths.kind != "slab")
-        near &= np.abs(paths.length_m - paths.length_m[k]) < QUADRATURE * SPEED_OF_LIGHT / paths.frequency_hz
+        near &= np.abs(paths.length_m - paths.length_m[k]) < quadrature * SPEED_OF_LIGHT / paths.frequency_hz
         if near.any():
             parent = np.flatnonzero(near)[np.argmax(paths.arrival[near] @ paths.arrival[k])]
             jones[parent] += paths.jones[k]

@@ -7,7 +7,7 @@ Sionna RT, and from arrays.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from pathlib import Path
 from typing import Any, TypeVar
@@ -54,7 +54,6 @@ class Scene:
         transmitters: Mapping[str, ArrayLike] | None = None,
         receivers: Mapping[str, ArrayLike] | None = None,
     ) -> None:
-        check_type("mesh", mesh, Mesh)
         faces = len(mesh.faces)
         if face_object is None:
             face_object = np.zeros(faces, dtype=np.int32)
@@ -220,7 +219,7 @@ class Scene:
     @property
     def bounds(self) -> np.ndarray:
         """Lower and upper corner of the mesh [m], shape ``(2, 3)``."""
-        return np.stack([self.mesh.vertices.min(axis=0), self.mesh.vertices.max(axis=0)])
+        return self.mesh.bounds
 
     def is_free(
         self, points: ArrayLike, *, clearance_m: float = 0.0, device: DeviceLike = None
@@ -237,22 +236,15 @@ class Scene:
 
 def _positions(name: str, values: Mapping[str, ArrayLike] | None) -> dict[str, np.ndarray]:
     """Positions by name [m], each ``(3,)``."""
-    if values is None:
-        return {}
-    if not isinstance(values, Mapping):
-        raise TypeError(f"{name}: got {type(values).__name__}, expected a mapping of names to positions")
     found = {}
-    for key, position in values.items():
+    for key, position in (values or {}).items():
         check_type(f"{name}: the name {key!r}", key, str)
         found[key] = check_array(f"{name}[{key!r}]", position, (3,))
     return found
 
 
-def _named_list(name: str, values: Iterable[T], kind: type[T]) -> list[T]:
+def _named_list(name: str, values: Sequence[T], kind: type[T]) -> list[T]:
     """``values`` as a list whose items are all of ``kind``."""
-    if isinstance(values, str) or not isinstance(values, Iterable):
-        raise TypeError(f"{name}: got {values!r:.60}, expected a list of {kind.__name__}")
-    found = list(values)
-    for k, value in enumerate(found):
+    for k, value in enumerate(values):
         check_type(f"{name}[{k}]", value, kind)
-    return found
+    return list(values)

@@ -66,10 +66,6 @@ class MaterialChoice:
             self._wanted = set(given)
             self._given = dict(given)
         elif given is not None:
-            if not isinstance(given, str | os.PathLike):
-                raise TypeError(
-                    f"materials: got {type(given).__name__}, expected a mapping of names to materials, or a table's file"
-                )
             self._given = load_materials(given)
         self._extrapolate = extrapolate
         self._chosen: dict[str, Material] = {}

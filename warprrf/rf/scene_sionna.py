@@ -28,14 +28,8 @@ from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.scene_parts import MaterialChoice, ScenePart
 
 _FOLDERS = (
-    "/usr/lib/x86_64-linux-gnu",
-    "/usr/lib/aarch64-linux-gnu",
-    "/usr/lib64",
-    "/usr/lib",
-    "/usr/local/lib",
-    "/usr/lib/llvm-*/lib",
-    "/opt/homebrew/opt/llvm*/lib",
-)
+    "/usr/lib/*-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/local/lib", "/usr/lib/llvm-*/lib", "/opt/homebrew/opt/llvm*/lib",
+)  # fmt: skip
 
 Positions = dict[str, np.ndarray]
 

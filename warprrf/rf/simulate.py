@@ -19,7 +19,6 @@ from warprrf.checks import (
     check_count,
     check_number,
     check_seed,
-    check_type,
     checked,
 )
 from warprrf.cluster import each
@@ -28,7 +27,7 @@ from warprrf.geometry.mesh import as_mesh
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.fresnel import surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
-from warprrf.rf.exact import REVISION, SINGLE, SUB_PIXELS, ExactEngine, ReceivedPaths
+from warprrf.rf.exact import REVISION, SINGLE, SUB_PIXELS, ExactEngine
 from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
 from warprrf.rf.positions import (
     check_positions,
@@ -38,12 +37,10 @@ from warprrf.rf.positions import (
     warn_of_unmodelled,
 )
 from warprrf.rf.scene import Scene
-from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.dataset import Received, SpectrumDataset
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, DEFAULT_SHAPE, check_beam, check_shape
 from warprrf.rf.tracing.model import Effects
 from warprrf.steps import Steps, digest
-
-ENGINES = ("exact", "sionna")
 
 
 @checked
@@ -107,8 +104,7 @@ def simulate(
     """
     if not hasattr(scene, "materials"):
         raise TypeError(f"scene: got {type(scene).__name__}, expected a Scene (a mesh and its materials)")
-    check_choice("engine", engine, ENGINES)
-    check_type("effects", effects, Effects)
+    check_choice("engine", engine, ("exact", "sionna"))
     sampling = Sampling(depth=depth, samples=samples, refraction=refraction, seed=seed)
     points = np.atleast_2d(check_receivers("receivers", receivers))
     source = check_array("transmitter", transmitter, (3,))
@@ -129,28 +125,24 @@ def simulate(
     common |= {"shape": check_shape(shape), "beam_sigma_rad": check_beam(beam_sigma_rad)}
     surfaces = (scene.mesh.vertices, scene.mesh.faces, scene.face_material, *vars(table).values())
     solver: Any = sampling, _versions(engine, solver_only=True)
-    if engine == "exact":
+    settings = {"depth": depth, "samples": samples, "refraction": int(refraction)}
+    if exact:
         solver = asdict(effects), seed if effects.scatterings > 1 else 0
+        named = {f"effects_{name}": int(value) for name, value in asdict(effects).items()}
+        settings = {"sub_pixels": SUB_PIXELS} | named
     inputs = digest(engine, common, air, surfaces, solver)
-    results: dict[int, Any] = {}  # ReceivedPaths
+    results: dict[int, Any] = {}
     if workspace is not None:
         known = {k: _kept(workspace, inputs, point) for k, point in enumerate(points)}
         results = {k: held for k, held in known.items() if held is not None}
     tell = progress or (lambda *_: None)
     tell("simulate", len(results), len(points))
     missing = [k for k in range(len(points)) if k not in results]
-    receiver = _Receiver(scene, common, effects if engine == "exact" else sampling, seed, air, device)
+    receiver = _Receiver(scene, common, effects if exact else sampling, seed, air, device)
     for at, found in each(receiver, [points[k] for k in missing], client):
         k = missing[at]
         results[k] = found if workspace is None else _kept(workspace, inputs, points[k], found)
         tell("simulate", len(results), len(points))
-    names = ("path_gain", "delay_s", "aod", "line_of_sight")
-    columns: Any = {n: np.stack([getattr(results[k], n) for k in range(len(points))]) for n in names}
-    settings = {"depth": depth, "samples": samples, "refraction": int(refraction)}
-    if engine == "exact":
-        settings = {"sub_pixels": SUB_PIXELS} | {
-            f"effects_{name}": int(value) for name, value in asdict(effects).items()
-        }
     return SpectrumDataset.from_spectra(
         receivers=points,
         transmitter=source,
@@ -163,7 +155,7 @@ def simulate(
         attributes=settings
         | ({} if air is None else air.attributes)
         | {f"version_{name}": value for name, value in _versions(engine).items()},
-        **columns,
+        **Received.columns([results[k] for k in range(len(points))]),
     )
 
 
@@ -245,7 +237,7 @@ class _Receiver:
     device: DeviceLike
     _running: Cache = field(default_factory=lambda: Cache(1))
 
-    def __call__(self, point: np.ndarray) -> ReceivedPaths:
+    def __call__(self, point: np.ndarray) -> Received:
         how, common = self.how, {**self.common, "gas": self.air, "device": self.device}
         if isinstance(how, Effects):
             ours = partial(ExactEngine, self.scene, **common, effects=how, seed=self.seed)
@@ -259,10 +251,10 @@ class _Receiver:
 
 
 def _kept(
-    workspace: str | os.PathLike[str], inputs: str, point: np.ndarray, found: ReceivedPaths | None = None
-) -> ReceivedPaths | None:
+    workspace: str | os.PathLike[str], inputs: str, point: np.ndarray, found: Received | None = None
+) -> Received | None:
     """What is on file for ``point``: what an earlier run left there, else what was ``found``."""
     make: Any = None if found is None else partial(vars, found)
     with Steps(workspace, shared=True) as steps:
         held: Any = steps.arrays(digest(inputs, point)[:24], make, version=REVISION, inputs=[inputs, point])
-    return ReceivedPaths(**held) if held else None
+    return Received(**held) if held else None

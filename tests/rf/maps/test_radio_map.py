@@ -188,7 +188,7 @@ def test_pictures_show_every_quantity(found, tmp_path):
     [
         ({"cell": 1e-4}, "makes 2000000000 cells"),
         ({"cell": 0.2, "bounds": [2.3, 1.7, 2.9, 2.3]}, "bounds: no cell of the"),
-        ({"mirror_order": 4}, "mirror_order: got 4, expected 0 to 3"),
+        ({"mirror_order": 4}, "mirror_order: got 4, expected one of None, 0, 1, 2, 3"),
     ],
 )
 def test_bad_input_is_named(whole, change, message):

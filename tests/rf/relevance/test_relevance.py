@@ -12,7 +12,7 @@ from warprrf.rf.em.materials import Material, roughness_scattering
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.relevance.model import full_field, material_parameters, with_lobes
-from warprrf.rf.relevance.search import Relevance, relevance, relevances
+from warprrf.rf.relevance.search import Relevance, choose, full_model, relevance
 from warprrf.rf.tracing.model import SETS, Effects
 
 RECEIVERS = RECEIVERS[:4]
@@ -32,6 +32,12 @@ def metal(roughness_m):
     )
 
 
+def at_each(tolerances_db, geometry):
+    """What is kept within each tolerance."""
+    found = full_model(geometry, RECEIVERS, progress=lambda *_: None, **OPTIONS)
+    return [choose(*found, tolerance) for tolerance in tolerances_db]
+
+
 @pytest.fixture(scope="module")
 def slabs():
     walls = SlabMaterial("walls", 3.0, 0.5, 0.1, 0.5, "directive", 4)
@@ -45,7 +51,7 @@ def data(slabs):
 
 @pytest.fixture(scope="module")
 def several(slabs):
-    return relevances(slabs, (1e-6, 0.1, 0.5, 2.0, 1000.0), receivers=RECEIVERS, **OPTIONS)
+    return at_each((1e-6, 0.1, 0.5, 2.0, 1000.0), slabs)
 
 
 def test_an_empty_room_has_line_of_sight_and_nothing_else():
@@ -88,7 +94,7 @@ def test_a_lobe_that_hardly_differs_is_replaced_and_power_is_kept():
         SlabMaterial("a", 4.0, 0.5, 0.1, 0.7, "directive", 5),
         SlabMaterial("b", 4.0, 0.5, 0.1, 0.7, "directive", 6),
     )
-    strict, loose = relevances(scene, (1e-4, 1.0), receivers=RECEIVERS, **OPTIONS)
+    strict, loose = at_each((1e-4, 1.0), scene)
     assert strict.lobes == (5, 6)
     assert len(loose.lobes) == 1
     p = material_parameters(scene.materials, F)

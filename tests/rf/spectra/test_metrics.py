@@ -150,7 +150,7 @@ def test_blocked_figures_are_those_of_receivers_without_line_of_sight():
     [
         (np.zeros((4, 4)), "shape"),
         (np.full(SHAPE, np.nan), "NaN"),
-        (np.full(SHAPE, -1.0), "negative"),
+        (np.full(SHAPE, -1.0), "at least 0"),
     ],
 )
 def test_bad_predictions_are_refused(wrong, message):

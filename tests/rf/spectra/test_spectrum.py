@@ -103,7 +103,7 @@ def test_decibels_and_plot():
 
 
 def test_bad_paths_are_refused():
-    with pytest.raises(ValueError, match="powers.*negative"):
+    with pytest.raises(ValueError, match="powers.*at least 0"):
         spread([[0, 0, 1.0]], [-1.0], (4, 8), SIGMA)
     with pytest.raises(ValueError, match="sigma"):
         spread([[0, 0, 1.0]], [1.0], (4, 8), 0.0)

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from warprrf.checks import check_array, check_number, check_positive, check_type, checked
+from warprrf.checks import check_array, check_choice, check_number, check_positive, check_type, checked
 from warprrf.device import require
-from warprrf.rf.channel.arrays import PlanarArray
+from warprrf.rf.channel.arrays import PlanarArray, check_unpolarised
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.spectra.readings import PowerTable
 
@@ -112,8 +112,7 @@ class ArraySpectra(PowerTable):
             ImportError: without Pillow (extra ``mesh``).
         """
         folder = Path(path)
-        if part not in (None, "train", "test"):
-            raise ValueError(f'part: got {part!r}, expected "train", "test" or None')
+        check_choice("part", part, (None, "train", "test"))
         needed = ["spectrum", "tx_pos.csv", "gateway_info.yml", *([f"{part}_index.txt"] if part else [])]
         for name in needed:
             if not (folder / name).exists():
@@ -162,10 +161,9 @@ def check_steering(array: PlanarArray, directions: ArrayLike) -> np.ndarray:
         TypeError, ValueError: naming the argument.
     """
     check_type("array", array, PlanarArray)
-    if array.polarisation is not None:
-        raise ValueError(f"array: got polarisation {array.polarisation!r}, expected None: all are vertical")
-    found = check_array("directions", directions, (..., 3))
-    if found.ndim < 2 or found.size == 0:
+    check_unpolarised("array", array, "all are vertical")
+    found = check_array("directions", directions, (..., None, 3))
+    if found.size == 0:
         raise ValueError(f"directions: got shape {found.shape}, expected (..., 3)")
     length = np.linalg.norm(found, axis=-1, keepdims=True)
     if not (np.abs(length - 1.0) < 1e-3).all():

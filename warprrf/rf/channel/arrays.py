@@ -21,11 +21,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from warprrf.cache import cached_property
-from warprrf.checks import check_array, check_count, check_positive, checked
+from warprrf.checks import check_array, check_choice, check_count, check_positive, checked
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
-from warprrf.rf.spectra.spectrum import angles_from_directions, transverse_basis
+from warprrf.rf.spectra.spectrum import angles_from_directions, transverse_basis, unit_vectors
 
 PATTERNS = ("isotropic", "dipole", "half_wave_dipole", "tr38901")
 SLANTS_RAD = {
@@ -68,14 +69,9 @@ class PlanarArray:
         spacing = check_array("spacing", self.spacing)
         if spacing.shape not in ((), (2,)) or (spacing <= 0).any():
             raise ValueError(f"spacing: got {self.spacing!r}, expected one or two positive numbers")
-        if isinstance(self.pattern, str) and self.pattern not in PATTERNS:
-            raise ValueError(
-                f"pattern: got {self.pattern!r}, expected {', '.join(PATTERNS)}, a function or samples"
-            )
-        if self.polarisation is not None and self.polarisation not in SLANTS_RAD:
-            raise ValueError(
-                f"polarisation: got {self.polarisation!r}, expected None, {', '.join(SLANTS_RAD)}"
-            )
+        if isinstance(self.pattern, str):
+            check_choice("pattern", self.pattern, PATTERNS)
+        check_choice("polarisation", self.polarisation, (None, *SLANTS_RAD))
         _ = self.rotation
 
     @property
@@ -94,14 +90,11 @@ class PlanarArray:
         value = check_array("orientation", self.orientation)
         if value.shape == (3,):
             return rotation_matrix(value)
-        if value.shape != (3, 3) or not np.allclose(value @ value.T, np.eye(3), atol=1e-9):
+        turned = value.shape == (3, 3) and np.allclose(value @ value.T, np.eye(3), atol=1e-9)
+        if not turned or np.linalg.det(value) < 0:
             raise ValueError(
-                f"orientation: got shape {value.shape}, expected three angles (3,) or a rotation (3, 3)"
-            )
-        if np.linalg.det(value) < 0:
-            raise ValueError(
-                "orientation: got a matrix of determinant -1, which mirrors the array; expected a rotation, of "
-                "determinant 1: turn one of its columns round"
+                f"orientation: got shape {value.shape}, expected three angles (3,), or a rotation (3, 3) of determinant 1: "
+                "one of -1 mirrors the array"
             )
         return value
 
@@ -171,14 +164,7 @@ class PlanarArray:
 
 def rotation_matrix(orientation: ArrayLike) -> np.ndarray:
     """Rotation from local to world axes of yaw, pitch and roll [rad]; 3GPP TR 38.901, eq. (7.1-4)."""
-    (ca, cb, cg), (sa, sb, sg) = np.cos(orientation), np.sin(orientation)
-    return np.array(
-        [
-            [ca * cb, ca * sb * sg - sa * cg, ca * sb * cg + sa * sg],
-            [sa * cb, sa * sb * sg + ca * cg, sa * sb * cg - ca * sg],
-            [-sb, cb * sg, cb * cg],
-        ]
-    )
+    return Rotation.from_euler("ZYX", orientation).as_matrix()
 
 
 @checked
@@ -188,10 +174,8 @@ def orientation_towards(direction: ArrayLike) -> tuple[float, float, float]:
     Raises:
         ValueError: for a vector without length.
     """
-    d = check_array("direction", direction, (3,))
-    if not np.linalg.norm(d) > 0:
-        raise ValueError("direction: got a zero vector, expected one with a length")
-    return float(np.arctan2(d[1], d[0])), float(-np.arctan2(d[2], np.hypot(d[0], d[1]))), 0.0
+    zenith, azimuth = angles_from_directions(unit_vectors("direction", direction, (3,)))
+    return float(azimuth), float(zenith - 0.5 * np.pi), 0.0
 
 
 @checked
@@ -225,28 +209,20 @@ def plane_wave_error(
     """
     for name, value in (("distance_m", distance_m), ("wavelength_m", wavelength_m)):
         check_positive(name, value, "number of metres")
-    d = check_array("direction", direction, (3,))
-    if not np.linalg.norm(d) > 0:
-        raise ValueError("direction: got (0, 0, 0), expected a direction")
-    unit = d / np.linalg.norm(d)
+    unit = unit_vectors("direction", direction, (3,))
     plane = array.response(unit, wavelength_m)
     true = array.spherical_response(distance_m * unit, wavelength_m)
     shares = np.abs(np.vdot(plane, true)) ** 2 / (len(true) * np.sum(np.abs(true) ** 2))
+    # Not wrapped: r_n - (r - u . d) for elements at d, by r_n^2 = (r - u . d)^2 + across.
+    place = array.positions(wavelength_m)
+    along = place @ unit
+    across = (place**2).sum(axis=1) - along**2
+    extra = across / (np.linalg.norm(distance_m * unit - place, axis=1) + np.abs(distance_m - along))
     return PlaneWaveError(
-        phase_rad=_largest_phase(array, distance_m, wavelength_m, unit),
+        phase_rad=float(2.0 * np.pi / wavelength_m * extra.max()),
         beam_loss_db=float(-10.0 * np.log10(shares)),
         entry_error=float(np.abs(plane - true).max()),
     )
-
-
-def _largest_phase(array: PlanarArray, distance_m: float, wavelength_m: float, unit: np.ndarray) -> float:
-    """Largest phase error [rad], not wrapped: r_n - (r - u . d) for elements at d."""
-    place = array.positions(wavelength_m)
-    along = place @ unit
-    each = np.linalg.norm(distance_m * unit - place, axis=1)
-    across = (place**2).sum(axis=1) - along**2  # r_n^2 = (r - u . d)^2 + across
-    extra = across / (each + np.abs(distance_m - along))
-    return float(2.0 * np.pi / wavelength_m * extra.max())
 
 
 def _pattern_gain(pattern: str | Pattern, local: np.ndarray) -> np.ndarray:
@@ -263,16 +239,18 @@ def _pattern_gain(pattern: str | Pattern, local: np.ndarray) -> np.ndarray:
     if pattern == "dipole":
         return 1.5 * np.sin(zenith) ** 2
     if pattern == "half_wave_dipole":
-        sine = np.sin(zenith)
-        steep = sine > 1e-9  # the limit along the axis is zero
-        return (
-            1.643
-            * np.where(steep, np.cos(0.5 * np.pi * np.cos(zenith)) / np.where(steep, sine, 1.0), 0.0) ** 2
-        )
+        sine = np.maximum(np.sin(zenith), 1e-9)  # the limit along the axis is zero
+        return 1.643 * (np.cos(0.5 * np.pi * np.cos(zenith)) / sine) ** 2
     width = np.deg2rad(65.0)  # TR 38.901, table 7.3-1
     vertical = -np.minimum(12.0 * ((zenith - 0.5 * np.pi) / width) ** 2, 30.0)
     horizontal = -np.minimum(12.0 * (azimuth / width) ** 2, 30.0)
     return 10.0 ** (0.1 * (8.0 - np.minimum(-(vertical + horizontal), 30.0)))
+
+
+def check_unpolarised(name: str, array: PlanarArray, why: str) -> None:
+    """Raise ValueError, naming the argument, for an array with a polarisation; ``why`` there may be none."""
+    if array.polarisation is not None:
+        raise ValueError(f"{name}: got polarisation {array.polarisation!r}, expected None: {why}")
 
 
 ISOTROPIC = PlanarArray(1, 1)

@@ -25,10 +25,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_count, check_positive, checked, one_line
-from warprrf.rf.channel.arrays import ISOTROPIC, PlanarArray
+from warprrf.rf.channel.arrays import ISOTROPIC, PlanarArray, check_unpolarised
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.waves import carrier_phase
-from warprrf.rf.spectra.spectrum import Spectrum, directions_from_angles, pixel_directions
+from warprrf.rf.spectra.spectrum import Spectrum, directions_from_angles, pixel_directions, unit_vectors
 
 
 @checked
@@ -65,11 +65,7 @@ class Codebook:
 
     def beam(self, index: int) -> np.ndarray:
         """Weights of one beam, shape ``(N,)``."""
-        check_count("index", index, 0, len(self) - 1)
-        if len(self.factors) == 1:
-            return self.factors[0][index]
-        across, down = np.divmod(index, len(self.factors[1]))
-        return np.kron(self.factors[0][across], self.factors[1][down])
+        return self.weights[check_count("index", index, 0, len(self) - 1)]
 
     def received(self, channel: ArrayLike) -> np.ndarray:
         """w^T h of every beam for channels ``(..., N)``, shape ``(..., B)``."""
@@ -148,7 +144,7 @@ def dft_codebook(array: PlanarArray, oversampling: int = 1) -> Codebook:
     Raises:
         ValueError: for a polarised array, or oversampling below 1.
     """
-    _unpolarised("array", array)
+    check_unpolarised("array", array, "powers choose beams")
     times = check_count("oversampling", oversampling)
     return Codebook(array, (_dft(array.cols, times), _dft(array.rows, times)))
 
@@ -171,19 +167,16 @@ def steering_codebook(
     Raises:
         ValueError: naming the argument; for a polarised array.
     """
-    _unpolarised("array", array)
+    check_unpolarised("array", array, "powers choose beams")
     if (directions is None) == (points is None):
         raise ValueError("directions: expected either directions or points, and got both or neither")
     name, given = ("directions", directions) if points is None else ("points", points)
-    v = check_array(name, given, (None, 3))
-    length = np.linalg.norm(v, axis=1, keepdims=True)
-    if not (length > 0).all():
-        raise ValueError(f"{name}: got a vector of length zero, expected ones with a length")
+    toward = unit_vectors(name, given)  # type: ignore[arg-type]
     if points is None:
-        response = array.response(v / length, 1.0)
+        response = array.response(toward, 1.0)
     else:
         wavelength = check_positive("wavelength_m", wavelength_m, "number of metres with points")
-        response = array.spherical_response(v, wavelength)
+        response = array.spherical_response(points, wavelength)
     return Codebook(array, (response.conj() / np.linalg.norm(response, axis=1, keepdims=True),))
 
 
@@ -295,10 +288,7 @@ def select_beams_multiuser(
     """
     check_positive("noise", noise, "share of the transmitted power")
     tx, rx = codebook_of("tx_array", tx_array), codebook_of("rx_array", rx_array)
-    given: Iterable[Source] = [sources] if isinstance(sources, Spectrum | PathArrays) else sources
-    gains = [_pair_gains(rays, tx, rx) for source in given for rays in rays_of(source, tx)]
-    if not gains:
-        raise ValueError("sources: got none, expected a spectrum or paths for every user")
+    gains = [_pair_gains(rays, tx, rx) for rays in rays_of_users(sources, tx)]
     served = _search(gains, noise * len(gains))
     received, transmitted = (np.array([served[u][k] for u in range(len(gains))]) for k in (0, 1))
     sinr = signal_over_interference(gains, transmitted, received, noise)
@@ -374,9 +364,23 @@ def _sum_rates(
 Rays = tuple[np.ndarray | None, np.ndarray, np.ndarray]
 
 
+def rays_of_users(sources: Source | Iterable[Source], tx: Codebook) -> list[Rays]:
+    """:func:`rays_of` of every user.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    given: Iterable[Source] = [sources] if isinstance(sources, Spectrum | PathArrays) else sources
+    found = [rays for source in given for rays in rays_of(source, tx)]
+    if not found:
+        raise ValueError("sources: got none, expected a spectrum or paths for every user")
+    return found
+
+
 def rays_of(source: Source, tx: Codebook) -> Iterator[Rays]:
     """Departure (None if it does not matter), arrival and power of what reaches each receiver of ``source``."""
-    directed = tx.array.elements > 1 or not _isotropic(tx.array)
+    pattern = tx.array.pattern
+    directed = tx.array.elements > 1 or not (isinstance(pattern, str) and pattern == "isotropic")
     if isinstance(source, PathArrays):
         for paths in source.each():
             kept = paths.select(np.flatnonzero(paths.power > 0))
@@ -428,24 +432,9 @@ def codebook_of(name: str, value: Ends) -> Codebook:
     if value is None:
         return Codebook(ISOTROPIC, (np.ones((1, 1), dtype=complex),))
     if isinstance(value, PlanarArray):
-        _unpolarised(name, value)
+        check_unpolarised(name, value, "powers choose beams")
         return dft_codebook(value)
-    if isinstance(value, Codebook):
-        return value
-    raise TypeError(f"{name}: got {type(value).__name__}, expected a PlanarArray or a Codebook")
-
-
-def _unpolarised(name: str, array: PlanarArray) -> None:
-    if not isinstance(array, PlanarArray):
-        raise TypeError(f"{name}: got {type(array).__name__}, expected a PlanarArray")
-    if array.polarisation is not None:
-        raise ValueError(
-            f"{name}: got polarisation {array.polarisation!r}, expected None: powers choose beams"
-        )
-
-
-def _isotropic(array: PlanarArray) -> bool:
-    return isinstance(array.pattern, str) and array.pattern == "isotropic"
+    return value
 
 
 def squared(values: np.ndarray) -> np.ndarray:

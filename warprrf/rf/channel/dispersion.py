@@ -142,12 +142,10 @@ def _first_fall(weight: np.ndarray, tau: np.ndarray, level: float) -> float:
 
 def _weights(power: ArrayLike, values: ArrayLike, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Shares of power that sum to one over the last axis (NaN without power), and values with 0 where there is none."""
-    p = check_array("power", power)
+    p = check_array("power", power, least=0.0)
     v = check_array(name, values, finite=False)
     if p.shape != v.shape or p.ndim == 0:
         raise ValueError(f"power: got shape {p.shape} for {name} of shape {v.shape}, expected the same")
-    if (p < 0).any():
-        raise ValueError("power: got negative values, expected linear power")
     positive = p > 0
     if not np.isfinite(v[positive]).all():
         raise ValueError(f"{name}: got NaN or infinite ones where there is power")

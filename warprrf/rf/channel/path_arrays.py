@@ -19,7 +19,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from warprrf.checks import check_array, check_count, check_type, checked, one_line
+from warprrf.checks import check_array, check_chosen, check_count, check_type, checked, one_line
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 from warprrf.rf.spectra.spectrum import angles_from_directions, directions_from_angles
@@ -91,10 +91,8 @@ class PathArrays:
                 )
         if self.interactions.size == 0:
             there = np.isfinite(self.vertices[..., 0])
-            codes, last = (
-                np.where(there, MIRROR, 0),
-                np.cumsum(there, axis=-1) == there.sum(-1, keepdims=True),
-            )
+            codes = np.where(there, MIRROR, 0)
+            last = np.cumsum(there, axis=-1) == there.sum(-1, keepdims=True)
             for kind, code in _LAST.items():
                 codes[there & last & (self.kind == kind)[..., None]] = code
             object.__setattr__(self, "interactions", codes.astype(np.int8))
@@ -147,8 +145,7 @@ class PathArrays:
         """
         if not self.batched:
             raise TypeError("paths of one receiver cannot be indexed by receiver; expected paths of several")
-        if not -len(self.gain) <= receiver < len(self.gain):
-            raise ValueError(f"receiver: got {receiver}, expected one of {len(self.gain)}")
+        check_count("receiver", receiver, -len(self.gain), len(self.gain) - 1)
         point = None if self.receiver is None else self.receiver[receiver]
         source = self.transmitter
         if source is not None and source.ndim == 2:
@@ -182,19 +179,9 @@ class PathArrays:
             raise TypeError(
                 "paths of several receivers cannot be selected from at once; index a receiver first"
             )
-        index: Any = chosen
-        if not isinstance(chosen, slice):
-            index = np.asarray(chosen)
-            index = index if index.size else index.astype(int)
-        try:
-            found = np.arange(len(self.gain))[index]
-        except (IndexError, OverflowError) as error:
-            raise ValueError(
-                f"chosen: {error}; expected indices of {len(self.gain)} paths, or a mask"
-            ) from error
-        if found.ndim != 1:
-            raise ValueError(f"chosen: got shape {found.shape}, expected a list of paths")
-        return self._taken(index)
+        if isinstance(chosen, slice):
+            return self._taken(chosen)
+        return self._taken(check_chosen("chosen", chosen, len(self.gain)))
 
     def with_gas(self, gas: Gas = True) -> Self:
         """The same paths with the absorption of ``gas`` in their gains, in place of what was in them.
@@ -325,10 +312,9 @@ class PathArrays:
             receiver = np.stack([np.asarray(p.receiver) for p in parts])
         sources = [p.transmitter for p in parts if p.transmitter is not None]
         common = _common([replace(p, transmitter=None) for p in parts])
-        if sources and len(sources) == len(parts) and not all(np.array_equal(s, sources[0]) for s in sources):
-            common["transmitter"] = np.stack(sources)
-        elif sources:
-            common["transmitter"] = sources[0]
+        if sources:
+            alike = len(sources) < len(parts) or all(np.array_equal(s, sources[0]) for s in sources)
+            common["transmitter"] = sources[0] if alike else np.stack(sources)
         return cls(**stacked, **common, receiver=receiver)
 
 
@@ -375,8 +361,6 @@ def _common(parts: Sequence[PathArrays]) -> dict[str, Any]:
     Raises:
         ValueError: if they differ in carrier, transmitter or air.
     """
-    if not parts:
-        return {}
     first = parts[0]
     for p in parts[1:]:
         same = p.frequency_hz == first.frequency_hz and p.air == first.air

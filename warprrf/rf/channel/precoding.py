@@ -29,11 +29,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import eigh
 
 from warprrf.checks import check_array, check_choice, check_positive, checked
-from warprrf.rf.channel.beams import Ends, Source, chunks, codebook_of, rays_of, squared
-from warprrf.rf.channel.path_arrays import PathArrays
-from warprrf.rf.spectra.spectrum import Spectrum
-
-METHODS = ("mr", "zf", "slnr")
+from warprrf.rf.channel.beams import Ends, Source, chunks, codebook_of, rays_of_users, squared
 
 
 @checked
@@ -54,19 +50,15 @@ def transmit_covariance(
         TypeError, ValueError: as for :func:`~warprrf.rf.channel.beams.select_beams`; for beams that do not fit the
             users.
     """
-    tx, book = codebook_of("tx_array", tx_array).array, codebook_of("rx_array", rx_array)
-    given: Iterable[Source] = [sources] if isinstance(sources, Spectrum | PathArrays) else sources
-    rays = [found for source in given for found in rays_of(source, codebook_of("tx_array", tx_array))]
-    if not rays:
-        raise ValueError("sources: got none, expected a spectrum or paths for every user")
+    sending, book = codebook_of("tx_array", tx_array), codebook_of("rx_array", rx_array)
+    tx, rays = sending.array, rays_of_users(sources, sending)
     beams = np.zeros(len(rays), int) if rx is None and len(book) == 1 else np.asarray(rx)
     if beams.shape != (len(rays),) or beams.dtype.kind not in "iu":
         raise ValueError(f"rx: got {rx!r}, expected the index of a beam for each of {len(rays)} users")
     if ((beams < 0) | (beams >= len(book))).any():
         raise ValueError(f"rx: got {beams.tolist()}, expected beams 0 to {len(book) - 1}")
     found = np.zeros((len(rays), tx.elements, tx.elements), dtype=complex)
-    for total, (departure, arrival, power), beam in zip(found, rays, beams, strict=True):
-        own = book.beam(int(beam))
+    for total, (departure, arrival, power), own in zip(found, rays, book.weights[beams], strict=True):
         for part in chunks(len(power), tx.elements):
             toward = arrival[part]
             received = squared(book.array.response(toward, 1.0) @ own) * book.array.gain(toward)
@@ -92,7 +84,7 @@ def precoders(channels: ArrayLike, method: str = "slnr", *, noise: float) -> np.
         ValueError: naming the argument; for a user without power, and for "zf" with more users than elements or users
             whose channels are linearly dependent.
     """
-    check_choice("method", method, METHODS)
+    check_choice("method", method, ("mr", "zf", "slnr"))
     check_positive("noise", noise, "share of the transmitted power")
     h = _checked(channels)
     if h.ndim == 2:

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_choice, check_count, check_positive, check_seed
-from warprrf.rf.channel.arrays import ISOTROPIC, SLANTS_RAD, PlanarArray
+from warprrf.rf.channel.arrays import ISOTROPIC, SLANTS_RAD, PlanarArray, check_unpolarised
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.channel.sums import (
     LEAST_FREQUENCIES,
@@ -202,8 +202,7 @@ def diffuse_power(
     """
     tx, rx = tx_array or ISOTROPIC, rx_array or ISOTROPIC
     for name, array in (("tx_array", tx), ("rx_array", rx)):
-        if array.polarisation is not None:
-            raise ValueError(f"{name}: got polarisation {array.polarisation!r}, expected None")
+        check_unpolarised(name, array, "diffuse paths hold powers alone")
     scattered = np.where(paths.kind == "diffuse", paths.power, 0.0)
     whole = scattered > 0
     gains = np.zeros(scattered.shape)

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -67,16 +67,9 @@ class Air:
         return cls(**found) if found else None
 
 
-class KeptEffects(Protocol):
-    """What a :class:`~warprrf.rf.relevance.search.Relevance` says of the air: "gas" is among the effects kept or not."""
-
-    @property
-    def kept(self) -> tuple[str, ...]:
-        """Names of the effects that matter."""
-
-
-Gas: TypeAlias = bool | Air | KeptEffects | None
-"""Whether the air absorbs: False or None for no, True for the standard atmosphere, one's own, or a relevance report."""
+Gas: TypeAlias = Any
+"""Whether the air absorbs: False or None for no, True for the standard atmosphere, one's own :class:`Air`, or a
+:class:`~warprrf.rf.relevance.search.Relevance`, which says whether it matters."""
 
 
 def air_of(gas: Gas, frequency_hz: float | None = None) -> Air | None:
@@ -129,8 +122,7 @@ def gas_attenuation_db_per_m(
     theta = 300.0 / temperature_k
     vapour_hpa = water_vapour_g_m3 * temperature_k / 216.7  # eq. (4)
     state = f, theta, pressure_hpa, vapour_hpa
-    imaginary = _oxygen(*state) + _water_vapour(*state)
-    per_km = 0.1820 * f[..., 0] * imaginary  # eq. (1)
+    per_km = 0.1820 * f[..., 0] * (_oxygen(*state) + _water_vapour(*state))  # eq. (1)
     return float(per_km) * 1e-3 if f_hz.ndim == 0 else per_km * 1e-3
 
 

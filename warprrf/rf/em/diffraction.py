@@ -25,12 +25,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.special import wofz
 
-from warprrf.checks import check_array, checked
-
-_TURN = np.exp(0.75j * np.pi)
 Pair = tuple[np.ndarray, np.ndarray]
 """Coefficients of fields across (TE) and in (TM) the plane of incidence."""
 
@@ -98,13 +94,6 @@ class EdgeRays:
         return np.sqrt((1.0 - np.asarray(self.cosine) ** 2) * np.stack(np.broadcast_arrays(*bent)))
 
 
-@checked
-def transition_function(x: ArrayLike) -> np.ndarray:
-    """F(x) = 2j sqrt(x) exp(jx) int_sqrt(x)^inf exp(-j t^2) dt of x >= 0. Source: Kouyoumjian and Pathak, eq. (27)."""
-    root = np.sqrt(check_array("x", x))
-    return np.asarray(np.sqrt(np.pi) * root * np.exp(0.25j * np.pi) * wofz(_TURN * root))
-
-
 def boundary_fields(rays: EdgeRays) -> np.ndarray:
     """The four terms of the coefficient, shape ``(4, ...)``, complex, in the order of :meth:`EdgeRays.incidence_cosines`.
 
@@ -121,7 +110,7 @@ def boundary_fields(rays: EdgeRays) -> np.ndarray:
         x = x - 2.0 * np.pi * n * np.rint(x / (2.0 * np.pi * n))
         size, tangent = np.abs(np.sin(0.5 * x)), np.tan(0.5 * x / n)
         slope = np.divide(size, tangent, out=np.zeros(np.broadcast(size, tangent).shape), where=tangent != 0)
-        terms.append(-0.5 / n * slope * wofz(_TURN * root * size))
+        terms.append(-0.5 / n * slope * wofz(np.exp(0.75j * np.pi) * root * size))
     return np.stack(np.broadcast_arrays(*terms))
 
 
@@ -162,7 +151,6 @@ def _turned(slant: np.ndarray, cosine: np.ndarray) -> Pair:
     """Cosine and sine of twice the angle from the edge-fixed b to the TE field of a face met under ``slant``."""
     along, across = np.cos(slant), cosine * np.sin(slant)
     square = along**2 + across**2
-    safe = np.where(
-        square > 0, square, 1.0
-    )  # met head on, a face has no plane of incidence: TE is along the edge
+    # Met head on, a face has no plane of incidence: TE is along the edge.
+    safe = np.where(square > 0, square, 1.0)
     return np.where(square > 0, (along**2 - across**2) / safe, 1.0), 2.0 * along * across / safe

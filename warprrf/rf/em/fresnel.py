@@ -49,6 +49,26 @@ class SurfaceTable:
     alpha_r: np.ndarray
     reciprocal: np.ndarray
 
+    def reflection(
+        self, material: np.ndarray, cos_incidence: np.ndarray, wavelength_m: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """TE and TM of mirrors of ``material``, rows of the table: those of :func:`slab_reflection`, less what scatters."""
+        slab = self.permittivity[material], self.thickness_m[material], wavelength_m
+        smooth = np.sqrt(1.0 - self.scattering[material] ** 2)
+        te, tm = slab_reflection(cos_incidence, *slab)
+        return smooth * te, smooth * tm
+
+    def passage(
+        self,
+        material: np.ndarray,
+        cos_incidence: np.ndarray,
+        wavelength_m: float,
+        solid_m: np.ndarray | float = np.nan,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """:func:`slab_passage` of slabs of ``material``, as thick as that or, where they are solids, ``solid_m``."""
+        thickness = np.where(np.isnan(solid_m), self.thickness_m[material], solid_m)
+        return slab_passage(cos_incidence, self.permittivity[material], thickness, wavelength_m)
+
 
 def surface_table(materials: Sequence[Material], frequency_hz: float) -> SurfaceTable:
     """The table of ``materials`` at ``frequency_hz``.
@@ -240,7 +260,6 @@ def lobe_norm(alpha_r: int, cos_incidence: ArrayLike) -> np.ndarray:
 
 
 COSINES = 257  # entries of tables over the cosine of incidence
-_PERMITTIVITY = np.geomspace(0.05, 200.0, 97)  # of epsilon_r - 1; the last reflects like metal
 
 
 @dataclass(frozen=True)
@@ -262,9 +281,8 @@ class FresnelCurves:
     def at(self, table: np.ndarray, log_excess: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Rows of ``table`` (97, K) at ``log_excess`` (G,), clipped to the family, and derivatives, ``(G, K)``."""
         step = self.log_excess[1] - self.log_excess[0]
-        x = np.clip(
-            (np.asarray(log_excess, float) - self.log_excess[0]) / step, 0.0, len(self.log_excess) - 1.001
-        )
+        x = (np.asarray(log_excess, float) - self.log_excess[0]) / step
+        x = np.clip(x, 0.0, len(self.log_excess) - 1.001)
         i = x.astype(int)
         s = (x - i)[:, None]
         return (1 - s) * table[i] + s * table[i + 1], (table[i + 1] - table[i]) / step
@@ -278,13 +296,9 @@ class FresnelCurves:
 @lru_cache(maxsize=1)
 def fresnel_curves() -> FresnelCurves:
     """The family of half-spaces from epsilon_r 1.05 to 201."""
-    cosine = np.linspace(0.0, 1.0, COSINES)
-    curves = np.stack(
-        [
-            0.5 * sum(np.abs(r) ** 2 for r in slab_reflection(cosine, 1.0 + x, np.inf, 1.0))
-            for x in _PERMITTIVITY
-        ]
-    )
+    excess = np.geomspace(0.05, 200.0, 97)  # of epsilon_r over 1; the last reflects like metal
+    te, tm = slab_reflection(np.linspace(0.0, 1.0, COSINES), 1.0 + excess[:, None], np.inf, 1.0)
+    curves = 0.5 * (np.abs(te) ** 2 + np.abs(tm) ** 2)
     # relative errors count: each curve is weighted by its mean
     moments = np.linalg.svd(curves / curves.mean(axis=1, keepdims=True), full_matrices=False)[2][:MOMENTS]
-    return FresnelCurves(np.log(_PERMITTIVITY), curves, moments, curves @ moments.T)
+    return FresnelCurves(np.log(excess), curves, moments, curves @ moments.T)

@@ -180,16 +180,10 @@ class Material:
         return cls(name, (band,), thickness_m, 0.0, scattering, pattern, alpha_r, reciprocal=reciprocal)
 
     @classmethod
-    def conductor(cls, *, scattering: float = 0.0, pattern: str = "lambertian", alpha_r: int = 4) -> Material:
-        """A good conductor (1e7 S/m): reflects all but a thousandth at terahertz."""
-        return cls.custom(
-            "conductor",
-            relative_permittivity=1.0,
-            conductivity=1e7,
-            scattering=scattering,
-            pattern=pattern,
-            alpha_r=alpha_r,
-        )
+    def conductor(cls, **options: Any) -> Material:
+        """A good conductor (1e7 S/m): reflects all but a thousandth at terahertz. ``options``: ``scattering``, ``pattern``
+        and what else :meth:`custom` takes."""
+        return cls.custom("conductor", relative_permittivity=1.0, conductivity=1e7, **options)
 
     def band(self, frequency_hz: float) -> Band:
         """The row that holds at ``frequency_hz``.

@@ -22,6 +22,7 @@ from warprrf.cache import Cache
 from warprrf.checks import (
     LARGEST_M,
     check_array,
+    check_choice,
     check_count,
     check_number,
     check_positive,
@@ -46,7 +47,6 @@ from warprrf.rf.spectra.antenna import Pattern, sample_pattern
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.spectra.spectrum import (
-    BEAM_SIGMA_RAD,
     Spectra,
     Spectrum,
     check_beam,
@@ -121,8 +121,7 @@ class RadioField(ABC):
         Warns:
             UserWarning: below 100 GHz and outdoors, of diffraction and transmission where they are not modelled.
         """
-        if not isinstance(model, str) or model not in cls.models:
-            raise ValueError(f"model: got {model!r}, expected one of {', '.join(cls.models)}")
+        check_choice("model", model, cls.models)
         return cls.models[model].fit(geometry, ds, model, **options)
 
     @classmethod
@@ -395,12 +394,7 @@ class RadioField(ABC):
         self,
         receivers: ArrayLike,
         transmitter: ArrayLike | None = None,
-        *,
-        beam_sigma_rad: float = BEAM_SIGMA_RAD,
-        shape: tuple[int, int] | None = None,
-        mirror_order: int | None = None,
-        client: Any = None,
-        progress: Progress | None = None,
+        **options: Any,
     ) -> Links:
         """Total and best path gain, delay spread and best-beam gain at every receiver, without spectra.
 
@@ -409,25 +403,21 @@ class RadioField(ABC):
 
         Args:
             receivers, transmitter: as for :meth:`spectrum`.
-            beam_sigma_rad: width of the receiver's beam: kappa = 1 / sigma^2.
-            shape: rows and columns of the grid that rays fill; 20 x 40 by default, the field's own for other models.
-            mirror_order: most reflections on a mirror path of a ``bistatic`` field, if fewer than it was fitted with:
-                chains of three mirrors take most of the time and carry little.
-            client: as for :meth:`spectra`.
-            progress: called as ``progress("links", done, total)``.
+            options: attributes of :class:`warprrf.rf.maps.links.LinkOptions`: ``beam_sigma_rad``, ``shape``,
+                ``mirror_order``, ``client``, ``progress``.
 
         Returns:
             Arrays ``(R,)``; numbers for one receiver and transmitter.
 
         Raises:
             ValueError: as for :meth:`spectrum`, and for a beam width that is not positive.
+            TypeError: for an unknown option.
         """
-        ends = self.check_positions(receivers, transmitter)
+        ends, asked = self.check_positions(receivers, transmitter), LinkOptions(**options)
         rows, found = np.zeros(0, int), []
         for source, own in ends.groups():
-            tell = progress and partial(_progress_after, progress, len(rows), len(ends.receivers))
-            options = LinkOptions(beam_sigma_rad, shape, mirror_order, client, tell)
-            found.append(self.trace_links(ends.receivers[own], source, options))
+            tell = asked.progress and partial(_progress_after, asked.progress, len(rows), len(ends.receivers))
+            found.append(self.trace_links(ends.receivers[own], source, replace(asked, progress=tell)))
             rows = np.concatenate([rows, own])
         return Links.joined(found)[0 if ends.single else np.argsort(rows)]
 

@@ -24,10 +24,8 @@ from warprrf.rf.channel.path_arrays import EDGE, MIRROR, SCATTER, SLAB
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.scene import Scene
 
-_VERSION = "4.0.5"  # of the format
 # of a path's code: a digit for each interaction, from the transmitter on; 0 for line of sight
 _DIGIT = {MIRROR: 1, EDGE: 2, SCATTER: 3, SLAB: 4}
-_FORBIDDEN = set('/\\:*?"<>|\n') | {"'"}
 
 
 @checked
@@ -60,7 +58,7 @@ def write_deepmimo(
     """
     folder = Path(folder)
     name = folder.name
-    if not name or name != name.lower() or _FORBIDDEN & set(name):
+    if not name or name != name.lower() or set("/\\:*?\"'<>|\n") & set(name):
         raise ValueError(f"folder: got the name {name!r}, which DeepMIMO cannot load; expected lower case")
     if paths.transmitter is None or paths.receiver is None:
         raise ValueError("paths: got ones without transmitter and receiver, which a scenario needs")
@@ -81,7 +79,7 @@ def write_deepmimo(
         code: int((several.interactions == code).sum(axis=-1).max(initial=0)) for code in (MIRROR, EDGE, SLAB)
     }
     parameters = {
-        "version": _VERSION,
+        "version": "4.0.5",  # of the format
         "rt_params": {
             "raytracer_name": "warprrf",
             "raytracer_version": version("warprrf"),

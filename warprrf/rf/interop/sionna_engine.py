@@ -11,7 +11,6 @@ import os
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
@@ -20,11 +19,11 @@ from warprrf.device import DeviceLike
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.waves import check_frequency
-from warprrf.rf.exact import ReceivedPaths
 from warprrf.rf.paths.sionna import by_delay
 from warprrf.rf.scene import Scene
 from warprrf.rf.scene_sionna import select_variant, sionna_rt
-from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape, spread_paths
+from warprrf.rf.spectra.dataset import Received
+from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape
 
 
 @checked
@@ -116,6 +115,8 @@ class SionnaEngine:
         self._scene.rx_array = self._rt.PlanarArray(**both)
         self._scene.add(self._rt.Transmitter("tx", position=self.transmitter.tolist()))
         self._solver = self._rt.PathSolver(deterministic=True)
+        # Sionna's default of 1e6 paths truncates silently; each sample can give one path a bounce.
+        self._most = self.sampling.samples * max(self.sampling.depth, 1) + 100_000
         self._solved = 0
 
     def solve(self, receiver: ArrayLike, *, specular: bool = True) -> PathArrays:
@@ -131,7 +132,7 @@ class SionnaEngine:
             paths = self._solver(
                 self._scene,
                 max_depth=self.sampling.depth,
-                max_num_paths_per_src=self._path_cap,
+                max_num_paths_per_src=self._most,
                 samples_per_src=self.sampling.samples,
                 synthetic_array=True,
                 los=True,
@@ -140,7 +141,9 @@ class SionnaEngine:
                 refraction=self.sampling.refraction,
                 seed=self.sampling.seed,
             )
-            found = self._read(paths)
+            if paths.valid.numpy().size >= self._most:
+                raise RuntimeError(f"Sionna filled its cap of {self._most} paths: power would be missing")
+            (found,) = by_delay(paths, self.frequency_hz, 0, True)
         finally:
             self._scene.remove("rx")
         self._solved += 1
@@ -148,28 +151,8 @@ class SionnaEngine:
             drjit = _device.require("drjit", extra="sionna")
             drjit.flush_malloc_cache()
             drjit.flush_kernel_cache()
-        return found
-
-    @property
-    def _path_cap(self) -> int:
-        """Sionna's default of 1e6 paths truncates silently; each sample can give one path a bounce."""
-        return self.sampling.samples * max(self.sampling.depth, 1) + 100_000
-
-    def _read(self, paths: Any) -> PathArrays:
-        """Sionna's paths of one receiver and transmitter."""
-        if paths.valid.numpy().size >= self._path_cap:
-            raise RuntimeError(f"Sionna filled its cap of {self._path_cap} paths: power would be missing")
-        (found,) = by_delay(paths, self.frequency_hz, 0, True)
         return found.with_gas(self.air)
 
-    def receive(self, receiver: ArrayLike) -> ReceivedPaths:
+    def receive(self, receiver: ArrayLike) -> Received:
         """The spectrum of one receiver (3,)."""
-        found = self.solve(receiver)
-        beam = self.shape, self.beam_sigma_rad
-        spread = spread_paths(found.arrival, found.power, *beam, device=self.device)
-        return ReceivedPaths(
-            path_gain=spread.path_gain,
-            delay_s=spread.of_strongest(found.tau),
-            aod=spread.of_strongest(np.column_stack([found.theta_t, found.phi_t])),
-            line_of_sight=bool((found.kind == "los").any()),
-        )
+        return Received.of(self.solve(receiver), self.shape, self.beam_sigma_rad, self.device)

@@ -48,7 +48,6 @@ THICKNESS_WAVELENGTHS = 200.0
 LOST_IN_NOISE = 1e-2 / np.pi  # [1/sr], 20 dB below a white Lambertian lobe: darker directions hardly count
 _EXCESS = np.geomspace(1e-2, 1e6, 1601)  # of epsilon_r - 1; the last reflects like metal
 _MATERIAL = "fitted_"  # Sionna keeps names of materials and objects apart, and reserves those of the ITU
-_FILES = {"scene.xml", "materials.json", "meshes"}
 
 
 @dataclass(frozen=True)
@@ -107,25 +106,6 @@ class Twin:
     frequency_hz: float
     groups: tuple[TwinGroup, ...] = dataclasses.field(repr=False)
     left_out: tuple[str, ...]
-
-    @property
-    def scattering_error_db(self) -> float:
-        """Error of the scattered power over all groups, rms weighted by area [dB]."""
-        return self._rms("scattering_error_db")
-
-    @property
-    def mirror_error_db(self) -> float:
-        """Error of the mirrored power over all groups, rms weighted by area [dB]."""
-        return self._rms("mirror_error_db")
-
-    @property
-    def lobe_error_db(self) -> float:
-        """Error of the lobes over all groups, rms weighted by area [dB]."""
-        return self._rms("lobe_error_db")
-
-    def _rms(self, name: str) -> float:
-        squares = [getattr(group, name) ** 2 for group in self.groups]
-        return float(np.sqrt(np.average(squares, weights=[group.area_m2 for group in self.groups])))
 
 
 @checked
@@ -456,7 +436,7 @@ def _check_replaceable(folder: Path) -> None:
         return
     try:
         table = read_json(folder / "materials.json")
-        twin = found <= _FILES and str(table["about"][0]).startswith(ABOUT)
+        twin = found <= {"scene.xml", "materials.json", "meshes"} and str(table["about"][0]).startswith(ABOUT)
     except (OSError, ValueError, KeyError, TypeError, IndexError):
         twin = False
     if not twin:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.checks import checked, one_line
+from warprrf.checks import check_choice, checked, one_line
 from warprrf.cluster import each
 from warprrf.device import Progress
 from warprrf.rf.channel.dispersion import delay_spread
@@ -27,10 +27,11 @@ from warprrf.rf.spectra.spectrum import (
     pixel_of,
     pixel_solid_angles,
 )
+from warprrf.rows import Rows
 
 
 @dataclass(frozen=True)
-class Links:
+class Links(Rows):
     """Links of several receivers, arrays ``(R,)``; or one, numbers.
 
     Attributes:
@@ -48,14 +49,7 @@ class Links:
     delay_spread_s: np.ndarray
     best_beam_gain: np.ndarray
 
-    def __getitem__(self, chosen: Any) -> Links:
-        """Those of some receivers, or of one."""
-        return Links(*(array[chosen] for array in vars(self).values()))
-
-    @classmethod
-    def joined(cls, parts: Sequence[Links]) -> Links:
-        """One after another."""
-        return cls(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in cls.__dataclass_fields__})
+    __getitem__ = Rows.take
 
 
 @checked
@@ -66,8 +60,10 @@ class LinkOptions:
     Attributes:
         beam_sigma_rad: width of the receiver's beam, kappa = 1 / sigma^2: array gain 2 / sigma^2, that of a planar
             array of 2 / (pi sigma^2) elements half a wavelength apart (522 at 2 degrees).
-        shape: rows and columns of the grid that rays fill; None for the model's default.
-        mirror_order: most reflections on a mirror path, 0 to 3; None for the field's own.
+        shape: rows and columns of the grid that rays fill; 20 x 40 by default, the field's own for other models than
+            ``bistatic``.
+        mirror_order: most reflections on a mirror path of a ``bistatic`` field, 0 to 3, if fewer than it was fitted with: chains
+            of three mirrors take most of the time and carry little.
         client: a ``dask.distributed.Client`` whose workers compute; this process by default.
         progress: called as ``progress("links", done, total)``.
     """
@@ -82,8 +78,7 @@ class LinkOptions:
         if self.shape is not None:
             object.__setattr__(self, "shape", check_shape(self.shape))
         check_beam(self.beam_sigma_rad)
-        if self.mirror_order not in (None, 0, 1, 2, 3):
-            raise ValueError(f"mirror_order: got {self.mirror_order!r}, expected 0 to 3, or None")
+        check_choice("mirror_order", self.mirror_order, (None, 0, 1, 2, 3))
 
     def in_batches(self, receivers: np.ndarray, batch: int, trace: Callable[[np.ndarray], Links]) -> Links:
         """Links of ``receivers`` (R, 3), at most ``batch`` of them at a time."""

@@ -94,9 +94,7 @@ class RadioMap:
             if not (np.abs(np.diff(fields[name]) - self.cell_m) < 1e-3 * self.cell_m).all():
                 raise ValueError(f"{name}: got {fields[name]}, expected steps of cell_m, {self.cell_m:g} m")
         for name in _LAYERS:
-            fields[name] = check_array(name, getattr(self, name), cells, finite=False)
-            if not (np.isnan(fields[name]) | (fields[name] >= 0) & np.isfinite(fields[name])).all():
-                raise ValueError(f"{name}: got negative or infinite values, expected NaN outside the air")
+            fields[name] = check_array(name, getattr(self, name), cells, finite=False, least=0.0)
         if self.ground_m is not None:
             fields["ground_m"] = check_array("ground_m", self.ground_m, cells, finite=False)
         for name, value in fields.items():

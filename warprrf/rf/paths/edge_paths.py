@@ -8,9 +8,8 @@ coefficient's terms, and the rest is tested as mirror paths are. Slabs do not be
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -21,18 +20,16 @@ from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.rf.channel.path_arrays import EDGE, MIRROR, SLAB
 from warprrf.rf.em.diffraction import EdgeRays, Pair, boundary_fields, diffraction_matrices
-from warprrf.rf.em.fresnel import SurfaceTable, slab_passage, slab_reflection
+from warprrf.rf.em.fresnel import SurfaceTable
 from warprrf.rf.paths.images import EdgeLeaves, MirrorImages
-from warprrf.rf.paths.mirror_paths import MirrorPaths, distinct, joined, passed, unobstructed
+from warprrf.rf.paths.mirror_paths import MirrorPaths, distinct, passed, unobstructed
 from warprrf.rf.paths.slabs import Walls
 from warprrf.rf.spectra.spectrum import transverse_basis
-
-LEAST_DB = -80.0
-"""Paths that are weaker than this, over an unobstructed straight path between the ends, are left out [dB]."""
+from warprrf.rows import Rows
 
 
 @dataclass(frozen=True)
-class EdgePaths:
+class EdgePaths(Rows):
     """L paths over one edge each, with a mirror or a slab before it, behind it, or none.
 
     Attributes:
@@ -83,8 +80,8 @@ class EdgePaths:
         falls (Kirchhoff's approximation). There, up to a detour of a wavelength, paths over an edge only bring what is
         left of theirs.
         """
-        found = found.widened(2)
-        count = found.patch.shape[1]
+        count = max(2, found.patch.shape[1])
+        found = found.of_width(count)
         friis = self.wavelength_m / (4.0 * np.pi * self.length_m)
         share = np.sqrt(self.power) / friis
         mirror = self.patch.max(axis=1, initial=-1)
@@ -99,32 +96,21 @@ class EdgePaths:
         near = self.detour_m < self.wavelength_m
         share = share * np.where(near & (left < 1.0), left, 1.0)
 
-        def filled(value: float, dtype: Any, *shape: int) -> np.ndarray:
-            return np.full((len(self), count, *shape), value, dtype)
-
-        point, code = filled(np.nan, float, 3), filled(0, np.int8)
-        point[:, :2], code[:, :2] = self.point, self.code
+        none, zero = np.full(self.code.shape, -1, np.int32), np.zeros(self.code.shape)
         edges = MirrorPaths(
-            self.receiver, filled(-1, np.int32), filled(-1, np.int32), point, share, self.length_m, self.excess_m, self.arrival,
-            filled(np.nan, float, 3), filled(0.0, float), filled(0.0, float), filled(np.nan, float), code,
-        )  # fmt: skip
-        return joined([found, edges.subset(np.flatnonzero(share > 0))])
-
-    def take(self, rows: np.ndarray) -> EdgePaths:
-        """The paths ``rows``."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in _ARRAYS})
+            self.receiver, none, none, self.point, share, self.length_m, self.excess_m, self.arrival,
+            np.full_like(self.point, np.nan), zero, zero, np.full_like(zero, np.nan), self.code,
+        ).of_width(count)  # fmt: skip
+        return MirrorPaths.joined([found, edges.subset(np.flatnonzero(share > 0))])
 
 
-_ARRAYS = tuple(f.name for f in fields(EdgePaths) if f.name != "wavelength_m")
-
-
-def patch_edges(patches: PlanarPatches, **options: Any) -> Edges:
+def patch_edges(patches: PlanarPatches) -> Edges:
     """Edges between planar patches: what is one patch has none, however its faces are bent by errors."""
     own = patches.face_patch >= 0
     normal = np.where(own[:, None], patches.normal[np.maximum(patches.face_patch, 0)], 0.0)
     turned = (normal * patches.mesh.face_normals).sum(axis=1) < 0
     group = patches.group[np.maximum(patches.face_patch, 0)]
-    return mesh_edges(patches.mesh, np.where(turned[:, None], -normal, normal), group, **options)
+    return mesh_edges(patches.mesh, np.where(turned[:, None], -normal, normal), group)
 
 
 class EdgeFinder:
@@ -135,10 +121,8 @@ class EdgeFinder:
         wavelength_m: Wavelength [m].
         table: Radio properties of the patches' groups; None for a bare mesh: fields without polarisation, reflected
             without a sign change.
-        edges: Those of the patches by default.
         walls: What may be passed, if anything.
         group: Row of ``table`` of each face, if there are walls.
-        least_db: See :data:`LEAST_DB`.
     """
 
     def __init__(
@@ -147,14 +131,11 @@ class EdgeFinder:
         wavelength_m: float,
         table: SurfaceTable | None = None,
         *,
-        edges: Edges | None = None,
         walls: Walls | None = None,
         group: np.ndarray | None = None,
-        least_db: float = LEAST_DB,
     ) -> None:
         self.images, self.wavelength_m, self.table = images, wavelength_m, table
-        self.edges = patch_edges(images.patches) if edges is None else edges
-        self.walls, self.group, self.least_db = walls, group, least_db
+        self.edges, self.walls, self.group = patch_edges(images.patches), walls, group
         self._leaves = EdgeLeaves(self.edges, images.device)
 
     def find(self, receivers: np.ndarray, mirrors: int = 1, progress: Progress | None = None) -> EdgePaths:
@@ -167,15 +148,18 @@ class EdgeFinder:
         """
         check_count("mirrors", mirrors, 0, 1)
         points = np.asarray(receivers, float).reshape(-1, 3)
-        parts = [self._described(_Ways.none(self.images.transmitter), np.zeros(0, int))]
+        place = self.images.transmitter
+        none = _Ways.over(
+            self.edges, np.zeros(0, int), np.zeros((0, 2), int), self.images.patches, place, place
+        )
+        parts = [self._described(none, none.edge)]
         for k, receiver in enumerate(points):
             ways = self._ways(receiver, mirrors)
             part = self._described(ways, np.full(len(ways.edge), k))
             parts.append(part.take(np.argsort(part.length_m, kind="stable")))
             if progress is not None:
                 progress("edges", k + 1, len(points))
-        every = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _ARRAYS}
-        return EdgePaths(**every, wavelength_m=self.wavelength_m)
+        return EdgePaths.joined(parts)
 
     def _ways(self, receiver: np.ndarray, mirrors: int) -> _Ways:
         """What reaches a receiver, unobstructed."""
@@ -193,7 +177,7 @@ class EdgeFinder:
         for sieve in (self._in_reach, partial(self._strong, direct), self._on_mirrors):
             ways = ways.take(np.flatnonzero(sieve(ways)))
         free = self._unobstructed(ways)
-        ways = ways.take(np.flatnonzero(free)).and_(self._passing(ways.take(np.flatnonzero(~free))))
+        ways = _Ways.joined([ways.take(free), self._passing(ways.take(~free))])
         # Wedges before the borders of their faces.
         ways = ways.take(np.argsort(self.edges.n[ways.edge], kind="stable"))
         return ways.take(ways.distinct(3.0 * patches.tolerance_m))
@@ -210,9 +194,10 @@ class EdgeFinder:
         return found
 
     def _strong(self, direct: float, ways: _Ways) -> np.ndarray:
-        """Whether paths reach the level even if every face and mirror reflects all."""
+        """Whether paths reach -80 dB of an unobstructed straight path between the ends, even if every face and mirror reflects
+        all."""
         most = np.abs(boundary_fields(self._rays(ways))).sum(axis=0) * direct / ways.leg.sum(axis=1)
-        return np.asarray(20.0 * np.log10(np.maximum(most, 1e-300)) > self.least_db)
+        return np.asarray(20.0 * np.log10(np.maximum(most, 1e-300)) > -80.0)
 
     def _on_mirrors(self, ways: _Ways) -> np.ndarray:
         found = np.ones(len(ways.edge), bool)
@@ -269,46 +254,30 @@ class EdgeFinder:
         """TE and TM of mirrors and faces of the patches ``(L,)``."""
         if self.table is None:
             return -np.ones(len(patch)), np.ones(len(patch))
-        group = self.images.patches.group[patch]
-        te, tm = slab_reflection(
-            cosine, self.table.permittivity[group], self.table.thickness_m[group], self.wavelength_m
-        )
-        smooth = np.sqrt(1.0 - self.table.scattering[group] ** 2)
-        return smooth * te, smooth * tm
-
-    def _passage(
-        self, group: np.ndarray, cosine: np.ndarray, thickness_m: np.ndarray | float = np.nan
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """TE and TM of slabs of ``group`` (L,), and by how much they make a path longer [m]; ``thickness_m`` of solids."""
-        if self.table is None:
-            raise ValueError("table: got None, expected materials beside walls")
-        solid = np.where(np.isnan(thickness_m), self.table.thickness_m[group], thickness_m)
-        return slab_passage(cosine, self.table.permittivity[group], solid, self.wavelength_m)
-
-    def _sheet(self, group: np.ndarray, cosine: np.ndarray, sheet: np.ndarray) -> Pair:
-        """TE and TM of a field behind a sheet over that of the way in air, 0 of what is no ``sheet``."""
-        te, tm, longer = self._passage(group, cosine)
-        late = np.where(sheet, np.exp(-2j * np.pi / self.wavelength_m * longer), 0.0)
-        return te * late, tm * late
+        return self.table.reflection(self.images.patches.group[patch], cosine, self.wavelength_m)
 
     def _described(self, ways: _Ways, receiver: np.ndarray) -> EdgePaths:
         edges, patches, rays = self.edges.take(ways.edge), self.images.patches, self._rays(ways)
         faces, cosines = patches.face_patch[edges.face], rays.incidence_cosines()
         reflected = [self._reflection(faces[:, j], cosines[2 + j]) for j in range(2)]
-        through = None
-        if self.walls is not None:
-            through = [self._sheet(patches.group[faces[:, j]], cosines[j], edges.n > 1.99) for j in range(2)]
+        through: list[Pair] | None = None
+        if self.walls is not None and self.table is not None:
+            through = []
+            for j in range(2):  # of the way in air, behind a sheet; nothing passes a wedge
+                te, tm, longer = self.table.passage(patches.group[faces[:, j]], cosines[j], self.wavelength_m)
+                late = np.where(edges.n > 1.99, np.exp(-2j * np.pi / self.wavelength_m * longer), 0.0)
+                through.append((te * late, tm * late))
         bent = diffraction_matrices(rays, reflected, through)
         before, behind = (_edge_basis(edges.along, ways.direction[:, j]) for j in range(2))
         field, sign = np.swapaxes(behind, 1, 2) @ bent @ before, bent[:, 0, 0].copy()
         outer, excess = ways.direction.copy(), np.zeros(len(ways.edge))
         for j in range(2):
             own = np.flatnonzero(ways.slab[:, j] >= 0)
-            if len(own) and self.walls is not None and self.group is not None:
+            if len(own) and self.walls is not None and self.group is not None and self.table is not None:
                 normal, way = self.walls.mesh.face_normals[ways.slab[own, j]], ways.direction[own, j]
                 cosine = np.abs((way * normal).sum(axis=1))
-                te, tm, excess[own] = self._passage(
-                    self.group[ways.slab[own, j]], cosine, ways.thickness_m[own, j]
+                te, tm, excess[own] = self.table.passage(
+                    self.group[ways.slab[own, j]], cosine, self.wavelength_m, ways.thickness_m[own, j]
                 )
                 slab = _at_plane(normal, way, way, te, tm)
                 field[own] = field[own] @ slab if j == 0 else slab @ field[own]
@@ -339,7 +308,7 @@ class EdgeFinder:
 
 
 @dataclass(frozen=True)
-class _Ways:
+class _Ways(Rows):
     """L ways over an edge each: the ``patch`` that mirrors or the face of the ``slab`` (L, 2) before and behind, -1 for none, where
     that ``stop`` is (L, 2, 3), and the ``thickness_m`` of a solid (L, 2); the ``point`` on the edge (L, 3) and ``at`` how far along
     (L,); and of both legs, unfolded at mirrors, lengths ``leg`` (L, 2), ``angle`` about the edge (L, 2) and ``direction`` of
@@ -392,23 +361,6 @@ class _Ways:
         stop = np.where(mirrored, point[:, None] + share * (image - point[:, None]), np.nan)
         slab, solid = np.full(patch.shape, -1), np.full(patch.shape, np.nan)
         return cls(edge, patch, slab, stop, solid, point, at, leg, angle, direction, end)
-
-    @classmethod
-    def none(cls, transmitter: np.ndarray) -> _Ways:
-        """No ways."""
-        shapes = {"edge": (), "at": (), "point": (3,), "stop": (2, 3), "direction": (2, 3), "end": (2, 3)}
-        found = {f.name: np.zeros((0, *shapes.get(f.name, (2,)))) for f in fields(cls)}
-        return cls(**found | {name: found[name].astype(int) for name in ("edge", "patch", "slab")})
-
-    def take(self, rows: np.ndarray) -> _Ways:
-        """The ways ``rows``."""
-        return _Ways(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
-
-    def and_(self, more: _Ways) -> _Ways:
-        """These ways, then ``more``."""
-        return _Ways(
-            **{f.name: np.concatenate([getattr(self, f.name), getattr(more, f.name)]) for f in fields(self)}
-        )
 
     def distinct(self, distance_m: float) -> np.ndarray:
         """Indices of ways that no earlier one repeats, with mirrors on the same sides and all points within ``distance_m``: edges

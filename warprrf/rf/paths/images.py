@@ -12,7 +12,7 @@ import copy
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,25 +28,20 @@ from warprrf.kernels.radio import edges as edge_kernels
 from warprrf.kernels.radio import mirrors as kernels
 from warprrf.kernels.radio.edges import find_over_edges
 from warprrf.kernels.radio.mirrors import IN_PLANE
+from warprrf.rows import Rows
 
-ALL_SPACE = 2.0  # a sine that stands for no cone
 MOST_KEPT = 4_000_000  # pairs of a chain and a patch to try up to which all chains are found once and kept
 BLOCK = 500_000  # chains that are unfolded at once
 MOST_CHAINS = 20_000_000
 """More chains of mirrors than this are not tried unless asked for: a minute on two cores in a room, twenty in a city."""
 
-CURVED_M2, CURVED_SHARE = 0.5, 0.01
-"""Area of smooth surfaces that facets stand for, and its share of all patches, above which a warning says so."""
-
-_PIECE_M = 20.0  # longer edges are cut, so that balls around neighbours stay small
 _WORDS = 16_000_000  # chains times leaves that are tried at once
 _SAMPLE = 1000  # chains from which the number of longer ones is estimated
-_FIRST, _LAUNCH_S = 4096, 0.1  # chains in the first launch; later ones take about so long
 _PARTS = 1000  # of a search, in which its progress is reported
 
 
 @dataclass(frozen=True)
-class Chains:
+class Chains(Rows):
     """Chains of k reflections.
 
     Attributes:
@@ -64,9 +59,10 @@ class Chains:
     def __len__(self) -> int:
         return len(self.sine)
 
-    def take(self, rows: slice | np.ndarray) -> Chains:
-        """The chains ``rows``."""
-        return Chains(self.patch[rows], self.image[rows], self.axis[rows], self.sine[rows])
+    @classmethod
+    def none(cls, order: int) -> Chains:
+        """No chains, of ``order`` reflections."""
+        return cls(np.zeros((0, order), np.int32), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
 
 class MirrorImages:
@@ -95,7 +91,9 @@ class MirrorImages:
         max_chains: float = MOST_CHAINS,
         device: DeviceLike = None,
     ) -> None:
-        if patches.two_sided and patches.curved_m2 > max(CURVED_M2, CURVED_SHARE * patches.area.sum()):
+        if patches.two_sided and patches.curved_m2 > max(
+            0.5, 0.01 * patches.area.sum()
+        ):  # what is less is detail
             warnings.warn(
                 f"mesh: {patches.curved_m2:.3g} m^2 of it are flat facets of smooth surfaces (a round pillar, say); each "
                 "mirrors as a plane or not at all, so that mirror paths off them are right in the mean alone",
@@ -109,10 +107,9 @@ class MirrorImages:
         self._on_device = _patches_on_device(
             patches, patches.tolerance_m if slack_m is None else slack_m, self.device
         )
-        root = Chains(
-            np.zeros((1, 0), np.int32), self.transmitter[None], np.zeros((1, 3)), np.array([ALL_SPACE])
-        )
-        self._kept = [root]
+        self._kept = [
+            Chains(np.zeros((1, 0), np.int32), self.transmitter[None], np.zeros((1, 3)), np.array([2.0]))
+        ]
 
     def search(
         self, points: np.ndarray, order: int, progress: Progress | None = None
@@ -127,7 +124,14 @@ class MirrorImages:
         Raises:
             ValueError: before anything is traced, if more than ``max_chains`` chains would be tried.
         """
-        ends = np.cumsum([0.0, *self._work(np.asarray(points, float).reshape(-1, 3), order)])
+        work, seconds = self._work(np.asarray(points, float).reshape(-1, 3), order)
+        if sum(work) > self.max_chains:
+            raise ValueError(
+                f"mirror_order: order {order} would try about {sum(work):.2g} chains of the mesh's {len(self.patches)} "
+                f"planar patches, some {seconds:.2g} seconds; expected at most {self.max_chains:.3g}: lower mirror_order, "
+                "simplify the mesh (fewer, larger planar patches), or give more max_chains to MirrorTracer"
+            )
+        ends = np.cumsum([0.0, *work])
 
         def tick(share: float) -> None:
             if progress is not None:
@@ -194,9 +198,8 @@ class MirrorImages:
                 _device.launch(find_over_edges, words.size, inputs, device=self.device)
                 chain, leaf, bit = _set_bits(words.numpy())
                 edge = leaves.edge[32 * leaf + bit]
-                chain, edge = np.unique(
-                    np.column_stack([chain, edge]), axis=0
-                ).T  # pieces of an edge share their ends
+                # Pieces of an edge share their ends.
+                chain, edge = np.unique(np.column_stack([chain, edge]), axis=0).T
                 parts.append((edge, some.patch[chain]))
         edge, patches = (np.concatenate(p) for p in zip(*parts, strict=True))
         return edge, patches
@@ -205,33 +208,19 @@ class MirrorImages:
         """All chains of 0, 1 ... reflections, up to ``order`` or as far as they are few; found once."""
         kept = self._kept
         while len(kept) <= order and len(kept[-1]) * len(self.patches) <= MOST_KEPT:
-            blocks = [block for block, _ in self._extended(kept[-1], np.zeros(3), -1.0, BLOCK)]
-            kept = [*kept, _joined(blocks, len(kept))]
+            blocks = [block for block, _ in self._extended(kept[-1], np.zeros(3), -1.0)]
+            kept = [*kept, Chains.joined([Chains.none(len(kept)), *blocks])]
         self._kept = kept
         return kept
 
     def affordable(self, points: np.ndarray, order: int) -> int:
         """The most reflections, up to ``order``, whose :meth:`search` is not refused."""
-        work, _ = self._estimated(np.asarray(points, float).reshape(-1, 3), order)
+        work, _ = self._work(np.asarray(points, float).reshape(-1, 3), order)
         return int((np.cumsum(work) <= self.max_chains).sum())
 
-    def _work(self, points: np.ndarray, order: int) -> list[float]:
-        """Number of chains that each search of 1, 2 ... ``order`` reflections tries: estimated if they are many.
-
-        Raises:
-            ValueError: if it is more than ``max_chains``.
-        """
-        work, seconds = self._estimated(points, order)
-        if sum(work) > self.max_chains:
-            raise ValueError(
-                f"mirror_order: order {order} would try about {sum(work):.2g} chains of the mesh's {len(self.patches)} "
-                f"planar patches, some {_spoken(seconds)}; expected at most {self.max_chains:.3g}: lower mirror_order, "
-                "simplify the mesh (fewer, larger planar patches), or give more max_chains to MirrorTracer"
-            )
-        return work
-
-    def _estimated(self, points: np.ndarray, order: int) -> tuple[list[float], float]:
-        """What :meth:`_work` gives, and the seconds of what is estimated; nothing is refused."""
+    def _work(self, points: np.ndarray, order: int) -> tuple[list[float], float]:
+        """Number of chains that each search of 1, 2 ... ``order`` reflections tries, estimated if they are many, and the
+        seconds of what is estimated."""
         if len(points) == 0 or len(self.patches) == 0:
             return [0.0] * order, 0.0
         kept, rng, ends = self._keep(order), np.random.default_rng(0), _Ends(points, self.device)
@@ -241,7 +230,7 @@ class MirrorImages:
             sample = sample.take(np.sort(rng.permutation(len(sample))[:_SAMPLE]))
             each = many / max(len(sample), 1)
             begin = time.perf_counter()
-            last = sum(len(block) for block, _ in self._extended(sample, ends.middle, ends.radius, BLOCK))
+            last = sum(len(block) for block, _ in self._extended(sample, ends.middle, ends.radius))
             work.append(shorter + each * last)
             seconds += each * (time.perf_counter() - begin)
             if k < order:  # later searches go on from all of them
@@ -254,12 +243,12 @@ class MirrorImages:
     def _some_longer(self, chains: Chains, rng: np.random.Generator) -> tuple[Chains, int]:
         """About ``_SAMPLE`` of the chains of one reflection more that follow ``chains``, and how many these are."""
         parts = []
-        for block, _ in self._extended(chains, np.zeros(3), -1.0, BLOCK):
+        for block, _ in self._extended(chains, np.zeros(3), -1.0):
             parts.append((block.take(rng.permutation(len(block))[:_SAMPLE]), len(block)))
         whole = sum(size for _, size in parts)
         share = min(1.0, _SAMPLE / max(whole, 1))
         some = [part.take(slice(int(np.ceil(share * size)))) for part, size in parts]
-        return _joined(some, chains.patch.shape[1] + 1), whole
+        return Chains.joined([Chains.none(chains.patch.shape[1] + 1), *some]), whole
 
     def _descendants(
         self, chains: Chains, steps: int, middle: np.ndarray, reach: float
@@ -270,26 +259,22 @@ class MirrorImages:
                 yield chains.take(slice(k, k + BLOCK)), min((k + BLOCK) / len(chains), 1.0)
             return
         before = 0.0
-        for block, share in self._extended(chains, middle, reach if steps == 1 else -1.0, BLOCK):
+        for block, share in self._extended(chains, middle, reach if steps == 1 else -1.0):
             for some, within in self._descendants(block, steps - 1, middle, reach):
                 yield some, before + within * (share - before)
             before = share
 
-    def _extended(
-        self, chains: Chains, middle: np.ndarray, reach: float, most: int
-    ) -> Iterator[tuple[Chains, float]]:
-        """Chains of one reflection more, about ``most`` at a time, and the share of ``chains`` that is done."""
+    def _extended(self, chains: Chains, middle: np.ndarray, reach: float) -> Iterator[tuple[Chains, float]]:
+        """Chains of one reflection more, about :data:`BLOCK` at a time, and the share of ``chains`` that is done."""
         last = chains.patch[:, -1] if chains.patch.shape[1] else np.full(len(chains), -1)
-        first, size = 0, _FIRST
-        while first < len(chains):
-            begin = time.perf_counter()
+        size = 16_384  # of a launch: a second or so in a city, after which the caller is told
+        for first in range(0, len(chains), size):
             stretch = slice(first, first + size)
             count = self._extend(chains.take(stretch), last[stretch], middle, reach, None)[0]
-            took = time.perf_counter() - begin
             ends, done = np.cumsum(count, dtype=np.int64), 0
             while done < len(count):
                 before = ends[done - 1] if done else 0
-                stop = max(done + 1, int(np.searchsorted(ends, before + most, side="right")))
+                stop = max(done + 1, int(np.searchsorted(ends, before + BLOCK, side="right")))
                 some = slice(first + done, first + stop)
                 parents = chains.take(some)
                 _, parent, patch, image, axis, sine = self._extend(
@@ -298,8 +283,6 @@ class MirrorImages:
                 longer = np.column_stack([parents.patch[parent], patch]).astype(np.int32, copy=False)
                 yield Chains(longer, image, axis, sine), (first + stop) / len(chains)
                 done = stop
-            first += len(count)
-            size = int(np.clip(size * _LAUNCH_S / max(took, 1e-9), size // 4 + 1, 4 * size))
 
     def _extend(
         self, chains: Chains, last: np.ndarray, middle: np.ndarray, reach: float, count: np.ndarray | None
@@ -376,7 +359,8 @@ class EdgeLeaves:
     """
 
     def __init__(self, edges: Edges, where: wp.Device) -> None:
-        count = np.maximum(1, np.ceil(edges.length / _PIECE_M)).astype(int)
+        longest_m = 20.0  # longer edges are cut, so that balls around neighbours stay small
+        count = np.maximum(1, np.ceil(edges.length / longest_m)).astype(int)
         edge = np.repeat(np.arange(len(edges)), count)
         piece = edges.length[edge] / count[edge]
         start = (np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)) * piece
@@ -404,20 +388,6 @@ def _set_bits(words: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     octets = words[row, column].astype("<u4", copy=False).view(np.uint8).reshape(-1, 4)
     some, bit = np.nonzero(np.unpackbits(octets, axis=1, bitorder="little"))
     return row[some], column[some], bit
-
-
-def _joined(parts: list[Chains], order: int) -> Chains:
-    """``parts`` of chains of ``order`` reflections, one after another."""
-    none = Chains(np.zeros((0, order), np.int32), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-    return Chains(*(np.concatenate([getattr(p, f.name) for p in (none, *parts)]) for f in fields(Chains)))
-
-
-def _spoken(seconds: float) -> str:
-    """A duration as people say it."""
-    for unit, length in (("days", 86400.0), ("hours", 3600.0), ("minutes", 60.0)):
-        if seconds >= 1.5 * length:
-            return f"{seconds / length:.0f} {unit}"
-    return f"{seconds:.0f} seconds"
 
 
 def _cones(chains: Chains, where: wp.Device) -> Any:

@@ -13,10 +13,12 @@ slab does not bend its way.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import chain
+from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
@@ -25,14 +27,11 @@ from warprrf.rf.channel.path_arrays import EDGE, MIRROR, SLAB
 from warprrf.rf.paths.images import MirrorImages
 from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.paths.slabs import Slabs, Walls
-
-ZONE_RINGS = ((0.0, 1), (0.5, 6), (0.9, 8))
-"""Radii (share of a Fresnel zone's) and numbers of the rays that fill it: about equal areas each."""
-LEAST_SHARE = 0.05  # paths that keep less of their field are dropped: -26 dB
+from warprrf.rows import Rows
 
 
 @dataclass(frozen=True)
-class MirrorPaths:
+class MirrorPaths(Rows):
     """Line of sight and mirror paths of several receivers, L rows, over up to K mirrors and slabs.
 
     Attributes:
@@ -101,26 +100,27 @@ class MirrorPaths:
         for k in np.unique(count):
             yield int(k), np.flatnonzero(count == k)
 
-    def subset(self, chosen: np.ndarray) -> MirrorPaths:
-        """The rows ``chosen``."""
-        return MirrorPaths(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
+    subset = Rows.take
 
-    def widened(self, most: int) -> MirrorPaths:
-        """The same with ``most`` columns at least, empty ones behind."""
-        more, empty = (
-            max(most - self.patch.shape[1], 0),
-            {"patch": -1, "slab": -1, "cosine": 0, "turn": 0, "code": 0},
-        )
-        wide = {f.name: getattr(self, f.name) for f in fields(self)}
-        for name in (*empty, "point", "normal", "thickness_m"):
-            pad = [(0, 0), (0, more), (0, 0)][: wide[name].ndim]
-            wide[name] = np.pad(wide[name], pad, constant_values=empty.get(name, np.nan))
-        return MirrorPaths(**wide)
+    def of_width(self, most: int) -> MirrorPaths:
+        """The same with ``most`` columns, the last ones left off or empty ones behind."""
+        wide: dict[str, Any] = {}
+        for name, empty in _EMPTY.items():
+            column = getattr(self, name)[:, :most]
+            pad = [(0, 0), (0, most - column.shape[1]), (0, 0)][: column.ndim]
+            wide[name] = np.pad(column, pad, constant_values=empty)
+        return replace(self, **wide)
 
     def of(self, receivers: np.ndarray) -> MirrorPaths:
         """The rows of ``receivers`` (N,), ascending, which are counted anew."""
         own = self.subset(np.isin(self.receiver, receivers))
         return replace(own, receiver=np.searchsorted(receivers, own.receiver))
+
+
+_EMPTY = {
+    "patch": -1, "slab": -1, "point": np.nan, "normal": np.nan, "cosine": 0.0, "turn": 0.0, "thickness_m": np.nan, "code": 0,
+}  # fmt: skip
+"""What columns hold past a path's last mirror or slab."""
 
 
 def exact_paths(
@@ -163,7 +163,7 @@ def exact_paths(
             own, slabs = through[own], [s.take(own) for s in slabs]
             found = row[own], patch[own], point[own], np.ones(len(own))
             parts.append(described(patches, source, receivers, found, order, walls, slabs))
-    paths = joined(parts)
+    paths = MirrorPaths.joined(parts)
     return paths.subset(np.argsort(paths.receiver, kind="stable"))
 
 
@@ -193,7 +193,7 @@ def zone_paths(
         walls: What may be passed.
 
     Returns:
-        Rows by order. Those with less than :data:`LEAST_SHARE` of their field are left out.
+        Rows by order. Those with less than a twentieth of their field, -26 dB, are left out.
 
     Raises:
         ValueError: before anything is traced, if more chains would be tried than ``images`` allow.
@@ -211,23 +211,17 @@ def zone_paths(
         if walls is not None:
             dark = np.flatnonzero(~free)
             dark = dark[through.reached(receivers[row[dark]], patch[dark], point[dark])]
-            own, slabs = passed(
-                walls,
-                *legs_of(patches, source, receivers[row[dark]], patch[dark], point[dark], position_error_m),
-            )
+            legs = legs_of(patches, source, receivers[row[dark]], patch[dark], point[dark], position_error_m)
+            own, slabs = passed(walls, *legs)
             dark = dark[own]
             kept[dark] = False
-            found = (
-                row[dark],
-                patch[dark],
-                point[dark],
-                through.share(receivers[row[dark]], patch[dark], point[dark]),
-            )
+            share = through.share(receivers[row[dark]], patch[dark], point[dark])
+            found = row[dark], patch[dark], point[dark], share
             parts.append(described(patches, source, receivers, found, order, walls, slabs))
         row, patch, point = row[kept], patch[kept], point[kept]
         found = row, patch, point, zone.share(receivers[row], patch, point)
         parts.append(described(patches, source, receivers, found, order, walls))
-    return joined(parts)
+    return MirrorPaths.joined(parts)
 
 
 class ZoneRays:
@@ -244,10 +238,15 @@ class ZoneRays:
     ) -> None:
         self.patches, self.source, self.wavelength_m, self.walls = patches, source, wavelength_m, walls
         self.position_error_m, self.device = position_error_m, device
+        rings = (
+            (0.0, 1),
+            (0.5, 6),
+            (0.9, 8),
+        )  # radii, as shares of the zone's, and numbers of rays: about equal areas each
         self.samples = np.array(
             [
                 (radius * np.cos(a), radius * np.sin(a))
-                for ring, (radius, count) in enumerate(ZONE_RINGS)
+                for ring, (radius, count) in enumerate(rings)
                 for a in 2 * np.pi * (np.arange(count) + 0.5 * (ring % 2)) / count
             ]
         )
@@ -410,16 +409,11 @@ def distinct(row: np.ndarray, point: np.ndarray, distance_m: float) -> np.ndarra
     """Indices of paths that no earlier one of the same receiver repeats, all points within ``distance_m``, sorted."""
     if point.shape[1] == 0 or len(row) < 2:
         return np.arange(len(row))
+    # Other receivers' points are further away than any of its own that count.
+    place = np.column_stack([3.0 * distance_m * row, point[:, 0]])
+    a, b = cKDTree(place).query_pairs(distance_m, output_type="ndarray").T
     same = np.zeros(len(row), bool)
-    key = np.lexsort((point[:, 0, 0], row))
-    for step in range(1, len(key)):
-        a, b = key[:-step], key[step:]
-        close = (row[a] == row[b]) & (np.abs(point[a, 0, 0] - point[b, 0, 0]) <= distance_m)
-        if not close.any():
-            break
-        a, b = a[close], b[close]
-        equal = (np.linalg.norm(point[a] - point[b], axis=2) <= distance_m).all(axis=1)
-        same[np.maximum(a, b)[equal]] = True
+    same[b[(np.linalg.norm(point[a] - point[b], axis=2) <= distance_m).all(axis=1)]] = True
     return np.flatnonzero(~same)
 
 
@@ -434,17 +428,14 @@ def described(
 ) -> MirrorPaths:
     """Rows of paths of one order (receiver, patch, point, share) over what ``slabs`` each leg passes, what they lack of all
     columns filled up."""
-    kept = np.flatnonzero(found[3] >= LEAST_SHARE)
+    kept = np.flatnonzero(found[3] >= 0.05)
     row, patch, point, share = (a[kept] for a in found)
     most = max(order, 1) + (walls.most if walls else 0)
     normal, slab = patches.normal[patch], np.full(patch.shape, -1, np.int32)
     thickness = np.full(patch.shape, np.nan)
     if walls is not None and slabs is not None:
-        mesh, stops, columns = (
-            patches.mesh,
-            stops_of(source, point, receivers[row]),
-            list[tuple[np.ndarray, ...]](),
-        )
+        mesh, stops = patches.mesh, stops_of(source, point, receivers[row])
+        columns: list[tuple[np.ndarray, ...]] = []
         for k, s in enumerate(s.take(kept) for s in slabs):
             leg = stops[:, k + 1] - stops[:, k]
             for j in range(walls.most):
@@ -463,9 +454,9 @@ def described(
         first = np.argsort((patch < 0) & (slab < 0), axis=1, kind="stable")
         patch, slab, thickness = (np.take_along_axis(a, first, axis=1) for a in (patch, slab, thickness))
         point, normal = (np.take_along_axis(a, first[..., None], axis=1) for a in (point, normal))
-    count, columns_now = ((patch >= 0) | (slab >= 0)).sum(axis=1), patch.shape[1]
+    count = ((patch >= 0) | (slab >= 0)).sum(axis=1)
     length, arrival = np.zeros(len(row)), np.zeros((len(row), 3))
-    cosine, turn = np.zeros((2, len(row), columns_now))
+    cosine, turn = np.zeros((2, *patch.shape))
     for k in np.unique(count):
         own = np.flatnonzero(count == k)
         stops = stops_of(source, point[own, :k], receivers[row[own]])
@@ -476,28 +467,12 @@ def described(
         cosine[own, :k] = np.abs((along[:, :-1] * normal[own, :k]).sum(axis=2))
         turn[own, :k] = turns(stops, normal[own, :k])
 
-    def filled(a: np.ndarray, value: float) -> np.ndarray:
-        shape = len(row), most, *a.shape[2:]
-        out = np.full(shape, value, a.dtype)
-        out[:, : min(most, columns_now)] = a[:, :most]
-        return out
-
     code = np.where(slab >= 0, SLAB, np.where(patch >= 0, MIRROR, 0)).astype(np.int8)
     return MirrorPaths(
-        receiver=row, patch=filled(patch, -1), slab=filled(slab, -1), point=filled(point, np.nan), share=share,
-        length_m=length, excess_m=0.0 * length, arrival=arrival,
-        normal=filled(normal, np.nan), cosine=filled(cosine, 0.0), turn=filled(turn, 0.0),
-        thickness_m=filled(thickness, np.nan), code=filled(code, 0),
-    )  # fmt: skip
+        row, patch, slab, point, share, length, 0.0 * length, arrival, normal, cosine, turn, thickness, code
+    ).of_width(most)
 
 
 def stops_of(source: np.ndarray, point: np.ndarray, ends: np.ndarray) -> np.ndarray:
     """Transmitter, mirror points and receiver of each path, shape ``(L, k + 2, 3)``."""
     return np.concatenate([np.broadcast_to(source, (len(ends), 1, 3)), point, ends[:, None]], axis=1)
-
-
-def joined(parts: list[MirrorPaths]) -> MirrorPaths:
-    """All paths of ``parts``, one after another."""
-    return MirrorPaths(
-        **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(MirrorPaths)}
-    )

@@ -29,7 +29,6 @@ from warprrf.checks import (
 from warprrf.netcdf_files import Variable
 from warprrf.rf.channel import dispersion as dispersions
 from warprrf.rf.channel import response
-from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.path_arrays import PADDING, PathArrays
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.paths import sionna
@@ -54,16 +53,7 @@ class Paths(PathArrays):
     diffuse_power = response.diffuse_power
     dispersion = dispersions.dispersion
 
-    def to_sionna(
-        self,
-        tx_array: PlanarArray | None = None,
-        rx_array: PlanarArray | None = None,
-        *,
-        diffuse: str | None = None,
-        seed: int = 0,
-    ) -> sionna.SionnaPaths:
-        """Arrays in the shapes and conventions of Sionna RT; see :func:`warprrf.rf.paths.sionna.to_sionna`."""
-        return sionna.to_sionna(self, tx_array, rx_array, diffuse=diffuse, seed=seed)
+    to_sionna = sionna.to_sionna
 
     @classmethod
     def from_sionna(
@@ -89,7 +79,11 @@ class Paths(PathArrays):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write to a NetCDF-4 file, whole or not at all; see :mod:`warprrf.rf.paths.path_set`."""
-        write_paths(path, self)
+        several = self.as_several()
+        held = several.receiver, several.transmitter, several.frequency_hz, several.air
+        ends, attributes = ends_and_attributes(*held)
+        attributes["single_receiver"] = int(not self.batched)
+        netcdf_files.write(path, arrays_of(several) | ends, PATH_VARIABLES, {}, attributes)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Paths:
@@ -99,9 +93,10 @@ class Paths(PathArrays):
             OSError: naming the file, if it cannot be read.
             ValueError: naming it, if it is damaged, or holds something else.
         """
-        arrays, one_receiver = read_paths(path)
-        several = cls(**arrays)
-        return several[0] if one_receiver else several
+        held, attributes = netcdf_files.read(path, PATH_VARIABLES, {})
+        with named(path, "damaged, or no paths"):
+            several = cls(**_fields_of(held, attributes))
+            return several[0] if attributes["single_receiver"] else several
 
 
 KINDS = ("", "los", "mirror", "diffuse", "slab", "edge")
@@ -189,48 +184,31 @@ def ends_and_attributes(
     return known, attributes | ({} if air is None else air.attributes)
 
 
-def write_paths(path: str | os.PathLike[str], paths: PathArrays) -> None:
-    """Write ``paths`` to a NetCDF-4 file, whole or not at all."""
-    several = paths.as_several()
-    ends, attributes = ends_and_attributes(
-        several.receiver, several.transmitter, several.frequency_hz, several.air
-    )
-    attributes["single_receiver"] = int(not paths.batched)
-    netcdf_files.write(path, arrays_of(several) | ends, PATH_VARIABLES, {}, attributes)
-
-
-def read_paths(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bool]:
-    """The fields of what :func:`write_paths` wrote, as paths of several receivers, and whether it was one receiver's.
-
-    Raises:
-        OSError: naming the file, if it cannot be read.
-        ValueError: naming it, if it is damaged, or holds something else.
-    """
-    held, attributes = netcdf_files.read(path, PATH_VARIABLES, {})
-    with named(path, "damaged, or no paths"):
-        if attributes.get("format") != _FORMAT:
-            raise ValueError(f"it holds {attributes.get('format')!r}, expected {_FORMAT!r}")
-        check_arrays(held, {name: wanted for name, wanted in _ARRAYS.items() if name in held})
-        carrier = attributes.get("frequency_hz")
-        there = {"jones_real", "jones_imag"} & held.keys()
-        fields: dict[str, Any] = {
-            "gain": held["gain_real"] + 1j * held["gain_imag"],
-            "vertices": held["vertices"],
-            "kind": np.array(KINDS, dtype="<U7")[held["kind"].astype(int)],
-            "valid": held["valid"].astype(bool),
-            "jones": held["jones_real"] + 1j * held["jones_imag"] if there else None,
-            "frequency_hz": None if carrier is None else check_positive("frequency_hz", carrier),
-            "transmitter": held.get("transmitter_position", held.get("transmitter_positions")),
-            "receiver": held.get("receiver_position"),
-            "air": Air.from_attributes(attributes),
-            **{name: held[name] for name in (*_UNITS, "interactions") if name in held},
-        }
-        for name, empty in PADDING.items():
-            if fields.get(name) is not None:
-                fields[name][~fields["valid"]] = empty
-        check_known_whole("vertices", fields["vertices"])
-        for way, angles in (("arrival", ("theta_r", "phi_r")), ("departure", ("theta_t", "phi_t"))):
-            check_known_whole(way, np.stack([fields[name] for name in angles], axis=-1))
-        if there:
-            check_known_whole("jones", fields["jones"], axes=2)
-        return fields, bool(attributes["single_receiver"])
+def _fields_of(held: dict[str, np.ndarray], attributes: dict[str, Any]) -> dict[str, Any]:
+    """Paths of several receivers, by the names of their fields, from what a file holds; errors name the array."""
+    if attributes.get("format") != _FORMAT:
+        raise ValueError(f"it holds {attributes.get('format')!r}, expected {_FORMAT!r}")
+    check_arrays(held, {name: wanted for name, wanted in _ARRAYS.items() if name in held})
+    carrier = attributes.get("frequency_hz")
+    there = {"jones_real", "jones_imag"} & held.keys()
+    fields: dict[str, Any] = {
+        "gain": held["gain_real"] + 1j * held["gain_imag"],
+        "vertices": held["vertices"],
+        "kind": np.array(KINDS, dtype="<U7")[held["kind"].astype(int)],
+        "valid": held["valid"].astype(bool),
+        "jones": held["jones_real"] + 1j * held["jones_imag"] if there else None,
+        "frequency_hz": None if carrier is None else check_positive("frequency_hz", carrier),
+        "transmitter": held.get("transmitter_position", held.get("transmitter_positions")),
+        "receiver": held.get("receiver_position"),
+        "air": Air.from_attributes(attributes),
+        **{name: held[name] for name in (*_UNITS, "interactions") if name in held},
+    }
+    for name, empty in PADDING.items():
+        if fields.get(name) is not None:
+            fields[name][~fields["valid"]] = empty
+    check_known_whole("vertices", fields["vertices"])
+    for way, angles in (("arrival", ("theta_r", "phi_r")), ("departure", ("theta_t", "phi_t"))):
+        check_known_whole(way, np.stack([fields[name] for name in angles], axis=-1))
+    if there:
+        check_known_whole("jones", fields["jones"], axes=2)
+    return fields

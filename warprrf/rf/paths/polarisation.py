@@ -132,23 +132,13 @@ def chain_amplitude(
     Returns:
         The amplitude, shape ``(L,)``, and its derivatives to ``log_excess``, shape ``(L, k)``.
     """
-    whole, slopes = _chains(log_excess, cosine, turn, reflects)
-    transmitted, received = ends
-    return (
-        np.einsum("li,lij,lj->l", received, whole, transmitted),
-        np.einsum("li,klij,lj->lk", received, slopes, transmitted),
-    )
-
-
-def _chains(
-    log_excess: np.ndarray, cosine: np.ndarray, turn: np.ndarray, reflects: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Jones matrices of chains in (TE, TM), shape ``(L, 2, 2)``, and their derivatives, shape ``(k, L, 2, 2)``."""
     amplitude, rise = _half_space(log_excess, cosine)
     amplitude = np.where(reflects[..., None], amplitude, 1.0)
     rise = np.where(reflects[..., None], rise, 0.0)
     rotation = _rotations(np.where(reflects, turn, 0.0))
-    count, mirrors = cosine.shape
+    count, mirrors = (
+        cosine.shape
+    )  # Jones matrices in (TE, TM), (L, 2, 2), and their derivatives, (k, L, 2, 2)
     whole = np.broadcast_to(np.eye(2), (count, 2, 2))
     slopes = np.zeros((mirrors, count, 2, 2))
     for k in range(mirrors):
@@ -156,7 +146,11 @@ def _chains(
         whole = amplitude[:, k, :, None] * turned
         slopes[:k] = amplitude[:, k, :, None] * (rotation[:, k] @ slopes[:k])
         slopes[k] = rise[:, k, :, None] * turned
-    return whole, slopes
+    transmitted, received = ends
+    return (
+        np.einsum("li,lij,lj->l", received, whole, transmitted),
+        np.einsum("li,klij,lj->lk", received, slopes, transmitted),
+    )
 
 
 def _half_space(log_excess: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -64,7 +64,7 @@ class SionnaPaths:
         Nothing moves: all ``num_time_steps`` T are alike. ``out_type`` "torch" gives complex64 and float32 tensors.
         """
         a, tau = impulse_response(self._paths, normalize_delays=normalize_delays, **self._options)
-        a = _one_transmitter(a)[..., None]
+        a = a[:, :, None, ..., None]
         steps = check_count("num_time_steps", num_time_steps, most=MOST_TIME_STEPS)
         a = np.broadcast_to(a, (*a.shape[:-1], steps)).copy()
         return _as(a, out_type), _as(np.where(self.valid, tau[:, None], -1.0), out_type)
@@ -77,21 +77,14 @@ class SionnaPaths:
         normalize_delays: bool = True,
         normalize: bool = False,
         out_type: str = "numpy",
-        method: str = "auto",
     ) -> Any:
         """Frequency response ``(R, M, 1, N, T, F)`` at baseband ``frequencies`` (F,) [Hz], as ``sionna.rt.Paths.cfr``.
 
-        ``normalize`` scales each link to unit mean energy; ``method`` is that of
-        :func:`~warprrf.rf.channel.response.frequency_response`.
+        ``normalize`` scales each link to unit mean energy.
         """
         f = self._paths.carrier_hz + check_array("frequencies", frequencies, (None,))
         h = frequency_response(
-            self._paths,
-            f,
-            squint=False,
-            normalize_delays=normalize_delays,
-            method=method,
-            **self._options,
+            self._paths, f, squint=False, normalize_delays=normalize_delays, **self._options
         )
         return _as(_time_steps(h, num_time_steps, normalize, mean=True), out_type)
 
@@ -107,15 +100,8 @@ class SionnaPaths:
         out_type: str = "numpy",
     ) -> Any:
         """Taps ``(R, M, 1, N, T, l_max - l_min + 1)``, as ``sionna.rt.Paths.taps``."""
-        h = channel_taps(
-            self._paths,
-            bandwidth,
-            l_min,
-            l_max,
-            squint=False,
-            normalize_delays=normalize_delays,
-            **self._options,
-        )
+        link = {"squint": False, "normalize_delays": normalize_delays} | self._options
+        h = channel_taps(self._paths, bandwidth, l_min, l_max, **link)
         return _as(_time_steps(h, num_time_steps, normalize, mean=False), out_type)
 
 
@@ -149,7 +135,7 @@ def to_sionna(
         return np.where(valid, values, 0.0)[:, None]
 
     return SionnaPaths(
-        a=_one_transmitter(passband),
+        a=passband[:, :, None],
         tau=np.where(valid, tau, -1.0)[:, None],
         theta_t=angle(several.theta_t),
         phi_t=angle(several.phi_t),
@@ -239,11 +225,6 @@ def repeated(paths: PathArrays) -> np.ndarray:
     return np.asarray(np.tril(same, -1).any(axis=1))
 
 
-def _one_transmitter(h: np.ndarray) -> np.ndarray:
-    """``(R, M, N, ...)`` as ``(R, M, 1, N, ...)``."""
-    return h[:, :, None]
-
-
 def _time_steps(h: np.ndarray, count: int, normalize: bool, *, mean: bool) -> np.ndarray:
     """``(R, M, N, F)`` as ``(R, M, 1, N, T, F)``; normalised over a link's mean energy, or its energy in all taps."""
     count = check_count("num_time_steps", count, most=MOST_TIME_STEPS)
@@ -252,7 +233,7 @@ def _time_steps(h: np.ndarray, count: int, normalize: bool, *, mean: bool) -> np
         energy = energy.mean(axis=-1) if mean else energy.sum(axis=-1)
         energy = energy.mean(axis=(1, 2))[:, None, None, None]
         h = np.divide(h, np.sqrt(energy), out=np.zeros_like(h), where=energy > 0)
-    several = _one_transmitter(h)[..., None, :]
+    several = h[:, :, None, :, None]
     return np.broadcast_to(several, (*several.shape[:-2], count, several.shape[-1])).copy()
 
 

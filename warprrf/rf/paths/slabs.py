@@ -16,15 +16,14 @@ from warprrf.cache import cached_property
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.fresnel import slab_transmission
+from warprrf.rows import Rows
 
 THICKEST_M = 1.0
 """Thicker solids are taken to be hollow, a cabinet's or a room's: two sheets."""
-THIN_M = 0.01  # that a solid is perhaps only as thick as
-LEAST_POWER = 1e-6  # of what lets less through nothing is sought
 
 
 @dataclass(frozen=True)
-class Slabs:
+class Slabs(Rows):
     """Slabs that N straight ways pass, in the order they are met, up to K each.
 
     Attributes:
@@ -62,15 +61,12 @@ class Slabs:
         used[:1] |= ~used.any()
         return Slabs(*(getattr(self, f.name)[:, used] for f in fields(self)))
 
-    def take(self, rows: np.ndarray) -> Slabs:
-        """Those of the ways ``rows``."""
-        return Slabs(*(getattr(self, f.name)[rows] for f in fields(self)))
 
-
+@dataclass(frozen=True, eq=False)
 class Walls:
     """Faces of a mesh that may be passed.
 
-    Args:
+    Attributes:
         mesh: the mesh.
         passes: which faces let something through, shape ``(F,)`` bool.
         most: most slabs on one way.
@@ -78,16 +74,11 @@ class Walls:
         device: where rays are cast.
     """
 
-    def __init__(
-        self, mesh: Mesh, passes: np.ndarray, most: int, clearance_m: float, device: DeviceLike = None
-    ) -> None:
-        self.mesh, self.passes, self.most, self.clearance_m, self.device = (
-            mesh,
-            passes,
-            most,
-            clearance_m,
-            device,
-        )
+    mesh: Mesh
+    passes: np.ndarray
+    most: int
+    clearance_m: float
+    device: DeviceLike = None
 
     @classmethod
     def of_slabs(
@@ -100,11 +91,12 @@ class Walls:
         clearance_m: float,
         device: DeviceLike = None,
     ) -> Walls:
-        """Those of which slabs of ``permittivity`` (F,) and ``thickness_m`` (F,), if they are sheets, let more than
-        :data:`LEAST_POWER` through."""
-        thickness = np.where(mesh.closed_part_of >= 0, np.minimum(thickness_m, THIN_M), thickness_m)
+        """Those of which slabs of ``permittivity`` (F,) and ``thickness_m`` (F,), if they are sheets, let more than a
+        millionth of the power through."""
+        # A solid is perhaps only a centimetre thick.
+        thickness = np.where(mesh.closed_part_of >= 0, np.minimum(thickness_m, 0.01), thickness_m)
         te = slab_transmission(1.0, permittivity, thickness, wavelength_m)[0]
-        return cls(mesh, np.abs(te) ** 2 > LEAST_POWER, most, clearance_m, device)
+        return cls(mesh, np.abs(te) ** 2 > 1e-6, most, clearance_m, device)
 
     @cached_property
     def _part(self) -> np.ndarray:
@@ -186,6 +178,4 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _joined(parts: list[tuple[np.ndarray, Slabs]]) -> tuple[np.ndarray, Slabs]:
     rows, slabs = zip(*parts, strict=True)
-    return np.concatenate(rows), Slabs(
-        *(np.concatenate([getattr(s, f.name) for s in slabs]) for f in fields(Slabs))
-    )
+    return np.concatenate(rows), Slabs.joined(slabs)

@@ -14,7 +14,7 @@ from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, GeometryLike, as_mesh
 from warprrf.geometry.planar_patches import planar_patches
 from warprrf.rf.em.absorption import Gas
-from warprrf.rf.em.fresnel import SurfaceTable, slab_passage, slab_reflection, surface_table
+from warprrf.rf.em.fresnel import SurfaceTable, surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.paths.edge_paths import EdgeFinder, EdgePaths
 from warprrf.rf.paths.images import MOST_CHAINS, MirrorImages
@@ -236,13 +236,12 @@ class MirrorTracer:
             through = slab >= 0
             material = self.patches.group[patch]
             material[through] = self._face_material[slab[through]]
-            eta, thickness = self.table.permittivity[material], self.table.thickness_m[material]
-            fields = slab_reflection(cos, eta, thickness, self.wavelength_m)
-            te, tm = (np.sqrt(1.0 - self.table.scattering[material] ** 2) * r for r in fields)
+            te, tm = self.table.reflection(material, cos, self.wavelength_m)
             if through.any():
-                solid = found.thickness_m[own, :count]
-                passed = cos[through], eta[through], np.where(np.isnan(solid), thickness, solid)[through]
-                te[through], tm[through], longer = slab_passage(*passed, self.wavelength_m)
+                solid = found.thickness_m[own, :count][through]
+                te[through], tm[through], longer = self.table.passage(
+                    material[through], cos[through], self.wavelength_m, solid
+                )
                 excess_m[own] = np.bincount(np.nonzero(through)[0], longer, minlength=len(own))
             stops = stops_of(self.transmitter, found.point[own, :count], receivers[found.receiver[own]])
             jones[own] = jones_matrices(stops, found.normal[own, :count], found.turn[own, :count], te, tm)

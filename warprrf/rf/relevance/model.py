@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.cache import cached_property
 from warprrf.device import Progress
 from warprrf.rf.em.absorption import gas_attenuation_db_per_m
 from warprrf.rf.em.fresnel import fresnel_curves, lobe, slab_reflection, surface_table
@@ -74,19 +73,15 @@ def full_field(
     ``"scene"``, ``"fit"`` or ``"assumed"``."""
     if isinstance(geometry, BistaticField):
         effects = replace(EVERYTHING, residual=geometry.effects.residual)
-        whole = replace(
-            geometry, effects=effects, transmitter=transmitter, air=None
-        )  # air is judged by itself
-        return whole, "fit"
+        # Air is judged by itself.
+        return replace(geometry, effects=effects, transmitter=transmitter, air=None), "fit"
     surface = Surface.of(geometry)
     frame = Frame(transmitter, frequency_hz, shape, 1.0, (0.0, 1.0), beam_sigma_rad, None)
     field = BistaticField.prior(surface, frame, effects=replace(EVERYTHING, residual=False), device=device)
     if not hasattr(geometry, "materials"):
         return field, "assumed"
-    parameters = replace(
-        material_parameters(geometry.materials, frequency_hz), log_through=surface.slabs(frequency_hz)[2]
-    )
-    return replace(field, parameters=parameters), "scene"
+    parameters = material_parameters(geometry.materials, frequency_hz)
+    return replace(field, parameters=replace(parameters, log_through=surface.slabs(frequency_hz)[2])), "scene"
 
 
 def with_lobes(p: Parameters, kept: tuple[int, ...]) -> Parameters:
@@ -174,10 +169,8 @@ class FullModel:
 
     def reduced(self, kept: frozenset[str]) -> BistaticField:
         """The field with the effects ``kept`` alone."""
-        p, lobes = (
-            self.field.parameters,
-            tuple(n for n in self.field.parameters.lobes if lobe_name(n) in kept),
-        )
+        p = self.field.parameters
+        lobes = tuple(n for n in p.lobes if lobe_name(n) in kept)
         parameters = p if len(lobes) in (0, len(p.lobes)) else with_lobes(p, lobes)
         return replace(self.field, effects=effects_of(kept), parameters=parameters, errors=None)
 
@@ -193,13 +186,11 @@ class FullModel:
         """One spectrum; light over several surfaces is as long as what the same ray sees of single ones."""
         gains = field.path_gains(view)
         if gas:
-            length, records = view.single_bounce_m(), gains.records
-            own = {
-                name: power
-                * self._air(view.paths.length_m if name == "specular" else length[records[name].ray], True)
-                for name, power in gains.tables.items()
-            }
-            gains = replace(gains, tables=own)
+            single, tables = view.single_bounce_m(), {}
+            for name, power in gains.tables.items():
+                length = view.paths.length_m if name == "specular" else single[gains.records[name].ray]
+                tables[name] = power * 10.0 ** (-0.1 * self.gas_db_per_m * length)
+            gains = replace(gains, tables=tables)
         return np.asarray(images(gains, self.beam)[0])
 
     def power(self, lost: frozenset[str]) -> float:
@@ -218,10 +209,7 @@ class FullModel:
     def _db(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return to_db(image, self.floor), to_db(image.sum(axis=(1, 2)), self.floor)
 
-    def _air(self, length_m: np.ndarray, gas: bool) -> np.ndarray | float:
-        return 10.0 ** (-0.1 * self.gas_db_per_m * length_m) if gas else 1.0
-
-    @cached_property
+    @property
     def longest_m(self) -> float:
         """Length of the longest path [m]."""
         lengths = [v.single_bounce_m()[v.traced(effects_of(self.all))["S"].ray] for v in self.views]

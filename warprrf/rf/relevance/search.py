@@ -12,7 +12,6 @@ The order does not depend on the tolerance, so a larger one never keeps more.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -31,7 +30,6 @@ from warprrf.rf.relevance.model import FullModel, effects_of, full_field, lobe_n
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape
 from warprrf.rf.tracing.model import Effects
 
-SAME_BAND = 0.05  # relative difference of carriers up to which a choice holds
 TITLES = {
     "line_of_sight": "line of sight",
     "mirrors_1": "mirrors, order 1",
@@ -46,7 +44,6 @@ TITLES = {
     "diffraction": "diffraction (one edge, Kouyoumjian and Pathak)",
     "transmission": "transmission through walls (ITU-R P.2040)",
 }
-ALIKE_DB = 0.01  # losses that round to the same hundredth of a dB are alike: then cost decides
 NEEDS = {
     "mirrors_1": ("mirrors_2",), "scatterings_1": ("mirror_scatter", "scatter_mirror", "scatterings_2", "residual"),
 }  # fmt: skip
@@ -77,12 +74,12 @@ class Effect:
     """
 
     name: str
-    image_db: float | None
-    total_db: float | None
-    image_blocked_db: float | None
-    total_blocked_db: float | None
-    kept: bool | None
-    reason: str
+    image_db: float | None = None
+    total_db: float | None = None
+    image_blocked_db: float | None = None
+    total_blocked_db: float | None = None
+    kept: bool | None = None
+    reason: str = ""
 
     @property
     def worth_db(self) -> float | None:
@@ -139,7 +136,7 @@ class Relevance:
         Raises:
             ValueError: if the carrier is another than the one that this was made for.
         """
-        if abs(frequency_hz / self.frequency_hz - 1.0) > SAME_BAND:
+        if abs(frequency_hz / self.frequency_hz - 1.0) > 0.05:  # materials hardly change within it
             raise ValueError(
                 f"frequency_hz: got spectra of {frequency_hz / 1e9:g} GHz, but this relevance is for "
                 f"{self.frequency_hz / 1e9:g} GHz; expected the same band, call warprrf.relevance for it"
@@ -251,8 +248,8 @@ class Setting:
             )  # fmt: skip
         elif isinstance(geometry, RadioField):
             raise TypeError(f"geometry: got a field of model {geometry.model!r}, expected a bistatic one")
-        if found.floor is not None and not (np.isfinite(found.floor) and found.floor > 0):
-            raise ValueError(f"floor: got {found.floor!r}, expected a path gain of more than 0")
+        if found.floor is not None:
+            check_positive("floor", found.floor, "path gain")
         for name in ("transmitter", "frequency_hz"):
             if getattr(found, name) is None:
                 raise ValueError(f"{name}: got None, expected it for anything but a fitted field")
@@ -287,23 +284,18 @@ def relevance(
             receivers on a surface or outside the scene, or a tolerance that is not positive.
         TypeError: for a geometry without a mesh, a field of another model, or an unknown setting.
     """
-    return relevances(
-        geometry, (tolerance_db,), receivers=receivers, device=device, progress=progress, **setting
-    )[0]
+    check_positive("tolerance_db", tolerance_db, "number of decibels")
+    tick: Progress = progress or (lambda stage, done, total: None)
+    model, source = full_model(geometry, receivers, device=device, progress=tick, **setting)
+    found = choose(model, source, tolerance_db)
+    tick("relevance", len(model.receivers) + 1, len(model.receivers) + 1)
+    return found
 
 
-def relevances(
-    geometry: Any,
-    tolerances_db: Sequence[float],
-    *,
-    receivers: Any,
-    device: Any = None,
-    progress: Progress | None = None,
-    **setting: Any,
-) -> list[Relevance]:
-    """:func:`relevance` at several tolerances, for little more than the time of one; arguments and errors as there."""
-    for tolerance in tolerances_db:
-        check_positive("tolerance_db", tolerance, "number of decibels")
+def full_model(
+    geometry: Any, receivers: Any, *, device: Any = None, progress: Progress, **setting: Any
+) -> tuple[FullModel, str]:
+    """What :func:`choose` takes, for the arguments of :func:`relevance`; errors as there."""
     asked = Setting(**setting).of(geometry)
     frequency_hz = check_frequency(asked.frequency_hz)
     question_unit(as_mesh(geometry, "geometry"), SPEED_OF_LIGHT / frequency_hz)
@@ -318,22 +310,20 @@ def relevances(
     places = np.atleast_2d(check_receivers("receivers", receivers))
     known = geometry.transmitter if isinstance(geometry, BistaticField) else None
     check_positions(full.mesh, full.transmitter, places, full.wavelength_m, known=known, device=device)
-    tick: Progress = progress or (lambda stage, done, total: None)
-    model = FullModel(full, places, floor=asked.floor, gas_db_per_m=asked.gas_db_per_m, progress=tick)
-    found = [_choose(model, source, float(tolerance)) for tolerance in tolerances_db]
-    tick("relevance", len(places) + 1, len(places) + 1)
-    return found
+    model = FullModel(full, places, floor=asked.floor, gas_db_per_m=asked.gas_db_per_m, progress=progress)
+    return model, source
 
 
-def _choose(model: FullModel, source: str, tolerance_db: float) -> Relevance:
+def choose(model: FullModel, source: str, tolerance_db: float) -> Relevance:
+    """What to keep of a model whose materials are of ``source``, within a tolerance."""
     full = model.field
     known = model.all if source != "assumed" else model.all - set(map(lobe_name, full.parameters.lobes))
     kept = model.all - frozenset(leave_out(model, known, tolerance_db))
     effects = [effect_row(model, name, kept) for name in model.effects if name in known]
     if source == "assumed":
-        effects.append(open_row("lobes", "only known materials or a fit tell which lobes matter"))
+        effects.append(Effect("lobes", reason="only known materials or a fit tell which lobes matter"))
     if "residual" not in model.all:
-        effects.append(open_row("residual", "only a fit tells"))
+        effects.append(Effect("residual", reason="only a fit tells"))
     loss, least = model.loss(kept), model.reduced(kept)
     lobes = least.parameters.lobes if least.effects.scatterings else least.parameters.lobes[:1]
     return Relevance(
@@ -364,16 +354,13 @@ def leave_out(model: FullModel, candidates: frozenset[str], tolerance_db: float)
         for name in sorted(candidates & kept):
             if not _needed(name, kept):
                 loss = decisive(model.loss(kept - {name}))
-                trials.append((round(loss / ALIKE_DB), _rank(name), name, loss))
+                # Losses that round to the same hundredth of a decibel are alike: then cost decides.
+                trials.append((round(loss / 0.01), (*COSTLY, name).index(name), name, loss))
         if not trials or min(trials)[-1] > tolerance_db:
             return order
         name = min(trials)[2]
         kept = kept - {name}
         order.append(name)
-
-
-def _rank(name: str) -> int:
-    return COSTLY.index(name) if name in COSTLY else len(COSTLY)
 
 
 def _needed(name: str, kept: frozenset[str]) -> bool:
@@ -396,14 +383,10 @@ def effect_row(model: FullModel, name: str, kept: frozenset[str]) -> Effect:
     return Effect(name, image, total, dark[0], dark[1], stays, _reason(model, name, lost))
 
 
-def open_row(name: str, reason: str) -> Effect:
-    """The row of an effect that only a fit can tell about."""
-    return Effect(name, None, None, None, None, None, reason)
-
-
 def _reason(model: FullModel, name: str, lost: frozenset[str]) -> str:
     if name == "gas":
-        return _gas(model)
+        rate, longest = model.gas_db_per_m, model.longest_m
+        return f"{1e3 * rate:.2g} dB/km, longest path {longest:.1f} m: at most {rate * longest:.2g} dB"
     if name in RARE:
         return _rare(model, name)
     if name.startswith("lobe_"):
@@ -416,11 +399,6 @@ def _reason(model: FullModel, name: str, lost: frozenset[str]) -> str:
 
 def _percent(share: float) -> str:
     return f"{100 * share:.2g} %" if share >= 1e-4 or share == 0 else f"{100 * share:.0e} %"
-
-
-def _gas(model: FullModel) -> str:
-    rate, longest = model.gas_db_per_m, model.longest_m
-    return f"{1e3 * rate:.2g} dB/km, longest path {longest:.1f} m: at most {rate * longest:.2g} dB"
 
 
 def _rare(model: FullModel, name: str) -> str:
@@ -438,11 +416,7 @@ def _lobe(model: FullModel, n: int) -> str:
     others = [k for k in model.field.parameters.lobes if k != n]
     if not others:
         return "the only lobe"
-    surface, weight = model.field.surface, model.field.parameters.weight
+    surface, p = model.field.surface, model.field.parameters
     area = np.bincount(surface.element_group, surface.element_area, minlength=surface.groups)
-    share = (
-        area
-        @ weight[:, model.field.parameters.lobes.index(n)]
-        / max(float(area @ weight.sum(axis=1)), 1e-300)
-    )
+    share = area @ p.weight[:, p.lobes.index(n)] / max(float(area @ p.weight.sum(axis=1)), 1e-300)
     return f"{_percent(float(share))} of the lobes' weight; its neighbours stand in for it"

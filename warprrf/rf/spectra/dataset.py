@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -23,7 +23,7 @@ from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
     DEFAULT_SHAPE,
     Spectrum,
-    check_pixels,
+    check_departures,
     check_range_db,
     check_shape,
     check_whole,
@@ -56,6 +56,38 @@ class PathsLike(Protocol):
 
     def each(self) -> Iterator[PathsLike]:
         """The paths of one receiver after another."""
+
+
+@dataclass(frozen=True)
+class Received:
+    """What one receiver gets, as pixels.
+
+    Attributes:
+        path_gain: Path gain per pixel [linear], shape ``(H, W)``, float64.
+        delay_s: Delay of the pixel's strongest path [s], shape ``(H, W)``; NaN where empty.
+        aod: Its zenith and azimuth of departure [rad], shape ``(H, W, 2)``; NaN where empty.
+        line_of_sight: Whether the transmitter is seen.
+    """
+
+    path_gain: np.ndarray
+    delay_s: np.ndarray
+    aod: np.ndarray
+    line_of_sight: bool
+
+    @classmethod
+    def of(
+        cls, paths: Any, shape: tuple[int, int], beam_sigma_rad: float, device: DeviceLike = None
+    ) -> Received:
+        """:class:`PathsLike` of one receiver, spread by its beam."""
+        spread = spread_paths(paths.arrival, paths.power, shape, beam_sigma_rad, device=device)
+        aod = spread.of_strongest(np.column_stack([paths.theta_t, paths.phi_t]))
+        line_of_sight = bool((paths.kind == "los").any())
+        return cls(spread.path_gain, spread.of_strongest(paths.tau), aod, line_of_sight)
+
+    @staticmethod
+    def columns(found: Sequence[Received]) -> dict[str, Any]:
+        """Those of several receivers, stacked by name."""
+        return {f.name: np.stack([getattr(one, f.name) for one in found]) for f in fields(Received)}
 
 
 @checked
@@ -102,16 +134,15 @@ class SpectrumDataset:
         """Check shapes and values; ValueError or TypeError names the field."""
         receivers = check_array("receivers", self.receivers, (None, 3))
         count = len(receivers)
-        gain = check_array("path_gain", self.path_gain, (count, None, None), dtype=np.float32, finite=False)
-        if np.isinf(gain).any():
-            raise ValueError("path_gain: got infinite values, expected linear gains, NaN where not measured")
+        spectra = (count, None, None)
+        gain = check_array("path_gain", self.path_gain, spectra, np.float32, finite=False, least=0.0)
         shape = check_shape(gain.shape[1:])
-        fields: dict[str, Any] = {
+        values: dict[str, Any] = {
             "receivers": receivers,
             "transmitter": check_array("transmitter", self.transmitter, (3,)),
             "frequency_hz": check_frequency(self.frequency_hz),
             "path_gain": gain,
-            "delay_s": check_array("delay_s", self.delay_s, (count, *shape), finite=False),
+            "delay_s": check_array("delay_s", self.delay_s, (count, *shape), finite=False, least=0.0),
             "aod": check_array("aod", self.aod, (count, *shape, 2), dtype=np.float32, finite=False),
             "floor": check_positive("floor", self.floor, "linear noise floor"),
             "range_db": check_range_db(self.range_db),
@@ -121,8 +152,8 @@ class SpectrumDataset:
             "line_of_sight": _check_flags("line_of_sight", self.line_of_sight, count),
             "attributes": _check_attributes(self.attributes),
         }
-        check_pixels(gain, fields["delay_s"], fields["aod"])
-        for name, value in fields.items():
+        check_departures(values["aod"])
+        for name, value in values.items():
             object.__setattr__(self, name, value)
 
     def __repr__(self) -> str:
@@ -170,7 +201,7 @@ class SpectrumDataset:
             UserWarning: naming receivers that get far more than line of sight would give; see
                 :data:`~warprrf.rf.spectra.levels.MARGIN_DB`.
         """
-        gain = check_array("path_gain", path_gain, (None, None, None), dtype=np.float32, finite=False)
+        gain = check_array("path_gain", path_gain, (None, None, None), np.float32, finite=False, least=0.0)
         if len(gain) == 0 or np.isnan(gain).all():
             raise ValueError("path_gain: got no spectra, expected one receiver's or more")
         places = check_array("receivers", receivers, (len(gain), 3))
@@ -178,10 +209,6 @@ class SpectrumDataset:
         if line_of_sight is None:
             frequency, beam = check_frequency(frequency_hz), check_positive("beam_sigma_rad", beam_sigma_rad)
             line_of_sight = _sees(places, source, gain, frequency, beam)
-        if (gain < 0).any():
-            raise ValueError(
-                f"path_gain: got {np.nanmin(gain)}, expected linear gains of at least 0 (of decibels, 10 ** (x / 10))"
-            )
         noise = default_floor(gain) if floor is None else check_positive("floor", floor, "linear noise floor")
         found = cls(
             receivers=receivers,
@@ -240,18 +267,13 @@ class SpectrumDataset:
             )
         if np.ndim(paths.transmitter) != 1:
             raise ValueError("paths: got ones of several transmitters, expected those of one")
-        several = list(paths.each())
         grid = check_shape(shape)
-        spread = [spread_paths(p.arrival, p.power, grid, beam_sigma_rad, device=device) for p in several]
-        aod = [np.column_stack([p.theta_t, p.phi_t]) for p in several]
+        found = [Received.of(p, grid, beam_sigma_rad, device) for p in paths.each()]
         return cls.from_spectra(
             receivers=np.atleast_2d(paths.receiver),
             transmitter=paths.transmitter,
             frequency_hz=paths.frequency_hz,
-            path_gain=np.stack([s.path_gain for s in spread]),
-            delay_s=np.stack([s.of_strongest(p.tau) for s, p in zip(spread, several, strict=True)]),
-            aod=np.stack([s.of_strongest(angles) for s, angles in zip(spread, aod, strict=True)]),
-            line_of_sight=np.array([(p.kind == "los").any() for p in several]),
+            **Received.columns(found),
             beam_sigma_rad=beam_sigma_rad,
             engine="paths",
             seed=seed,
@@ -477,9 +499,7 @@ class SpectrumDataset:
 
         Numbers in the header are text, because EXR headers hold 32-bit floats only.
         """
-        if not -len(self) <= index < len(self):
-            raise ValueError(f"index: got {index}, expected a receiver from 0 to {len(self) - 1}")
-        spectrum = self[index]
+        spectrum = self[check_count("index", index, -len(self), len(self) - 1)]
         dataset_files.export_exr(
             path, replace(spectrum, attributes={**spectrum.attributes, "polarisation": self.polarisation})
         )

@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_positive, checked
+from warprrf.checks import check_array, check_choice, check_positive, checked
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.metrics import psnr, unit_image
 from warprrf.rf.spectra.spectrum import Spectrum, check_whole, to_db
@@ -75,6 +75,7 @@ def idw(train: SpectrumDataset, *, power: float = 2.0, domain: str = "auto") -> 
         ValueError: for a power that is not positive, or an unknown domain.
     """
     check_positive("power", power)
+    check_choice("domain", domain, ("db", "linear", "auto"))
     receivers = _receivers(train)
     floor, range_db = float(train.floor), train.range_db
     images = np.asarray(train.path_gain, dtype=np.float64)
@@ -94,8 +95,6 @@ def idw(train: SpectrumDataset, *, power: float = 2.0, domain: str = "auto") -> 
             f"averaged in {domain}: leave-one-out PSNR {score['db']:.2f} dB in dB, {score['linear']:.2f} dB in linear "
             "power"
         )
-    elif domain not in tables:
-        raise ValueError(f'domain: got {domain!r}, expected "db", "linear" or "auto"')
     return Lookup("idw", note, train, partial(_idw, train, receivers, tables[domain], domain, power))
 
 

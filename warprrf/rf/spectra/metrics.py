@@ -19,7 +19,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
 from warprrf.checks import check_alike, check_array, check_number, checked
@@ -46,9 +45,7 @@ def unit_image(path_gain: np.ndarray, floor: float, range_db: tuple[float, float
     low, high = check_array("range_db", range_db, (2,))
     if not high > low:
         raise ValueError(f"range_db: got ({low}, {high}), expected (lowest, highest), the latter above")
-    path_gain = check_array("path_gain", path_gain, finite=False)
-    if (path_gain < 0).any():
-        raise ValueError(f"path_gain: got {path_gain.min()}, expected gains of at least 0")
+    path_gain = check_array("path_gain", path_gain, finite=False, least=0.0)
     check_number("floor", floor, 0.0)
     return np.clip((np.asarray(to_db(path_gain, floor), dtype=np.float64) - low) / (high - low), 0.0, 1.0)
 
@@ -230,7 +227,8 @@ def evaluate(
         prediction = predict(receiver)
         seconds[i] = time.perf_counter() - start
         truth = np.asarray(test.path_gain[i], dtype=np.float64)
-        gain = _checked_gain(prediction, truth.shape, i)
+        given = getattr(prediction, "path_gain", prediction)
+        gain = check_array(f"predict (receiver {i})", given, truth.shape, least=0.0)
         truth_unit, unit = unit_image(truth, floor, range_db), unit_image(gain, floor, range_db)
         rows["psnr_db"][i] = psnr(unit, truth_unit)
         rows["ssim"][i] = ssim(unit, truth_unit) if min(truth.shape) >= SSIM_WINDOW else np.nan
@@ -297,15 +295,6 @@ def _on_grid(predict: Callable[[np.ndarray], Any], shape: tuple[int, int]) -> Ca
     owner: Any = getattr(predict, "__self__", None)
     is_field = hasattr(owner, "on_grid") and getattr(predict, "__name__", "") == "spectrum"
     return owner.on_grid(shape).spectrum if is_field else predict
-
-
-def _checked_gain(prediction: Spectrum | ArrayLike, shape: tuple[int, ...], index: int) -> np.ndarray:
-    gain = check_array("predict", getattr(prediction, "path_gain", prediction), finite=False)
-    if gain.shape != shape:
-        raise ValueError(f"predict: got shape {gain.shape} for receiver {index}, expected {shape}")
-    if not np.isfinite(gain).all() or gain.min() < 0:
-        raise ValueError(f"predict: got NaN, infinite or negative path gain for receiver {index}")
-    return gain
 
 
 def _unit(angles: np.ndarray | None) -> np.ndarray:

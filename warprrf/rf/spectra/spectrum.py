@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from types import EllipsisType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from numpy.typing import ArrayLike
 from warprrf import device as _device
 from warprrf.checks import (
     check_array,
+    check_count,
     check_known_whole,
     check_number,
     check_positive,
@@ -47,11 +49,11 @@ def check_shape(shape: Sequence[int]) -> tuple[int, int]:
         ValueError: otherwise.
     """
     try:
-        rows, columns = (int(n) for n in shape)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"shape: got {shape!r}, expected (rows, columns) such as (90, 180)") from error
-    if rows < 2 or columns < 2 or (rows, columns) != tuple(shape):
-        raise ValueError(f"shape: got {shape!r}, expected two whole numbers of at least 2, such as (90, 180)")
+        rows, columns = (check_count("shape", n, 2) for n in shape)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"shape: got {shape!r}, expected two whole numbers of at least 2, such as (90, 180)"
+        ) from error
     if rows * columns > 1 << 24:
         raise ValueError(f"shape: got {rows} x {columns} pixels, expected at most {1 << 24} in all")
     return rows, columns
@@ -78,25 +80,18 @@ def check_range_db(range_db: Sequence[float]) -> tuple[float, float]:
     return low, high
 
 
-def check_pixels(path_gain: np.ndarray, delay_s: np.ndarray | None, aod: np.ndarray | None) -> None:
-    """Refuse what no pixel holds; NaN is an empty delay or direction.
+def check_departures(aod: np.ndarray) -> None:
+    """Refuse angles of departure ``(..., 2)`` that are none; NaN is an empty one.
 
     Raises:
-        ValueError: naming the array, for negative gains, negative or infinite delays, angles that are out of range.
+        ValueError: for angles that are out of range, or known in part.
     """
-    if (path_gain < 0).any():
-        bad = int((path_gain < 0).sum())
-        raise ValueError(f"path_gain: got {bad} negative values, expected linear path gain")
-    if delay_s is not None and not (np.isnan(delay_s) | (delay_s >= 0) & (delay_s < np.inf)).all():
-        raise ValueError("delay_s: got negative or infinite values, expected seconds, or NaN where empty")
-    angle_rounding = 1e-3  # radians by which angles of departure may lie out of range: by compact files
-    if aod is not None:
-        check_known_whole("aod", aod)
-        zenith, azimuth, most = aod[..., 0], aod[..., 1], np.pi + angle_rounding
-        if ((zenith < -angle_rounding) | (zenith > most) | (azimuth < -most) | (azimuth > most)).any():
-            raise ValueError(
-                "aod: got angles out of range, expected zeniths 0 to pi and azimuths -pi to pi, or NaN where empty"
-            )
+    check_known_whole("aod", aod)
+    zenith, azimuth, rounding = aod[..., 0], aod[..., 1], 1e-3  # by as much compact files are out of range
+    if ((zenith < -rounding) | (zenith > np.pi + rounding) | (np.abs(azimuth) > np.pi + rounding)).any():
+        raise ValueError(
+            "aod: got angles out of range, expected zeniths 0 to pi and azimuths -pi to pi, or NaN where empty"
+        )
 
 
 def check_whole(name: str, path_gain: ArrayLike) -> None:
@@ -116,14 +111,6 @@ def pixel_directions(shape: tuple[int, int]) -> np.ndarray:
     """Unit vectors from the receiver through the pixel centres, shape ``(H, W, 3)``, float64."""
     zenith, azimuth = pixel_angles(shape)
     return directions_from_angles(zenith[:, None], azimuth[None, :])
-
-
-@lru_cache(maxsize=8)
-def _pixel_list(shape: tuple[int, int]) -> np.ndarray:
-    """:func:`pixel_directions` as rows, not to be written to."""
-    pixels = pixel_directions(shape).reshape(-1, 3)
-    pixels.setflags(write=False)
-    return pixels
 
 
 def pixel_solid_angles(shape: tuple[int, int]) -> np.ndarray:
@@ -175,6 +162,21 @@ def transverse_basis(directions: ArrayLike) -> np.ndarray:
     up = np.stack([cosine * np.cos(azimuth), cosine * np.sin(azimuth), -np.sin(zenith)], axis=-1)
     around = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)], axis=-1)
     return np.stack([up, around], axis=-2)
+
+
+def unit_vectors(
+    name: str, value: ArrayLike, shape: tuple[int | EllipsisType | None, ...] = (None, 3)
+) -> np.ndarray:
+    """Vectors of ``shape``, made of length one.
+
+    Raises:
+        TypeError, ValueError: naming the argument, for another shape, numbers not finite, or a vector of no length.
+    """
+    vectors = check_array(name, value, shape)
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    if not (length > 0).all():
+        raise ValueError(f"{name}: got a vector of length zero, expected ones with a length")
+    return vectors / length
 
 
 def pixel_of(directions: ArrayLike, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -260,18 +262,12 @@ def spread_paths(
     """
     shape = rows, columns = check_shape(shape)
     d = check_array("directions", directions, (None, 3))
-    power = check_array("powers", powers, (len(d),))
+    power = check_array("powers", powers, (len(d),), least=0.0)
     check_positive("sigma", sigma, "beam width in radians")
-    if (power < 0).any():
-        raise ValueError(f"powers: got {int((power < 0).sum())} negative path gains, expected linear power")
     positive = np.flatnonzero(power > 0)
     if len(positive) == 0:
         return SpreadPaths(np.zeros((rows, columns)), np.full((rows, columns), -1, dtype=np.int32))
-    d, power = d[positive], power[positive]
-    length = np.linalg.norm(d, axis=1, keepdims=True)
-    if (length == 0).any():
-        raise ValueError("directions: got a vector of length zero, expected directions of arrival")
-    d = d / length
+    d, power = unit_vectors("directions", d[positive]), power[positive]
     row, column = pixel_of(d, (rows, columns))
     cell = (row * columns + column).astype(np.int32)
     order = np.argsort(cell, kind="stable")
@@ -356,7 +352,7 @@ def unit_beams(directions: np.ndarray, shape: tuple[int, int], sigma: float) -> 
     """
     rows, columns = check_shape(shape)
     out = np.zeros((len(directions), rows * columns), np.float32)
-    pixels = _pixel_list((rows, columns))
+    pixels = pixel_directions(shape).reshape(-1, 3)
     solid_angle = np.repeat(pixel_solid_angles(shape), columns)
     limit = 4.0 * np.sin(0.5 * _cutoff(shape, sigma)) ** 2 * (1.0 + 1e-12)
     for k, d in enumerate(directions):
@@ -483,9 +479,11 @@ class Spectrum:
         shape = check_array("path_gain", self.path_gain, (..., None, None)).shape
         for name, value in self._arrays().items():
             if value is not None:
-                check_array(name, value, (*shape, 2) if name == "aod" else shape, finite=False)
+                least = 0.0 if name != "aod" else None
+                check_array(name, value, (*shape, 2) if name == "aod" else shape, finite=False, least=least)
                 object.__setattr__(self, name, np.asarray(value))
-        check_pixels(self.path_gain, self.delay_s, self.aod)
+        if self.aod is not None:
+            check_departures(self.aod)
         check_number("floor", self.floor, least=0.0)
         if self.range_db is not None:
             check_range_db(self.range_db)

@@ -55,7 +55,7 @@ from warprrf.rf.fields.harmonic.fitting import (
     targets,
 )
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining, list_responses
-from warprrf.rf.fields.harmonic.options import FieldOptions, Rates
+from warprrf.rf.fields.harmonic.options import CHANNEL_RATES, GAIN_RATES, FieldOptions
 from warprrf.rf.fields.harmonic.paths import View, near_line_of_sight, paths_of
 from warprrf.rf.fields.harmonic.problem import Problem, harmonics
 from warprrf.rf.fields.harmonic.transport import (
@@ -73,7 +73,6 @@ from warprrf.steps import digest
 
 LAYERS = {"rf3dgs+": ("gain",), "rf3dgs": ("gain", "delay", "aod_x", "aod_y", "aod_z")}
 """Layers that each model may have."""
-CHANNEL_RATES = Rates(constant=0.1, directional=0.05, ridge=0.02, ridge_directional=0.1)
 
 
 @checked
@@ -197,7 +196,13 @@ class HarmonicField(RadioField):
             fitted_on=receivers.copy(),
             device=device,
         )
-        seen = blank._seen_from(receivers, transport, progress)
+        seen = blank._seen_from(receivers, progress) if transport is None else transport
+        rule = chosen.transmittance
+        if seen.shape != blank.shape or seen.rule != rule or not np.array_equal(seen.receivers, receivers):
+            raise ValueError(
+                f"transport: got weights of {len(seen.receivers)} receivers, shape {seen.shape}, rule {seen.rule!r}; "
+                f"expected those of exactly the {len(receivers)} receivers of ds, shape {blank.shape}, rule {rule!r}"
+            )
         ready = time.perf_counter()
         trained = _train(blank, ds, images, seen, checkpoint=chosen.checkpoint, progress=progress)
         report = {
@@ -231,40 +236,15 @@ class HarmonicField(RadioField):
             )
         return ends
 
-    def spectrum(
-        self,
-        receivers: ArrayLike,
-        transmitter: ArrayLike | None = None,
-        *,
-        shape: tuple[int, int] | None = None,
-        transport: Transport | None = None,
-    ) -> Spectrum:
-        """The spatial spectrum of every receiver; see :meth:`RadioField.spectrum`.
-
-        Gaussians that no ray of the fitted grid met learned nothing: on a finer one they are guesses.
-
-        Args:
-            receivers, transmitter, shape: as there.
-            transport: blending weights of exactly this receiver, on this grid, if they were computed before.
-
-        Raises:
-            ValueError: as for :meth:`check_positions`; or another transmitter with ``rf3dgs``, whose delays and gains
-                hold only for the one it was fitted for.
-        """
-        field = self.on_grid(shape)
-        return field._looked(
-            receivers, transmitter, lambda at, source: field._view_from(at, source, transport).spectrum
-        )
-
     def _trace_spectrum(self, receiver: np.ndarray, transmitter: np.ndarray) -> Spectrum:
-        return self._view_from(receiver, transmitter, None).spectrum
+        return self._view_from(receiver, transmitter).spectrum
 
     def _trace_paths(self, receiver: np.ndarray, transmitter: np.ndarray, max_paths: int | None) -> Paths:
         """At least one diffuse path is kept to carry what is below the floor. With ``line_of_sight="explicit"`` the ``los``
         path carries Friis gain; without, the power of the pixels within 3 beam sigmas of the transmitter's direction,
         merged. Direction and delay of ``los`` are exact; a diffuse path arrives from its pixel's centre."""
         found = paths_of(
-            self._view_from(receiver, transmitter, None),
+            self._view_from(receiver, transmitter),
             beam_sigma_rad=self.beam_sigma_rad,
             frequency_hz=self.frequency_hz,
             max_paths=max_paths,
@@ -281,7 +261,6 @@ class HarmonicField(RadioField):
 
     @classmethod
     def _put_together(cls, tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict[str, Any]:
-        options = dict(header["options"])
         layers = {n.removeprefix("layer/"): t for n, t in tensors.items() if n.startswith("layer/")}
         if "gain" not in layers:
             raise ValueError("it has no layer of gain")
@@ -290,7 +269,7 @@ class HarmonicField(RadioField):
             "mesh": Mesh(tensors["mesh/vertices"], tensors["mesh/faces"])
             if "mesh/faces" in tensors
             else None,
-            "options": FieldOptions(**options | {"rates": Rates(**options.get("rates", {}))}),
+            "options": FieldOptions(**header["options"]),
             "layers": layers,
             "gain_unit": header["gain_unit"],
             "delay_unit": header["delay_unit"],
@@ -310,11 +289,8 @@ class HarmonicField(RadioField):
 
     def _line_of_sight(self, receiver: np.ndarray, transmitter: np.ndarray) -> tuple[bool, float]:
         """Whether the mesh lets them see each other, and their Friis gain, less absorption."""
-        distance = float(np.linalg.norm(receiver - transmitter))
-        if distance == 0:
-            raise ValueError("receivers: got the transmitter's own position; expected them apart")
         visible = self.mesh is not None and self.mesh.visible(receiver, transmitter, device=self.device)[0]
-        return bool(visible), float(self._free_space(distance))
+        return bool(visible), float(self._free_space(float(np.linalg.norm(receiver - transmitter))))
 
     def _beam(self, receiver: np.ndarray, transmitter: np.ndarray) -> np.ndarray | None:
         """The explicit line of sight's beam on the grid, or None."""
@@ -332,22 +308,12 @@ class HarmonicField(RadioField):
             gain = (SPEED_OF_LIGHT / self.frequency_hz / (4 * np.pi * length_m)) ** 2
         return gain if self.air is None else gain * self.air.transmittance(self.frequency_hz, length_m)
 
-    def _seen_from(
-        self, receivers: np.ndarray, seen: Transport | None, progress: Progress | None
-    ) -> Transport:
-        """Blending weights of ``receivers`` (R, 3): ``seen`` if given, once it is sure that they are theirs."""
-        rule = self.options.transmittance
-        if seen is None:
-            return transport(
-                self.gaussians, receivers, self.shape, range_db=self.range_db, rule=rule, top_k=self.options.top_k,
-                device=self.device, progress=progress,
-            )  # fmt: skip
-        if seen.shape != self.shape or seen.rule != rule or not np.array_equal(seen.receivers, receivers):
-            raise ValueError(
-                f"transport: got weights of {len(seen.receivers)} receivers, shape {seen.shape}, rule {seen.rule!r}; "
-                f"expected those of exactly the {len(receivers)} receivers asked for, shape {self.shape}, rule {rule!r}"
-            )
-        return seen
+    def _seen_from(self, receivers: np.ndarray, progress: Progress | None) -> Transport:
+        """Blending weights of ``receivers`` (R, 3)."""
+        return transport(
+            self.gaussians, receivers, self.shape, range_db=self.range_db, rule=self.options.transmittance,
+            top_k=self.options.top_k, device=self.device, progress=progress,
+        )  # fmt: skip
 
     def _blend(self, name: str, seen: Transport) -> np.ndarray:
         """The blended layer ``name`` of one receiver, shape ``(H, W)`` float64."""
@@ -367,9 +333,9 @@ class HarmonicField(RadioField):
         _device.launch(kernels.predict, len(out), inputs, device=device)
         return out.numpy().reshape(self.shape).astype(np.float64)
 
-    def _view_from(self, receiver: np.ndarray, source: np.ndarray, seen: Transport | None) -> View:
+    def _view_from(self, receiver: np.ndarray, source: np.ndarray) -> View:
         """Spectrum at one receiver and what it was made of."""
-        seen = self._seen_from(receiver[None], seen, None)
+        seen = self._seen_from(receiver[None], None)
         visible, friis = self._line_of_sight(receiver, source)
         lengths = self._lengths(seen, source)
         power = self._factor(lengths)[0] * self.gain_unit * self._blend("gain", seen)
@@ -466,7 +432,7 @@ def _train(
             logits = None if state is None else state.opacity
             opacity = OpacityTraining(problem, listed, gaussians.opacities, logits)
         states[name] = state = fit_layer(
-            problem, target, steps=steps[name], rates=options.rates if is_gain else CHANNEL_RATES,
+            problem, target, steps=steps[name], rates=GAIN_RATES if is_gain else CHANNEL_RATES,
             degree=options.sh_degree, opacity=opacity, state=state, each=partial(each, name),
         )  # fmt: skip
         before += steps[name]

@@ -25,7 +25,7 @@ from warprrf.kernels.adam import build_adam, corrections
 from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.kernels.raster.sh import COEFFICIENTS as DEGREE_TO_COUNT
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining
-from warprrf.rf.fields.harmonic.options import FieldOptions, Rates
+from warprrf.rf.fields.harmonic.options import GAIN_RATES, FieldOptions, Rates
 from warprrf.rf.fields.harmonic.problem import Problem
 from warprrf.rf.fields.harmonic.transport import Transport
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -224,7 +224,7 @@ def fit_layer(
     target: Target,
     *,
     steps: int,
-    rates: Rates | None = None,
+    rates: Rates = GAIN_RATES,
     degree: int = 3,
     opacity: OpacityTraining | None = None,
     state: State | None = None,
@@ -245,7 +245,6 @@ def fit_layer(
     Returns:
         Final state; coefficients of the Gaussians ``problem.seen``, shape ``(G, 16)``.
     """
-    rates = rates or Rates()
     p, k = problem, problem.kernels
     active = np.arange(_kernels.COEFFICIENTS) < DEGREE_TO_COUNT[degree]
     rate = np.where(active, rates.directional, 0.0)
@@ -333,7 +332,7 @@ def targets(
     dark = 0.1  # a pixel below the floor counts as this share of it where logarithms are averaged
     floored = np.maximum(images - extra, dark * floor)
     relative = np.log(floored / np.where(met, blended * gain_unit, 1.0))
-    start = np.nan_to_num(weighted_means(seen, relative, met)[1])
+    start = np.nan_to_num(weighted_means(seen, relative, met))
     exponential = options.gain == "exp"
     low, high = (float(v) for v in ds.range_db)
     layers = {
@@ -361,7 +360,7 @@ def targets(
             channels.update({f"aod_{axis}": departure[..., k] for k, axis in enumerate("xyz")})
             for name, image in channels.items():
                 middle = float(np.median(image[mask]))
-                mean = weighted_means(seen, image, mask)[1]
+                mean = weighted_means(seen, image, mask)
                 layers[name] = Target(
                     kind="signed",
                     image=np.where(mask, image, 0.0),
@@ -372,10 +371,8 @@ def targets(
     return layers, gain_unit, delay_unit
 
 
-def weighted_means(
-    transport: Transport, values: np.ndarray, where: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Per Gaussian seen by ``transport``: its index, and the mean of ``values`` over the pixels ``where`` that see it.
+def weighted_means(transport: Transport, values: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """Per Gaussian seen by ``transport``: the mean of ``values`` over the pixels ``where`` that see it.
 
     Both images have shape ``(R, H, W)``; the mean is weighted by blending weight, NaN if it is seen in none of them.
     """
@@ -388,4 +385,4 @@ def weighted_means(
         value = np.where(met, values[r].ravel()[part.pixel], 0.0)
         total += np.bincount(local, weights=weight, minlength=len(seen))
         summed += np.bincount(local, weights=weight * value, minlength=len(seen))
-    return seen, np.divide(summed, total, out=np.full(len(seen), np.nan), where=total > 0)
+    return np.divide(summed, total, out=np.full(len(seen), np.nan), where=total > 0)

@@ -32,6 +32,10 @@ class Rates:
     ridge_directional: float = 0.2
 
 
+GAIN_RATES = Rates()
+CHANNEL_RATES = Rates(constant=0.1, directional=0.05, ridge=0.02, ridge_directional=0.1)
+
+
 @checked
 @dataclass(frozen=True)
 class FieldOptions:
@@ -49,7 +53,6 @@ class FieldOptions:
         iterations: optimiser steps of the gain, ``batch`` receivers each; twice as many change the test PSNR by less
             than 0.1 dB.
         batch: receivers per step.
-        rates: learning rates and ridge.
         train_opacity: also train the opacities with the gain, as RF-3DGS does; the field then has Gaussians of its own
             opacities. Needs the ``product`` transmittance.
         checkpoint: file to save progress to and go on from; removed when the fit is done, and no part of a field.
@@ -68,7 +71,6 @@ class FieldOptions:
     line_of_sight: str | None = None
     iterations: int = 300
     batch: int = 10
-    rates: Rates = Rates()
     train_opacity: bool = False
     checkpoint: str | os.PathLike[str] | None = None
     seed: int = 0
