@@ -1,6 +1,7 @@
 """Fixtures of more than one folder."""
 
 import sys
+from contextlib import nullcontext
 from functools import partialmethod
 from pathlib import Path
 
@@ -13,26 +14,30 @@ settings.load_profile("any machine")
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "helpers"), str(HERE), str(HERE.parent)]
 
+from second_device import second_device
+
 
 def pytest_addoption(parser):
     parser.addoption("--on", default="cpu", help="the device of tests that name none (default: %(default)s)")
 
 
-def pytest_runtest_setup(item):
-    if item.get_closest_marker("cuda") and not wp.is_cuda_available():
-        pytest.skip("needs a CUDA device: none here")
-
-
 @pytest.fixture(autouse=True)
-def _default_device(request):
-    """Tests that name no device run on the CPU, where a GPU is at hand too."""
-    with wp.ScopedDevice(request.config.getoption("--on")):
+def _default_device(request, monkeypatch):
+    """Tests that name no device run on the CPU, where a GPU is at hand too. Where none is, those that ask for one get a
+    second CPU device that the library takes for one. Arrays of the other device are refused there."""
+    on = request.config.getoption("--on")
+    if on == "cpu" and not request.node.get_closest_marker("cuda"):
+        with wp.ScopedDevice("cpu"):
+            yield
+        return
+    monkeypatch.setattr(wp.config, "launch_array_access_mode", wp.config.LaunchArrayAccessMode.STRICT)
+    with nullcontext() if wp.is_cuda_available() else second_device(), wp.ScopedDevice(on):
         yield
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
 def device(request, monkeypatch, _default_device):
-    """Warp's default device while a test runs: the CPU, and again a GPU where there is one. Kernels must run there."""
+    """Warp's default device while a test runs: the CPU, and again a GPU or what stands for one. Kernels must run there."""
     launched, launch = [], wp.launch
 
     def counted(kernel, *args, **kwargs):

@@ -28,3 +28,13 @@ def test_a_launch_visits_every_index_of_its_range_once(how, count, device, monke
         module.launch(count_visits, COUNT, [visits], device=device, **how)
     index = np.arange(COUNT)
     assert np.array_equal(visits.numpy(), np.where((index >= first) & (index < last), index + 1, 0))
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize(("launched_on", "made_on"), [("cuda:0", "cpu"), ("cpu", "cuda:0")])
+def test_an_array_of_the_other_device_is_refused(launched_on, made_on):
+    """So a forgotten `device=` shows in every marked test, on a second CPU device too."""
+    visits = wp.zeros(COUNT, dtype=int, device=made_on)
+    with pytest.raises(RuntimeError, match="allocated on the launch device"):
+        module.launch(count_visits, COUNT, [visits], device=launched_on)
+    module.launch(count_visits, COUNT, [visits.to(launched_on)], device=launched_on)

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import warp as wp
 from places import ROOT
+from warp._src import context
 
 from warprrf import device
 
@@ -61,3 +62,35 @@ def test_other_words_on_standard_error_are_kept(capfd):
         os.write(2, b"before\n" + warning + b"after\n")
     os.write(2, b"later\n")
     assert capfd.readouterr().err == "before\nafter\nlater\n"
+
+
+WITHOUT_GPU = {
+    "without CUDA": {"is_cuda_enabled": False},
+    "no NVIDIA driver was found.*driver 580 or later": {"driver_version": None},
+    r"driver is too old, of CUDA 12\.8.*driver 580 or later, of CUDA 13\.0": {"driver_version": (12, 8)},
+    "no card: nvidia-smi": {"driver_version": (13, 0)},
+}
+
+
+@pytest.mark.parametrize("name", ["cuda", "cuda:0"])
+@pytest.mark.parametrize(("why", "found"), WITHOUT_GPU.items(), ids=["build", "driver", "old driver", "card"])
+def test_why_there_is_no_gpu_is_said(why, found, name, monkeypatch):
+    device.start()
+    runtime = context.runtime
+    for key, value in {"is_cuda_enabled": True, "min_driver_version": (13, 0), **found}.items():
+        monkeypatch.setattr(runtime, key, value)
+    monkeypatch.setattr(runtime, "device_map", {"cpu": runtime.cpu_device})
+    monkeypatch.setattr(runtime, "cuda_devices", [])
+    with pytest.raises(ValueError, match=rf"device: got '{name}', expected one of cpu; .*{why}"):
+        device.resolve(name)
+    with pytest.raises(ValueError, match=r"device: got 'gpu', expected one of cpu$"):
+        device.resolve("gpu")
+
+
+def test_a_driver_that_is_too_old_is_warned_of(monkeypatch):
+    """Once, when Warp starts: without an error, as a CPU is there."""
+    device.start()
+    monkeypatch.setattr(context.runtime, "driver_version", (12, 8))
+    monkeypatch.setattr(context.runtime, "min_driver_version", (13, 0))
+    with pytest.warns(UserWarning, match="there is a CPU alone; the NVIDIA driver is too old"):
+        device.start.__wrapped__()

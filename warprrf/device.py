@@ -85,14 +85,36 @@ def resolve(device: DeviceLike = None) -> wp.Device:
     """The Warp device that ``device`` names (``None``: Warp's preferred one, CUDA where there is a GPU).
 
     Raises:
-        ValueError: if Warp has no such device.
+        ValueError: if Warp has no such device; it says why there is no GPU.
     """
     try:
         start()
         return wp.get_device(device)
     except (ValueError, RuntimeError, TypeError) as error:
         known = ", ".join(str(d) for d in wp.get_devices())
-        raise ValueError(f"device: got {device!r}, expected one of {known}") from error
+        why = f"; {_why_no_gpu()}" if str(device).startswith("cuda") and not wp.is_cuda_available() else ""
+        raise ValueError(f"device: got {device!r}, expected one of {known}{why}") from error
+
+
+DRIVER_OF_CUDA = {12: "525", 13: "580"}
+"""The first driver of each generation of CUDA (NVIDIA, "CUDA Toolkit release notes", minimum required drivers)."""
+
+
+def _why_no_gpu() -> str:
+    """Why Warp has no CUDA device, and what to do."""
+    runtime = wp._src.context.runtime
+    if not runtime.is_cuda_enabled:
+        return f"this build of Warp {wp.__version__} is without CUDA: install PyPI's warp-lang"
+    least, found = runtime.min_driver_version, runtime.driver_version
+    name = DRIVER_OF_CUDA.get(least[0], f"for CUDA {least[0]}.{least[1]}")
+    if found is None:
+        return f"no NVIDIA driver was found, or it has no card: Warp needs driver {name} or later"
+    if found < least:
+        return (
+            f"the NVIDIA driver is too old, of CUDA {found[0]}.{found[1]}: Warp {wp.__version__} needs driver {name} "
+            f"or later, of CUDA {least[0]}.{least[1]}"
+        )
+    return "the NVIDIA driver has no card: nvidia-smi and CUDA_VISIBLE_DEVICES say which it may use"
 
 
 _own = threading.local()
@@ -250,6 +272,9 @@ def start() -> None:
 
     Raises:
         OSError: if neither its cache nor a temporary folder can be written.
+
+    Warns:
+        UserWarning: of an NVIDIA driver that is too old for Warp.
     """
     with _without_cuda_warning():
         try:
@@ -257,6 +282,9 @@ def start() -> None:
         except OSError as error:
             _use_temporary_cache(error)
             wp.init()
+    runtime = wp._src.context.runtime  # Warp's own warning is silenced with its other words
+    if runtime.driver_version is not None and runtime.driver_version < runtime.min_driver_version:
+        warnings.warn(f"device: there is a CPU alone; {_why_no_gpu()}", UserWarning, stacklevel=2)
 
 
 def load_module(module: wp.Module, device: wp.Device, block_dim: int) -> None:

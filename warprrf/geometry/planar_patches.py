@@ -22,6 +22,7 @@ from warprrf.cache import Cache, cached_property
 from warprrf.checks import check_similarity
 from warprrf.geometry.mesh import Mesh, components, edge_pairs, vectors_across
 from warprrf.kernels.rays.mesh import OverlapFaces, find_overlaps
+from warprrf.kernels.rays.patches import PatchFaces, lie_in_patches
 
 FLAT_M = 1e-5
 """Corners may lie this far from their patch's plane [m], and six standard deviations of vertices' errors more."""
@@ -160,24 +161,31 @@ class PlanarPatches:
     def _grown(self) -> Cache:
         return Cache(4)
 
-    def _face_boxes(self, slack_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corner of what lies no further than ``slack_m`` from each side of a face, shape ``(F, 3)`` each: a
+    def _by_patch(self, slack_m: float) -> PatchFaces:
+        """Faces patch by patch on the CPU, with boxes of what lies no further than ``slack_m`` from each side of a face: a
         triangle grown about the centre of its inscribed circle."""
 
-        def make() -> tuple[np.ndarray, np.ndarray]:
-            corner = self.mesh.triangles
+        def make() -> PatchFaces:
+            order, ends = self._faces_and_ends
+            corner, reach = self.mesh.triangles[order], self.tolerance_m + 1e-9
             side = np.linalg.norm(np.roll(corner, -1, axis=1) - np.roll(corner, 1, axis=1), axis=2)
             around = np.maximum(side.sum(axis=1), 1e-300)
             middle = (side[..., None] * corner).sum(axis=1, keepdims=True) / around[:, None, None]
-            radius = 2.0 * self.mesh.areas / around
+            radius = 2.0 * self.mesh.areas[order] / around
             with np.errstate(divide="ignore", invalid="ignore"):
                 grown = np.nan_to_num(
                     middle + (corner - middle) * (1.0 + slack_m / radius)[:, None, None], nan=np.inf
                 )
-            reach, flat = self.tolerance_m + 1e-9, ~np.isfinite(grown).all(axis=(1, 2))
+            flat = ~np.isfinite(grown).all(axis=(1, 2))
             low, high = grown.min(axis=1) - reach, grown.max(axis=1) + reach
             low[flat], high[flat] = -np.inf, np.inf
-            return low, high
+            put = partial(wp.array, dtype=wp.vec3d, device="cpu")
+            faces, wide = PatchFaces(), slack_m + self.tolerance_m
+            faces.ends = wp.array(ends, dtype=wp.int32, device="cpu")
+            faces.normal, faces.corners = put(self.normal), put(corner)
+            faces.low, faces.high = put(self.boxes[:, 0] - wide), put(self.boxes[:, 1] + wide)
+            faces.face_low, faces.face_high = put(low), put(high)
+            return faces
 
         return self._grown.get(slack_m, make)
 
@@ -189,23 +197,13 @@ class PlanarPatches:
             points: Positions [m], shape ``(N, 3)``.
             slack_m: Width added to every face [m]: faces leave no seam between them.
         """
-        box = self.boxes[patch]
-        reach = slack_m + self.tolerance_m
-        inside = ((points >= box[:, 0] - reach) & (points <= box[:, 1] + reach)).all(axis=1)
-        near = np.flatnonzero(inside)
-        order, ends = self._faces_and_ends
-        first, count = ends[patch[near]], np.diff(ends)[patch[near]]
-        row = np.repeat(np.arange(len(near)), count)
-        face = order[np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count) + first[row]]
-        low, high = self._face_boxes(slack_m)
-        for axis in range(3):  # most faces are far away, which costs little to see
-            at = points[near, axis][row]
-            close = np.flatnonzero((at >= low[face, axis]) & (at <= high[face, axis]))
-            row, face = row[close], face[close]
-        met = _in_triangles(
-            points[near][row], self.mesh.triangles[face], self.normal[patch[near]][row], slack_m
-        )
-        inside[near] = np.bincount(row, weights=met, minlength=len(near)) > 0
+        where, inside = _device.resolve("cpu"), np.empty(len(patch), dtype=bool)
+        given = partial(wp.array, device=where, copy=False)
+        inputs = [
+            self._by_patch(slack_m), slack_m, given(np.asarray(patch, np.int32), dtype=wp.int32),
+            given(np.asarray(points, float), dtype=wp.vec3d), given(inside, dtype=wp.bool),
+        ]  # fmt: skip
+        _device.launch(lie_in_patches, len(patch), inputs, device=where)
         return inside
 
 
@@ -499,14 +497,3 @@ def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angle between lines along unit vectors [rad], in [0, pi / 2]; exact for small ones."""
     sine = np.linalg.norm(np.cross(a, b), axis=1)
     return np.arctan2(sine, np.abs(np.einsum("ni,ni->n", a, b)))
-
-
-def _in_triangles(p: np.ndarray, corner: np.ndarray, normal: np.ndarray, slack_m: float) -> np.ndarray:
-    """Whether point k lies in triangle k, seen along ``normal``, or no further than ``slack_m`` from each of its sides."""
-    inside = [np.zeros(len(p))] * 3
-    for k in range(3):
-        start, edge = corner[:, k], corner[:, (k + 1) % 3] - corner[:, k]
-        length = np.maximum(np.linalg.norm(edge, axis=1), 1e-300)
-        inside[k] = np.einsum("ni,ni->n", np.cross(normal, edge), p - start) / length
-    depth = np.stack(inside)
-    return np.asarray((depth >= -slack_m).all(axis=0) | (depth <= slack_m).all(axis=0))

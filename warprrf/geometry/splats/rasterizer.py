@@ -395,19 +395,22 @@ def _listed(span: wp.array, count: wp.array, distance: wp.array, view: View) -> 
     device, n = count.device, len(count)
     tiles = view.tiles_x * view.tiles_y
     starts = wp.zeros(tiles + 1, dtype=int, device=device)
-    entries = int(count.numpy().sum(dtype=np.int64))
+    nothing = wp.empty(1, dtype=int, device=device), starts
+    if n == 0:
+        return nothing
+    keys, order = (wp.empty(2 * n, dtype=int, device=device) for _ in range(2))  # sorting wants room for two
+    launch(binning.sort_keys, n, [count, distance, keys, order], device=device)
+    wp.utils.radix_sort_pairs(keys, order, n)
+    ends = wp.empty(n, dtype=wp.int64, device=device)
+    launch(binning.counts_in_order, n, [order, count, ends], device=device)
+    wp.utils.array_scan(ends, ends, inclusive=True)
+    entries = int(ends[n - 1 :].numpy()[0])  # one number, where the counts may be millions
     if entries == 0:
-        return wp.empty(1, dtype=int, device=device), starts
+        return nothing
     if entries > 2**30:
         raise ValueError(
             f"gaussians: they cover {entries} tiles in all, more than 2^30; prune large Gaussians or render smaller"
         )
-    keys, order = (wp.empty(2 * n, dtype=int, device=device) for _ in range(2))  # sorting wants room for two
-    launch(binning.sort_keys, n, [count, distance, keys, order], device=device)
-    wp.utils.radix_sort_pairs(keys, order, n)
-    ends = wp.empty(n, dtype=int, device=device)
-    launch(binning.counts_in_order, n, [order, count, ends], device=device)
-    wp.utils.array_scan(ends, ends, inclusive=True)
     keys, ids = (wp.empty(2 * entries, dtype=int, device=device) for _ in range(2))
     launch(binning.emit_entries, n, [order, span, ends, view.tiles_x, keys, ids], device=device)
     wp.utils.radix_sort_pairs(keys, ids, entries, 0, tiles.bit_length())

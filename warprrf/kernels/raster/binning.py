@@ -25,11 +25,11 @@ def sort_keys(
 
 @wp.kernel(enable_backward=False)
 def counts_in_order(
-    offset: int, order: wp.array(dtype=int), count: wp.array(dtype=int), ordered: wp.array(dtype=int)
+    offset: int, order: wp.array(dtype=int), count: wp.array(dtype=int), ordered: wp.array(dtype=wp.int64)
 ):
-    """The count of tiles of each Gaussian, near to far."""
+    """The count of tiles of each Gaussian, near to far; their sum may be too large for 32 bits."""
     i = offset + wp.tid()
-    ordered[i] = count[order[i]]
+    ordered[i] = wp.int64(count[order[i]])
 
 
 @wp.kernel(enable_backward=False)
@@ -37,7 +37,7 @@ def emit_entries(
     offset: int,
     order: wp.array(dtype=int),
     span: wp.array(dtype=wp.vec4i),
-    ends: wp.array(dtype=int),
+    ends: wp.array(dtype=wp.int64),
     tiles_x: int,
     keys: wp.array(dtype=int),
     values: wp.array(dtype=int),
@@ -48,7 +48,7 @@ def emit_entries(
     s = span[k]
     at = int(0)
     if i > 0:
-        at = ends[i - 1]
+        at = int(ends[i - 1])
     for row in range(s[3]):
         for column in range(s[1]):
             keys[at] = (s[2] + row) * tiles_x + (s[0] + column) % tiles_x

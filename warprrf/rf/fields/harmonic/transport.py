@@ -25,7 +25,7 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians, rotations_of
 from warprrf.geometry.splats.rasterizer import Blending
-from warprrf.geometry.splats.render import BlendWeights, blend_weights
+from warprrf.geometry.splats.render import BlendWeights, blend_weights_of_each
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.spectra.spectrum import check_shape, pixel_directions
 
@@ -158,9 +158,10 @@ def views(
     progress: Progress | None,
 ) -> Iterator[BlendWeights]:
     """What each of ``receivers`` (R, 3) sees on a grid of ``shape``."""
-    for k, position in enumerate(receivers):
-        camera = Camera.spherical(shape[1], shape[0], position=position)
-        yield blend_weights(gaussians, camera, top_k=top_k, blending=blending, device=device)
+    cameras = (Camera.spherical(shape[1], shape[0], position=position) for position in receivers)
+    seen = blend_weights_of_each(gaussians, cameras, top_k=top_k, blending=blending, device=device)
+    for k, weights in enumerate(seen):
+        yield weights
         if progress is not None:
             progress("transport", k + 1, len(receivers))
 
