@@ -42,7 +42,13 @@ ENDS = np.array([[1.5, 3.0, 1.2], [6.5, 3.0, 1.2]])
 PLACES_X = 2.5, 4.0
 ACROSS = np.arange(-0.6, 0.6001, 0.025)
 MOVED_M = -2.0
-EFFECTS: dict[str, Any] = {"mirrors": 1, "scatterings": 1, "mirror_scatter": False, "scatter_mirror": False, "transmissions": 0}
+EFFECTS: dict[str, Any] = {
+    "mirrors": 1,
+    "scatterings": 1,
+    "mirror_scatter": False,
+    "scatter_mirror": False,
+    "transmissions": 0,
+}
 COLUMNS = {
     "person": (
         ("x", "person from the transmitter [m]", "{:g}"), ("deepest_db", "deepest [dB]", "{:.1f}"),
@@ -94,7 +100,9 @@ def knife_edges(x: float, y: float) -> np.ndarray:
     per_wavelength = 2.0 * CARRIER_HZ / 299792458.0
     scale = np.sqrt(per_wavelength * (1.0 / (x - start) + 1.0 / (end - x)))
     edge = PERSON_M[0] / 2
-    sine, cosine = fresnel(scale * np.array([y + edge - ENDS[0, 1], ENDS[0, 1] - y + edge, PERSON_M[1] - height]))
+    sine, cosine = fresnel(
+        scale * np.array([y + edge - ENDS[0, 1], ENDS[0, 1] - y + edge, PERSON_M[1] - height])
+    )
     return np.asarray(0.5 * ((0.5 - cosine) ** 2 + (0.5 - sine) ** 2))
 
 
@@ -102,7 +110,9 @@ def prior(scene: wr.Scene, **effects: Any) -> BistaticField:
     """A field of ``scene`` before any measurement, of the link."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of effects that are not modelled
-        ds = wr.simulate(scene, transmitter=ENDS[0], receivers=ENDS[1], frequency_hz=CARRIER_HZ, shape=(20, 40))
+        ds = wr.simulate(
+            scene, transmitter=ENDS[0], receivers=ENDS[1], frequency_hz=CARRIER_HZ, shape=(20, 40)
+        )
     return BistaticField.prior(scene, ds, effects=wr.Effects(**effects))
 
 
@@ -120,13 +130,13 @@ def walk(x: float) -> Row:
     return {
         "x": x - ENDS[0, 0], "deepest_db": min(found), "screen_db": float(np.min(np.array(known)[dark])),
         "shadow_rms_db": rms(error[dark]), "shadow_most_db": float(np.abs(error[dark]).max()),
-        "lit_most_db": float(np.abs(np.array(found)[~dark]).max()), "across_m": ACROSS.tolist(), "found_db": found, "known_db": known,
+        "lit_most_db": float(np.abs(np.array(found)[~dark]).max()), "across_m": ACROSS.tolist(), "found_db": found,
+        "known_db": known,
     }  # fmt: skip
 
 
 def step_seconds(what: str, **effects: Any) -> Row:
-    """Seconds of a person's step through the office, of the link alone or of a spectrum, and of a whole spectrum with all effects: of
-    a place and a room that are new to it, each."""
+    """Seconds of a person's step through the office under ``effects``, and of a whole spectrum with all of them."""
     whole, field = (prior(office(), **e).on_grid((90, 180)) for e in ({}, effects))
     receiver, steps = ENDS[1] - [2.0, 1.5, 0.0], []
 
@@ -140,9 +150,17 @@ def step_seconds(what: str, **effects: Any) -> Row:
         make = partial(field.with_objects, at, materials={"person": "skin"})
         now = make()
         ask = partial(now.spectrum if field.effects.scatterings else now.paths, receiver)
-        steps.append((seconds(make), seconds(ask), seconds(partial(whole.spectrum, receiver + [0.01 * k, 0.0, 0.0]))))
+        steps.append(
+            (seconds(make), seconds(ask), seconds(partial(whole.spectrum, receiver + [0.01 * k, 0.0, 0.0])))
+        )
     edit, step, spectrum = np.median(steps, axis=0).tolist()
-    return {"what": what, "edit_s": edit, "step_s": step, "whole_s": spectrum, "share": (edit + step) / spectrum}
+    return {
+        "what": what,
+        "edit_s": edit,
+        "step_s": step,
+        "whole_s": spectrum,
+        "share": (edit + step) / spectrum,
+    }
 
 
 def moved(scene: wr.Scene) -> wr.Scene:
@@ -168,7 +186,11 @@ class Cabinet:
         count = max(self.options.counts)
         places = wr.sample_receivers(self.after, 400, z=(0.8, 1.8), seed=self.fits.job.seed)
         places = places[self.before.is_free(places, clearance_m=0.1) & (places[:, 0] < SHEET_X)]
-        asked = {"before": places[:count], "after": places[:count], "test": places[count : count + self.options.tests]}
+        asked = {
+            "before": places[:count],
+            "after": places[:count],
+            "test": places[count : count + self.options.tests],
+        }
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # walls are passed by neither
             return {
@@ -196,7 +218,10 @@ def rows(options: Options, fits: Fits) -> Iterator[Row]:
     """The person's walk, seconds of a step, and the cabinet."""
     for x in PLACES_X:
         yield {"part": "person", **fits.row(f"walk {x}", partial(walk, x))}
-    steps = {"the link": {"scatterings": 0, "transmissions": 0}, "a spectrum, single bounces and edges": EFFECTS}
+    steps = {
+        "the link": {"scatterings": 0, "transmissions": 0},
+        "a spectrum, single bounces and edges": EFFECTS,
+    }
     for what, effects in {**steps, "a spectrum, all effects": {}}.items():
         yield {"part": "seconds", **fits.row(f"seconds {what}", partial(step_seconds, what, **effects))}
     cabinet = Cabinet(options, fits)

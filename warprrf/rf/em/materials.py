@@ -504,18 +504,16 @@ def itu_material(
     )
 
 
-SKIN_HZ = (1e8, 1e11)
-"""Where the law of :func:`skin` was fitted to measurements, of what is tabulated here [Hz]: Gabriel et al. give 10 Hz to 100 GHz."""
 _SKIN = 4.0, ((32.0, 7.234e-12, 0.0), (1100.0, 32.48e-9, 0.2)), 0.0002
-"""Dry skin: permittivity at high frequencies; strength, relaxation time [s] and spread of each dispersion (the other two of four have
-no strength); ionic conductivity [S/m]."""
+"""Dry skin: permittivity at high frequencies; strength, relaxation time [s] and spread of each of two dispersions (two more have no
+strength); ionic conductivity [S/m]."""
 
 
 def skin_permittivity(frequency_hz: float) -> complex:
     """Complex relative permittivity of dry skin: 7.98 - 10.9j at 60 GHz.
 
     Source: S. Gabriel, R. W. Lau and C. Gabriel, "The dielectric properties of biological tissues: III. Parametric models for
-    the dielectric spectrum of tissues", Phys. Med. Biol. 41 (1996), table 1 (four Cole-Cole dispersions), fitted up to 100 GHz.
+    the dielectric spectrum of tissues", Phys. Med. Biol. 41 (1996), table 1: four Cole-Cole dispersions, 10 Hz to 100 GHz.
     """
     turn = 2j * np.pi * check_frequency(frequency_hz)
     high, dispersions, ionic = _SKIN
@@ -525,34 +523,27 @@ def skin_permittivity(frequency_hz: float) -> complex:
 
 @lru_cache(maxsize=1)
 def skin() -> Material:
-    """Dry skin, as a half-space that does not scatter: what waves from some GHz on see of a person, clothes apart.
-
-    Rows follow :func:`skin_permittivity` to 0.5 % from 0.1 to 100 GHz, where it holds; above, up to 1 THz, they say that it is
-    continued.
-    """
-    rows, ends = [], np.geomspace(SKIN_HZ[0], 1e12, 65)
-    for low, high in pairwise(ends.tolist()):
-        epsilon = np.array([skin_permittivity(low), skin_permittivity(high)])
-        ghz = np.array([low, high]) / 1e9
-        sigma = -epsilon.imag * 2.0 * np.pi * 1e9 * ghz * VACUUM_PERMITTIVITY
-        b, d = (float(np.diff(np.log(y))[0] / np.diff(np.log(ghz))[0]) for y in (epsilon.real, sigma))
-        beyond = "" if high <= 1.0001 * SKIN_HZ[1] else "extrapolated from 0.1 to 100 GHz: "
-        laws = {"a": float(epsilon.real[0] / ghz[0] ** b), "b": b, "c": float(sigma[0] / ghz[0] ** d), "d": d}
-        rows.append(Band(low, high, **laws, source=beyond + "Gabriel et al. 1996, dry skin"))
+    """Dry skin, a half-space that does not scatter: what waves above some GHz see of a person, clothes apart. Rows follow
+    :func:`skin_permittivity` to 0.5 % from 0.1 to 1000 GHz; those above 100 GHz, where it was not fitted, say so."""
+    rows = []
+    for low, high in pairwise(np.geomspace(0.1, 1000.0, 65).tolist()):
+        epsilon = np.array([skin_permittivity(1e9 * ghz) for ghz in (low, high)])
+        sigma = -epsilon.imag * 2e9 * np.pi * np.array([low, high]) * VACUUM_PERMITTIVITY
+        b, d = (float(np.log(y[1] / y[0]) / np.log(high / low)) for y in (epsilon.real, sigma))
+        source = "extrapolated from 0.1 to 100 GHz: " * (high > 100.1) + "Gabriel et al. 1996, dry skin"
+        rows.append(
+            Band(
+                1e9 * low, 1e9 * high, float(epsilon.real[0]) / low**b, b, float(sigma[0]) / low**d, d, source
+            )
+        )
     return Material("skin", tuple(rows), thickness_m=np.inf)
-
-
-def library_names() -> tuple[str, ...]:
-    """Names that :func:`library_material` knows."""
-    return ("skin", *ITU_BANDS)
 
 
 def library_material(name: str) -> Material | None:
     """The material that a name alone says, at any frequency: ``"skin"``, or one of ITU-R P.2040; None for no such name."""
     if name == "skin":
         return skin().extrapolated()
-    known = itu_name(name)
-    return None if known is None else itu_material(known, name=name).extrapolated()
+    return itu_material(name, name=name).extrapolated() if itu_name(name) else None
 
 
 def assumed_permittivity(name: str, frequency_hz: float) -> float:

@@ -176,25 +176,19 @@ class Surface:
         """Number of cells."""
         return len(self.cell_element)
 
-    def group_of(self, name: str) -> int | None:
-        """The group that has most of the area of the object or of the groups called ``name``; None for no such name or no face."""
-        own = self.faces_of(name)
-        if not own.any():
-            return self.group_names.index(name) if name in self.group_names else None
-        return int(np.bincount(self.group[own], self.mesh.areas[own]).argmax())
-
     def faces_of(self, name: str) -> np.ndarray:
-        """Faces of the object called ``name``, else of the groups that are, shape ``(F,)`` bool."""
+        """Faces of the object called ``name``, else of the group that is, shape ``(F,)`` bool."""
         if name in self.object_names:
             return np.asarray(self.face_object == self.object_names.index(name))
-        return np.isin(self.group, [g for g, own in enumerate(self.group_names) if own == name])
+        return np.asarray(self.group == (self.group_names.index(name) if name in self.group_names else -1))
 
     @classmethod
-    def of(cls, geometry: GeometryLike) -> Surface:
+    def of(cls, geometry: GeometryLike, *, element_m: float | None = None) -> Surface:
         """Patches, groups and elements of a Reconstruction, a Scene or a Mesh; a Surface is returned as it is.
 
         Materials of a Scene become groups, and those that a Mesh has names of; else pieces of one colour, or of one shape
-        where there are no colours. A mesh with the noise of a scan is flattened where planes are found in it.
+        where there are no colours. A mesh with the noise of a scan is flattened where planes are found in it. Elements are
+        ``element_m`` wide; by default as the whole asks for.
 
         Raises:
             TypeError: if it has no mesh.
@@ -203,48 +197,19 @@ class Surface:
         if isinstance(geometry, Surface):
             return geometry
         mesh = as_mesh(geometry, "geometry")
-        element_m = element_width(mesh)
+        element_m = element_width(mesh) if element_m is None else element_m
         material, names = named_faces(geometry, mesh)
-        objects = _objects(geometry, mesh)
+        patches, colours, measured = _patches_and_colours(geometry, mesh, material)
+        mesh = patches.mesh
         if material is not None:
-            return cls.of_groups(mesh, material, names, element_m, **objects, **_slabs(geometry, len(names)))
-        patches, colours, measured = _patches_and_colours(geometry, mesh)
-        pieces = patches.mesh, patches.face_patch
-        groups = shape_groups(*pieces) if colours is None else colour_groups(*pieces, colours)
-        names = tuple(f"group_{k}" for k in range(len(groups[1])))
-        if len(patches.mesh.faces) != len(mesh.faces):
-            objects = {}  # a scan that was flattened has faces of its own
-        return cls._cut(patches, groups, names, element_m, measured, **objects)
-
-    @classmethod
-    def of_groups(
-        cls, mesh: Mesh, group: np.ndarray, names: Sequence[str], element_m: float, **known: Any
-    ) -> Surface:
-        """That of faces of known groups (F,), on exact patches.
-
-        Args:
-            mesh: its faces, F of them.
-            group: index into ``names`` of each.
-            names: what the groups are called; each is a material of its own.
-            element_m: width of elements [m].
-            known: ``thickness_m`` and ``dispersion`` of the groups, ``face_object`` and ``object_names``; as the attributes.
-        """
-        groups = group, np.arange(len(names), dtype=np.int32), np.full((len(names), 4), np.nan)
-        return cls._cut(planar_patches(mesh, group), groups, names, element_m, False, **known)
-
-    @classmethod
-    def _cut(
-        cls,
-        patches: PlanarPatches,
-        groups: tuple[np.ndarray, np.ndarray, np.ndarray],
-        names: Sequence[str],
-        element_m: float,
-        measured: bool,
-        **known: Any,
-    ) -> Surface:
-        """Patches of a mesh cut into elements of ``element_m``, with ``groups`` of its faces, their materials and appearance; where
-        photos or a scanner ``measured`` it, it has an error and rounded edges."""
-        mesh, (group, alike, appearance) = patches.mesh, groups
+            group, alike = material, np.arange(len(names), dtype=np.int32)
+            appearance = np.full((len(names), 4), np.nan)
+        else:
+            pieces = mesh, patches.face_patch
+            group, alike, appearance = (
+                shape_groups(*pieces) if colours is None else colour_groups(*pieces, colours)
+            )
+            names = tuple(f"group_{k}" for k in range(len(alike)))
         if measured:
             normal, error_m = _on_patches(patches, smoothed_normals(mesh, 3)), POSITION_ERROR_M
         else:
@@ -254,15 +219,14 @@ class Surface:
         if patches.two_sided:
             least_m2 = MIN_MIRROR * min(element_m, ELEMENT_M) ** 2
             patch, planes = _mirrors(_apart(patches, alike[group]), least_m2)
+        sides = patches.two_sided
         mesh, parent = split_long(mesh, np.flatnonzero(patches.once), LARGEST_FACE * element_m)
         group, patch = group[parent].astype(np.int32), patch[parent].astype(np.int32)
-        if "face_object" in known:
-            known["face_object"] = known["face_object"][parent]
         return cls(
             mesh=mesh, normal=np.asarray(normal[parent]), patch=patch, plane_normal=planes[0], plane_offset=planes[1],
             group=group, material=alike, appearance=appearance, patch_group=largest_groups(mesh, patch, group, len(planes[1])),
-            group_names=tuple(names), position_error_m=error_m, two_sided=patches.two_sided,
-            **elements(mesh, patch, group, element_m), **_unknown_slabs(len(names)) | known,
+            **_slabs(geometry, material, len(names)), group_names=tuple(names), position_error_m=error_m,
+            two_sided=sides, **_elements(mesh, patch, group, element_m), **objects_of(geometry, parent),
         )  # fmt: skip
 
     @classmethod
@@ -275,7 +239,7 @@ class Surface:
             plane_offset=patches.offset, group=material, material=np.arange(groups, dtype=np.int32),
             appearance=np.full((groups, 4), np.nan), patch_group=faces, element=none, cell=none, cell_element=none[:1],
             element_centre=mesh.center[None], element_area=np.array([mesh.areas.sum()]), element_group=none[:1],
-            **_unknown_slabs(groups), group_names=tuple(names), position_error_m=TRUE_ERROR_M, two_sided=True,
+            **_slabs(mesh, None, groups), group_names=tuple(names), position_error_m=TRUE_ERROR_M, two_sided=True,
         )  # fmt: skip
 
     @cached_property
@@ -345,10 +309,12 @@ class Surface:
 
 
 def _patches_and_colours(
-    geometry: GeometryLike, mesh: Mesh
+    geometry: GeometryLike, mesh: Mesh, material: np.ndarray | None
 ) -> tuple[PlanarPatches, Colours | None, bool]:
-    """Patches, with their mesh, which is another one if ``mesh`` is a scan; colours on it, None where there are none; and whether
-    photos or a scanner measured them."""
+    """Patches, with their mesh, which is another one if ``mesh`` is a scan; colours on it, None where there are none or
+    ``material`` (F,) is known; and whether photos or a scanner measured them."""
+    if material is not None:
+        return planar_patches(mesh, material), None, False
     found, gaussians = getattr(geometry, "patches", None), gaussians_of(geometry)
     if isinstance(found, PlanarPatches) and gaussians is not None:
         return found, Colours.of_gaussians(mesh, gaussians), True
@@ -394,32 +360,30 @@ def named_faces(geometry: GeometryLike, mesh: Mesh) -> tuple[np.ndarray | None, 
     return group.reshape(-1).astype(np.int32), tuple((*names, "unnamed")[k] for k in used)
 
 
-def _objects(geometry: GeometryLike, mesh: Mesh) -> dict[str, Any]:
-    """Object of each face and the objects' names, where ``geometry`` has them."""
-    known, names = getattr(geometry, "face_object", None), tuple(getattr(geometry, "object_names", ()))
-    if known is None or not names:
-        return {}
-    return {"face_object": np.asarray(known, np.int32), "object_names": names}
-
-
-def _unknown_slabs(groups: int) -> dict[str, Any]:
-    return {"thickness_m": np.full(groups, np.nan), "dispersion": np.full((groups, 4), np.nan)}
-
-
-def _slabs(geometry: GeometryLike, groups: int) -> dict[str, Any]:
+def _slabs(geometry: GeometryLike, named: np.ndarray | None, groups: int) -> dict[str, Any]:
     """Thickness and dispersion of each group, where the groups are a Scene's materials; else NaN."""
-    materials, found = getattr(geometry, "materials", ()), _unknown_slabs(groups)
-    if len(materials) == groups:
+    materials = getattr(geometry, "materials", ())
+    thickness, dispersion = np.full(groups, np.nan), np.full((groups, 4), np.nan)
+    if named is not None and len(materials) == groups:
         for g, m in enumerate(materials):
             if not is_name_alone(m):
-                found["thickness_m"][g] = float(m.thickness_m)
+                thickness[g] = float(m.thickness_m)
                 if getattr(m, "bands", ()) and m.itu is None:
                     band = m.bands[0]
-                    found["dispersion"][g] = band.a, band.b, band.c, band.d
-    return found
+                    dispersion[g] = band.a, band.b, band.c, band.d
+    return {"thickness_m": thickness, "dispersion": dispersion}
 
 
-def elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray, width_m: float) -> dict[str, np.ndarray]:
+def objects_of(geometry: GeometryLike, parent: np.ndarray) -> dict[str, Any]:
+    """Object of each face, a piece of ``parent`` (F,), and the objects' names, by the names of :class:`Surface`; of a geometry that has
+    some, and was not flattened."""
+    known, names = getattr(geometry, "face_object", None), tuple(getattr(geometry, "object_names", ()))
+    if known is None or not names or len(known) <= parent.max():
+        return {}
+    return {"face_object": np.asarray(known, np.int32)[parent], "object_names": names}
+
+
+def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray, width_m: float) -> dict[str, Any]:
     """Elements and cells of faces, by the names of :class:`Surface`: pieces of one group and patch on a lattice of
     ``width_m``."""
     centre = mesh.triangles.mean(axis=1)
@@ -427,15 +391,15 @@ def elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray, width_m: float) -
     key = np.column_stack([group, patch, cells // CELLS])
     element = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
     pieces, cell = np.unique(np.column_stack([element, cells]), axis=0, return_inverse=True)
-    return {
+    found = {
         "element": element,
         "cell": cell.reshape(-1).astype(np.int32),
         "cell_element": pieces[:, 0].astype(np.int32),
-        **of_elements(mesh, element, group),
     }
+    return found | of_elements(mesh, element, group)
 
 
-def of_elements(mesh: Mesh, element: np.ndarray, group: np.ndarray) -> dict[str, np.ndarray]:
+def of_elements(mesh: Mesh, element: np.ndarray, group: np.ndarray) -> dict[str, Any]:
     """Centre, area and group of each element, by the names of :class:`Surface`."""
     centre, area = mesh.triangles.mean(axis=1), mesh.areas
     total = np.maximum(np.bincount(element, area), 1e-12)

@@ -326,13 +326,12 @@ class BistaticField(RadioField):
         )  # fmt: skip
 
     def with_geometry(self, geometry: GeometryLike) -> BistaticField:
-        """The same field in a room that changed: materials that were fitted stay with what stays.
+        """The same field in a room that changed: fitted materials stay with what stays.
 
-        A face of the new geometry keeps the parameters of the group that its material's name says, else of the one that it lies
-        on, to within the surface's error of position; cells keep what was learned of them where they are as before. Anything else
-        is new, and made of what a Scene's :class:`Material` of it says, or of that which its name has in ITU-R P.2040. Where the
-        room is as it was nothing changes, to the last digit. Edit ``field.mesh`` where photos or a scanner made it: the fit
-        may have mended what it was given. How wrong the field is now (``uncertainty=``) is not known.
+        A face keeps the parameters of the group that its material's name says, else of the one that it lies on, to within the
+        surface's error of position; cells keep what was learned of them where they are as before. Anything else is new, and of what
+        the Scene's :class:`Material` or a name in ITU-R P.2040 says. A room that is as it was changes nothing. Where photos or a
+        scanner made the room, edit ``field.mesh``, which the fit may have mended. The stated uncertainty is not known there.
 
         Args:
             geometry: the whole room as it is now: Scene, Mesh or Reconstruction.
@@ -343,35 +342,29 @@ class BistaticField(RadioField):
 
         Warns:
             UserWarning: where a fitted surface vanished, or something is new whose material nobody knows.
-
-        Example::
-
-            now = field.with_geometry(wr.Scene.load("lobby_with_a_new_desk.xml"))
         """
         return replace(self, **edited.with_geometry(self, geometry))
 
     def with_objects(
         self, objects: Mapping[str, Mesh | None], *, materials: Mapping[str, Material | str] | None = None
     ) -> BistaticField:
-        """The same field with things added, moved or taken away; see :meth:`with_geometry` for what stays.
-
-        A thing stands in the place of the object of its name, or else of the material of its name, and is made of what that was.
-        A new one needs a material.
+        """The same field with things added, moved or taken away; the rest stays, as of :meth:`with_geometry`.
 
         Args:
-            objects: by name, the thing's mesh where it is now; None takes it away. Vertices in metres, faces outward.
-            materials: by the objects' names, what they are made of: a :class:`Material`; the name of one of the field's groups;
-                ``"skin"`` (Gabriel et al. 1996, to 100 GHz; see :func:`warprrf.em.skin`); or a name in ITU-R P.2040.
+            objects: by name, the thing's mesh where it is now, faces outward; None takes it away. It stands in the place of the
+                object of that name, or else of the material, and is made of the same.
+            materials: by the objects' names, of what is new or made otherwise: a :class:`Material`; the name of one of the field's
+                groups; one in ITU-R P.2040; or ``"skin"``, see :func:`warprrf.em.skin`.
 
         Raises:
-            TypeError, ValueError: for a name that is no object's, an object whose material nobody says, a material that is not known
-                at the field's carrier.
+            ValueError: for a name that is no object's, an object whose material nobody says, a material that is not known at the
+                field's carrier.
 
         Example::
 
             crossing = field.with_objects({"person": wr.Mesh(vertices, faces)}, materials={"person": "skin"})
         """
-        return replace(self, **edited.with_objects(self, objects, materials))
+        return replace(self, **edited.with_objects(self, objects, materials or {}))
 
     # ------------------------------------------------------------------------------------------ asking
 

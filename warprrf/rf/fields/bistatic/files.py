@@ -25,7 +25,11 @@ def taken_apart(parts: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str,
     """Tensors and header of the ``parts`` of a field, by the names of its attributes, but for what every model has."""
     s, p = parts["surface"], parts["parameters"]
     tensors = {f"surface/{name}": np.asarray(getattr(s, name)) for name in _SURFACE}
-    tensors |= {"mesh/vertices": s.mesh.vertices, "mesh/faces": s.mesh.faces, "surface/face_object": s.face_object}
+    tensors |= {
+        "mesh/vertices": s.mesh.vertices,
+        "mesh/faces": s.mesh.faces,
+        "surface/face_object": s.face_object,
+    }
     tensors |= {f"parameters/{name}": getattr(p, name) for name in _PARAMETERS}
     tensors |= {name: parts[name] for name in ("residual", "material")}
     if parts["errors"] is not None:
@@ -66,7 +70,7 @@ def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict
             object_names=tuple(objects),
             position_error_m=header["position_error_m"],
             two_sided=two_sided,
-            **{name: tensors.get(f"surface/{name}") for name in _SURFACE},
+            **arrays,
         ),
         "effects": Effects(**header["effects"]),
         "sub_pixels": header["sub_pixels"],
