@@ -56,8 +56,8 @@ COLUMNS = {
         ("shadow_most_db", "largest [dB]", "{:.2f}"), ("lit_most_db", "beside it, largest [dB]", "{:.2f}"),
     ),
     "seconds": (
-        ("what", "a step, 90 x 180 pixels", "{}"), ("edit_s", "edit [s]", "{:.3f}"), ("step_s", "step [s]", "{:.2f}"),
-        ("share", "of the whole spectrum", "{:.2f}"),
+        ("what", "a step, 90 x 180 pixels", "{}"), ("edit_s", "edit [s]", "{:.3f}"), ("step_s", "then [s]", "{:.2f}"),
+        ("whole_s", "whole spectrum, all effects [s]", "{:.2f}"), ("share", "of that", "{:.2f}"),
     ),
     "rows": (
         ("field", "field", "{}"), ("n_train", "spectra", "{}"), ("test", "receivers", "{}"), ("psnr_db", "PSNR [dB]", "{:.2f}"),
@@ -136,8 +136,10 @@ def walk(x: float) -> Row:
 
 
 def step_seconds(what: str, **effects: Any) -> Row:
-    """Seconds of a person's step through the office under ``effects``, and of a whole spectrum with all of them."""
+    """Seconds of a person's step through the office under ``effects``, and of a whole spectrum with all of them. A link alone, where
+    nothing scatters, needs no grid of rays."""
     whole, field = (prior(office(), **e).on_grid((90, 180)) for e in ({}, effects))
+    field = field if field.effects.scatterings else field.on_grid((10, 20))
     receiver, steps = ENDS[1] - [2.0, 1.5, 0.0], []
 
     def seconds(work: Callable[[], Any]) -> float:

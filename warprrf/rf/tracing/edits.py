@@ -84,7 +84,7 @@ class Room:
 
 def edited(surface: Surface, room: Room, **slabs: np.ndarray) -> tuple[Surface, np.ndarray]:
     """The surface of ``room``, whose groups are all of the old one's, then new ones with ``thickness_m`` and ``dispersion`` of
-    ``slabs``; and the cell of the old one that each of its cells is or lies on, -1 for none. If nothing changed, the old surface."""
+    ``slabs``; and of each of its cells that of the old one that it is or lies on, -1 for none. Unchanged, it is the old one."""
     s, count, names = surface, len(surface.mesh.faces), tuple(material.name for material in room.materials)
     first = _first_at_place(s, room.mesh)
     at = first[count:]  # of each face the old one in its place, if that is below count
