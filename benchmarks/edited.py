@@ -136,8 +136,8 @@ def walk(x: float) -> Row:
 
 
 def step_seconds(what: str, **effects: Any) -> Row:
-    """Seconds of a person's step through the office under ``effects``, and of a whole spectrum with all of them. A link alone, where
-    nothing scatters, needs no grid of rays."""
+    """Seconds of a person's step through the office under ``effects``, and of a whole spectrum with all of them. A link alone,
+    where nothing scatters, needs no grid of rays."""
     whole, field = (prior(office(), **e).on_grid((90, 180)) for e in ({}, effects))
     field = field if field.effects.scatterings else field.on_grid((10, 20))
     receiver, steps = ENDS[1] - [2.0, 1.5, 0.0], []

@@ -5,9 +5,6 @@ from warprrf.rf.em.materials import Material as Material
 # a material of ITU-R P.2040 by its name
 from warprrf.rf.em.materials import itu_material as itu_material
 
-# a person's skin
-from warprrf.rf.em.materials import skin as skin
-
 # permittivity by frequency, one row of a material
 from warprrf.rf.em.materials import Band as Band
 

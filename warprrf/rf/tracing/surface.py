@@ -375,8 +375,8 @@ def _slabs(geometry: GeometryLike, named: np.ndarray | None, groups: int) -> dic
 
 
 def objects_of(geometry: GeometryLike, parent: np.ndarray) -> dict[str, Any]:
-    """Object of each face, a piece of ``parent`` (F,), and the objects' names, by the names of :class:`Surface`; of a geometry that has
-    some, and was not flattened."""
+    """Object of each face, a piece of ``parent`` (F,), and the objects' names, by the names of :class:`Surface`; of a geometry that
+    has some, and was not flattened."""
     known, names = getattr(geometry, "face_object", None), tuple(getattr(geometry, "object_names", ()))
     if known is None or not names or len(known) <= parent.max():
         return {}

@@ -354,7 +354,7 @@ class BistaticField(RadioField):
             objects: by name, the thing's mesh where it is now, faces outward; None takes it away. It stands in the place of the
                 object of that name, or else of the material, and is made of the same.
             materials: by the objects' names, of what is new or made otherwise: a :class:`Material`; the name of one of the field's
-                groups; one in ITU-R P.2040; or ``"skin"``, see :func:`warprrf.em.skin`.
+                groups; one in ITU-R P.2040; or ``"skin"``: dry, by Gabriel et al. (1996), to 100 GHz.
 
         Raises:
             ValueError: for a name that is no object's, an object whose material nobody says, a material that is not known at the
