@@ -53,6 +53,7 @@ NAMES = {
         "a measured place: links held out, fields beside simple rivals and the measurement's noise",
     ),
     "office": ("benchmarks.office", "two rooms parted by glass and plasterboard: a field behind the walls"),
+    "edited": ("benchmarks.edited", "a room that changed: a person across a link, a cabinet moved"),
     "outside": (
         "benchmarks.outside",
         "measurements by others: an array's pictures over carriers",

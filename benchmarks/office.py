@@ -86,21 +86,26 @@ class Options:
 def office() -> wr.Scene:
     """The scene: a shell seen from within, the sheets between the rooms, closed furniture."""
     names = list(MATERIALS)
-    quads = [(name, side) for name, side in zip(SHELL, _sides((0, 0, 0), SIZE), strict=True)]
+    quads = [(name, side) for name, side in zip(SHELL, box_sides((0, 0, 0), SIZE), strict=True)]
     for name, (left, right), (low, high) in SHEETS:
         ends = [(left, low), (right, low), (right, high), (left, high)]
         quads.append((name, np.array([(SHEET_X, y, z) for y, z in ends])))
     for name, *corners in FURNITURE:
-        quads += [(name, side[::-1]) for side in _sides(*corners)]
-    faces = (4 * np.arange(len(quads))[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
+        quads += [(name, side[::-1]) for side in box_sides(*corners)]
     of_face = np.repeat([names.index(name) for name, _ in quads], 2)
-    mesh = wr.Mesh(np.concatenate([corners for _, corners in quads]), faces)
+    mesh = quads_mesh(np.stack([corners for _, corners in quads]))
     return wr.Scene(
         mesh, [material(name) for name in names], of_face, face_object=of_face, object_names=names
     )
 
 
-def _sides(low: Corner, high: Corner) -> np.ndarray:
+def quads_mesh(corners: np.ndarray) -> wr.Mesh:
+    """A mesh of rectangles, corners ``(N, 4, 3)`` [m]."""
+    faces = (4 * np.arange(len(corners))[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
+    return wr.Mesh(corners.reshape(-1, 3), faces)
+
+
+def box_sides(low: Corner, high: Corner) -> np.ndarray:
     """Corners of the sides of a box, wound inward, across x, y and z, shape ``(6, 4, 3)``."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     corners = np.array(low) + corners * np.subtract(high, low)

@@ -255,6 +255,9 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     # fields
     "BistaticField.array_spectrum": lambda p: {"receivers": POINTS[0], "transmitter": p.transmitter + 0.1},
     "BistaticField.at_frequency": lambda p: {"frequency_hz": 140e9},
+    "BistaticField.with_objects": lambda p: {
+        "objects": {"box": wr.Mesh(p.mesh.vertices * 0.05 + POINTS[0], p.mesh.faces)}, "materials": {"box": "skin"},
+    },
     "RadioField.fit": lambda p: {
         "effects": wr.Effects(mirrors=1, residual=False), "lobes": (0, 4), "sub_pixels": 1, "device": "cpu",
         "relevance": p.relevance,

@@ -159,3 +159,42 @@ def _beams() -> str:
         lines.append([BEAMS[method], str(count or ""), *cells])
     head = ("within 1 dB, all / blocked", "spectra", *(f"{n} elements" for n in sizes))
     return markdown(head, lines)
+
+
+def _edited(part: str, columns: tuple[tuple[str, str, str], ...]) -> str:
+    rows = [[show(row[key], form) for key, _, form in columns] for row in read("edited")[part]]
+    return markdown([title for _, title, _ in columns], rows)
+
+
+@entry("edited-person")
+def _person() -> str:
+    return _edited(
+        "person",
+        (
+            ("x", "from the transmitter [m]", "{:g}"), ("deepest_db", "deepest [dB]", "{:.1f}"),
+            ("screen_db", "P.526 [dB]", "{:.1f}"),
+            ("shadow_rms_db", "in the shadow: rms [dB]", "{:.2f}"), ("shadow_most_db", "largest [dB]", "{:.2f}"),
+        ),
+    )  # fmt: skip
+
+
+@entry("edited-cabinet")
+def _cabinet() -> str:
+    return _edited(
+        "rows",
+        (
+            ("field", "field", "{}"), ("n_train", "spectra", "{}"), ("psnr_db", "PSNR [dB]", "{:.2f}"),
+            ("total_rms_db", "total gain, rms [dB]", "{:.2f}"),
+        ),
+    )  # fmt: skip
+
+
+@entry("edited-seconds")
+def _steps() -> str:
+    return _edited(
+        "seconds",
+        (
+            ("what", "step of", "{}"), ("edit_s", "edit [s]", "{:.2f}"), ("step_s", "then [s]", "{:.2f}"),
+            ("whole_s", "whole [s]", "{:.2f}"), ("share", "step / whole", "{:.2f}"),
+        ),
+    )  # fmt: skip

@@ -19,6 +19,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -495,6 +496,48 @@ def itu_material(
         xpd=xpd,
         itu=known,
     )
+
+
+_SKIN = 4.0, ((32.0, 7.234e-12, 0.0), (1100.0, 32.48e-9, 0.2)), 0.0002
+"""Dry skin: permittivity at high frequencies; strength, relaxation time [s] and spread of each of two dispersions (two more have no
+strength); ionic conductivity [S/m]."""
+
+
+def skin_permittivity(frequency_hz: float) -> complex:
+    """Complex relative permittivity of dry skin: 7.98 - 10.9j at 60 GHz.
+
+    Source: S. Gabriel, R. W. Lau and C. Gabriel, "The dielectric properties of biological tissues: III. Parametric models for
+    the dielectric spectrum of tissues", Phys. Med. Biol. 41 (1996), table 1: four Cole-Cole dispersions, 10 Hz to 100 GHz.
+    """
+    turn = 2j * np.pi * check_frequency(frequency_hz)
+    high, dispersions, ionic = _SKIN
+    found = sum(size / (1.0 + (turn * tau) ** (1.0 - spread)) for size, tau, spread in dispersions)
+    return complex(high + found + ionic / (turn * VACUUM_PERMITTIVITY))
+
+
+@lru_cache(maxsize=1)
+def skin() -> Material:
+    """Dry skin, a half-space that does not scatter: what waves above some GHz see of a person, clothes apart. Rows follow
+    :func:`skin_permittivity` to 0.5 % from 0.1 to 1000 GHz; those above 100 GHz, where it was not fitted, say so."""
+    rows = []
+    for low, high in pairwise(np.geomspace(0.1, 1000.0, 65).tolist()):
+        epsilon = np.array([skin_permittivity(1e9 * ghz) for ghz in (low, high)])
+        sigma = -epsilon.imag * 2e9 * np.pi * np.array([low, high]) * VACUUM_PERMITTIVITY
+        b, d = (float(np.log(y[1] / y[0]) / np.log(high / low)) for y in (epsilon.real, sigma))
+        source = "extrapolated from 0.1 to 100 GHz: " * (high > 100.1) + "Gabriel et al. 1996, dry skin"
+        rows.append(
+            Band(
+                1e9 * low, 1e9 * high, float(epsilon.real[0]) / low**b, b, float(sigma[0]) / low**d, d, source
+            )
+        )
+    return Material("skin", tuple(rows), thickness_m=np.inf)
+
+
+def library_material(name: str) -> Material | None:
+    """The material that a name alone says, at any frequency: ``"skin"``, or one of ITU-R P.2040; None for no such name."""
+    if name == "skin":
+        return skin().extrapolated()
+    return itu_material(name, name=name).extrapolated() if itu_name(name) else None
 
 
 def assumed_permittivity(name: str, frequency_hz: float) -> float:

@@ -271,10 +271,18 @@ class ZoneRays:
         offset = self.samples[:, 0, None] * u[:, None] + self.samples[:, 1, None] * v[:, None]
         middle = (0.5 * (receivers + self.source))[:, None] + radius[:, None, None] * offset
         start = np.broadcast_to(receivers[:, None], middle.shape).reshape(-1, 3)
-        free = self.clear(start, middle.reshape(-1, 3))
+        middle = middle.reshape(-1, 3)
+        free = self.clear(start, self._past(start, middle))
         left = np.flatnonzero(free)
-        free[left] = self.clear(middle.reshape(-1, 3)[left], np.broadcast_to(self.source, (len(left), 3)))
+        end = np.broadcast_to(self.source, (len(left), 3))
+        free[left] = self.clear(self._past(end, middle[left]), end)
         return np.asarray(free.reshape(count, len(self.samples)).mean(axis=1))
+
+    def _past(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Points so far behind b, seen from a, that a ray to them misses nothing at b, where no surface is, shape ``(N, 3)``."""
+        way = b - a
+        length = np.linalg.norm(way, axis=1, keepdims=True)
+        return np.asarray(b + 2.0 * self.position_error_m / np.maximum(length, 1e-12) * way)
 
     def _mirror_share(self, ends: np.ndarray, patch: np.ndarray, point: np.ndarray) -> np.ndarray:
         """That of mirror paths; a zone cuts a patch's plane in an ellipse, longer by 1 / cos."""

@@ -64,8 +64,9 @@ ARRAYS = {
     "element_group": index_to("G", "E"),
     "thickness_m": Expected("G", 0.0, np.inf, nan=True),
     "dispersion": Expected("G 4", nan=True),
+    "face_object": index_to("O", "F", -1),
 }
-"""What the arrays of a :class:`Surface` must be: F faces, P patches, G groups, E elements, X cells, K looks."""
+"""What the arrays of a :class:`Surface` must be: F faces, P patches, G groups, E elements, X cells, K looks, O objects."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +95,8 @@ class Surface:
         position_error_m: of the surface [m]: rays end so far before it.
         two_sided: whether faces have two sides; False: mirrors that of ``plane_normal``, elements the front one, of a surface
             that photos saw.
+        face_object: object that each face belongs to, -1 for none, shape ``(F,)`` int32; by default none.
+        object_names: what the objects are called.
 
     Raises:
         TypeError, ValueError: for arrays that do not fit each other, or indices and values out of range.
@@ -119,10 +122,15 @@ class Surface:
     group_names: tuple[str, ...]
     position_error_m: float
     two_sided: bool = False
+    face_object: np.ndarray = None  # type: ignore[assignment]  # made when it is not given
+    object_names: tuple[str, ...] = ()
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
 
     def __post_init__(self) -> None:
-        check_arrays(vars(self), ARRAYS, F=len(self.mesh.faces), G=len(self.group_names))
+        if self.face_object is None:
+            object.__setattr__(self, "face_object", np.full(len(self.mesh.faces), -1, np.int32))
+        sizes = {"F": len(self.mesh.faces), "G": len(self.group_names), "O": len(self.object_names)}
+        check_arrays(vars(self), ARRAYS, **sizes)
         check_number("position_error_m", self.position_error_m, 0.0, 10.0)
 
     @cached_property
@@ -168,12 +176,19 @@ class Surface:
         """Number of cells."""
         return len(self.cell_element)
 
+    def faces_of(self, name: str) -> np.ndarray:
+        """Faces of the object called ``name``, else of the group that is, shape ``(F,)`` bool."""
+        if name in self.object_names:
+            return np.asarray(self.face_object == self.object_names.index(name))
+        return np.asarray(self.group == (self.group_names.index(name) if name in self.group_names else -1))
+
     @classmethod
-    def of(cls, geometry: GeometryLike) -> Surface:
+    def of(cls, geometry: GeometryLike, *, element_m: float | None = None) -> Surface:
         """Patches, groups and elements of a Reconstruction, a Scene or a Mesh; a Surface is returned as it is.
 
         Materials of a Scene become groups, and those that a Mesh has names of; else pieces of one colour, or of one shape
-        where there are no colours. A mesh with the noise of a scan is flattened where planes are found in it.
+        where there are no colours. A mesh with the noise of a scan is flattened where planes are found in it. Elements are
+        ``element_m`` wide; by default as the whole asks for.
 
         Raises:
             TypeError: if it has no mesh.
@@ -182,8 +197,8 @@ class Surface:
         if isinstance(geometry, Surface):
             return geometry
         mesh = as_mesh(geometry, "geometry")
-        element_m = _element_width(mesh)
-        material, names = _named_faces(geometry, mesh)
+        element_m = element_width(mesh) if element_m is None else element_m
+        material, names = named_faces(geometry, mesh)
         patches, colours, measured = _patches_and_colours(geometry, mesh, material)
         mesh = patches.mesh
         if material is not None:
@@ -205,13 +220,13 @@ class Surface:
             least_m2 = MIN_MIRROR * min(element_m, ELEMENT_M) ** 2
             patch, planes = _mirrors(_apart(patches, alike[group]), least_m2)
         sides = patches.two_sided
-        mesh, parent = _split_long(mesh, np.flatnonzero(patches.once), LARGEST_FACE * element_m)
+        mesh, parent = split_long(mesh, np.flatnonzero(patches.once), LARGEST_FACE * element_m)
         group, patch = group[parent].astype(np.int32), patch[parent].astype(np.int32)
         return cls(
             mesh=mesh, normal=np.asarray(normal[parent]), patch=patch, plane_normal=planes[0], plane_offset=planes[1],
-            group=group, material=alike, appearance=appearance, patch_group=_largest_groups(mesh, patch, group, len(planes[1])),
+            group=group, material=alike, appearance=appearance, patch_group=largest_groups(mesh, patch, group, len(planes[1])),
             **_slabs(geometry, material, len(names)), group_names=tuple(names), position_error_m=error_m,
-            two_sided=sides, **_elements(mesh, patch, group, element_m),
+            two_sided=sides, **_elements(mesh, patch, group, element_m), **objects_of(geometry, parent),
         )  # fmt: skip
 
     @classmethod
@@ -282,9 +297,10 @@ class Surface:
     @cached_property
     def patches(self) -> PlanarPatches:
         """Its patches, of the split mesh."""
-        return PlanarPatches.from_planes(
+        found = PlanarPatches.from_planes(
             self.mesh, self.patch, self.plane_normal, self.plane_offset, tolerance_m=self.position_error_m, two_sided=self.two_sided
         )  # fmt: skip
+        return replace(found, group=self.patch_group)  # edges ask what their faces are made of
 
     def images(self, transmitter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Image of ``transmitter`` (3,) in every patch's plane, ``(P, 3)``, and its height over it, ``(P,)`` [m]."""
@@ -328,7 +344,7 @@ def _apart(patches: PlanarPatches, material: np.ndarray) -> PlanarPatches:
     )
 
 
-def _named_faces(geometry: GeometryLike, mesh: Mesh) -> tuple[np.ndarray | None, tuple[str, ...]]:
+def named_faces(geometry: GeometryLike, mesh: Mesh) -> tuple[np.ndarray | None, tuple[str, ...]]:
     """Index of each face's material, or None where there are no names to tell faces apart, and the names: those of a
     Scene's materials, else of the mesh's, the last for faces of none."""
     known, materials = getattr(geometry, "face_material", None), getattr(geometry, "materials", ())
@@ -344,7 +360,7 @@ def _named_faces(geometry: GeometryLike, mesh: Mesh) -> tuple[np.ndarray | None,
     return group.reshape(-1).astype(np.int32), tuple((*names, "unnamed")[k] for k in used)
 
 
-def _slabs(geometry: GeometryLike, named: np.ndarray | None, groups: int) -> dict[str, np.ndarray]:
+def _slabs(geometry: GeometryLike, named: np.ndarray | None, groups: int) -> dict[str, Any]:
     """Thickness and dispersion of each group, where the groups are a Scene's materials; else NaN."""
     materials = getattr(geometry, "materials", ())
     thickness, dispersion = np.full(groups, np.nan), np.full((groups, 4), np.nan)
@@ -358,21 +374,38 @@ def _slabs(geometry: GeometryLike, named: np.ndarray | None, groups: int) -> dic
     return {"thickness_m": thickness, "dispersion": dispersion}
 
 
-def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray, width_m: float) -> dict[str, np.ndarray]:
+def objects_of(geometry: GeometryLike, parent: np.ndarray) -> dict[str, Any]:
+    """Object of each face, a piece of ``parent`` (F,), and the objects' names, by the names of :class:`Surface`; of a geometry that
+    has some, and was not flattened."""
+    known, names = getattr(geometry, "face_object", None), tuple(getattr(geometry, "object_names", ()))
+    if known is None or not names or len(known) <= parent.max():
+        return {}
+    return {"face_object": np.asarray(known, np.int32)[parent], "object_names": names}
+
+
+def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray, width_m: float) -> dict[str, Any]:
     """Elements and cells of faces, by the names of :class:`Surface`: pieces of one group and patch on a lattice of
     ``width_m``."""
-    centre, area = mesh.triangles.mean(axis=1), mesh.areas
+    centre = mesh.triangles.mean(axis=1)
     cells = np.floor(CELLS * (centre - mesh.bounds[0]) / width_m).astype(np.int64)
     key = np.column_stack([group, patch, cells // CELLS])
     element = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
     pieces, cell = np.unique(np.column_stack([element, cells]), axis=0, return_inverse=True)
+    found = {
+        "element": element,
+        "cell": cell.reshape(-1).astype(np.int32),
+        "cell_element": pieces[:, 0].astype(np.int32),
+    }
+    return found | of_elements(mesh, element, group)
+
+
+def of_elements(mesh: Mesh, element: np.ndarray, group: np.ndarray) -> dict[str, Any]:
+    """Centre, area and group of each element, by the names of :class:`Surface`."""
+    centre, area = mesh.triangles.mean(axis=1), mesh.areas
     total = np.maximum(np.bincount(element, area), 1e-12)
     owner = np.zeros(len(total), np.int32)
     owner[element] = group
     return {
-        "element": element,
-        "cell": cell.reshape(-1).astype(np.int32),
-        "cell_element": pieces[:, 0].astype(np.int32),
         "element_centre": np.stack([np.bincount(element, area * x) for x in centre.T], axis=1)
         / total[:, None],
         "element_area": total,
@@ -380,7 +413,7 @@ def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray, width_m: float) 
     }
 
 
-def _largest_groups(mesh: Mesh, patch: np.ndarray, group: np.ndarray, patches: int) -> np.ndarray:
+def largest_groups(mesh: Mesh, patch: np.ndarray, group: np.ndarray, patches: int) -> np.ndarray:
     """The group that has most of each patch's area, shape ``(P,)`` int32."""
     area = np.zeros((patches, int(group.max(initial=0)) + 1))
     own = patch >= 0
@@ -388,7 +421,7 @@ def _largest_groups(mesh: Mesh, patch: np.ndarray, group: np.ndarray, patches: i
     return area.argmax(axis=1).astype(np.int32)
 
 
-def _element_width(mesh: Mesh) -> float:
+def element_width(mesh: Mesh) -> float:
     """Width of elements [m]: as many as :data:`ELEMENTS` at most, pieces of small patches apart; :data:`ELEMENT_M`, or less in
     scenes so small that there would be fewer than :data:`LEAST_ELEMENTS`."""
     area = float(mesh.areas.sum())
@@ -427,7 +460,7 @@ def _mirrors(patches: PlanarPatches, least_m2: float) -> tuple[np.ndarray, tuple
     return order[patches.face_patch].astype(np.int32), (patches.normal[own], patches.offset[own])
 
 
-def _split_long(mesh: Mesh, chosen: np.ndarray, most_m: float) -> tuple[Mesh, np.ndarray]:
+def split_long(mesh: Mesh, chosen: np.ndarray, most_m: float) -> tuple[Mesh, np.ndarray]:
     """Faces ``chosen`` of ``mesh``, halved across their longest edge until none is longer than ``most_m``, and each
     face's parent.
 

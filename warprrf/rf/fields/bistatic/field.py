@@ -16,6 +16,7 @@ function of both directions and of the path's lengths, the field holds for a tra
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -39,9 +40,10 @@ from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.channel.array_spectra import check_steering
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Air, Gas, air_of
+from warprrf.rf.em.materials import Material
 from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import Data, Measured, RadioField, with_settings
-from warprrf.rf.fields.bistatic import files
+from warprrf.rf.fields.bistatic import edited, files
 from warprrf.rf.fields.bistatic.fit import fit
 from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, read
@@ -322,6 +324,47 @@ class BistaticField(RadioField):
             self, frequency_hz=float(frequency_hz), parameters=self.parameters.at_ratio(ratio), errors=None,
             floor=self.floor / ratio**2, range_db=(self.range_db[0] - fall, self.range_db[1] - fall),
         )  # fmt: skip
+
+    def with_geometry(self, geometry: GeometryLike) -> BistaticField:
+        """The same field in a room that changed: fitted materials stay with what stays.
+
+        A face keeps the parameters of the group that its material's name says, else of the one that it lies on, to within the
+        surface's error of position; cells keep what was learned of them where they are as before. Anything else is new, and of what
+        the Scene's :class:`Material` or a name in ITU-R P.2040 says. A room that is as it was changes nothing. Where photos or a
+        scanner made the room, edit ``field.mesh``, which the fit may have mended. The stated uncertainty is not known there.
+
+        Args:
+            geometry: the whole room as it is now: Scene, Mesh or Reconstruction.
+
+        Raises:
+            TypeError: for a geometry without a mesh.
+            ValueError: for a new material that is not known at the field's carrier.
+
+        Warns:
+            UserWarning: where a fitted surface vanished, or something is new whose material nobody knows.
+        """
+        return replace(self, **edited.with_geometry(self, geometry))
+
+    def with_objects(
+        self, objects: Mapping[str, Mesh | None], *, materials: Mapping[str, Material | str] | None = None
+    ) -> BistaticField:
+        """The same field with things added, moved or taken away; the rest stays, as of :meth:`with_geometry`.
+
+        Args:
+            objects: by name, the thing's mesh where it is now, faces outward; None takes it away. It stands in the place of the
+                object of that name, or else of the material, and is made of the same.
+            materials: by the objects' names, of what is new or made otherwise: a :class:`Material`; the name of one of the field's
+                groups; one in ITU-R P.2040; or ``"skin"``: dry, by Gabriel et al. (1996), to 100 GHz.
+
+        Raises:
+            ValueError: for a name that is no object's, an object whose material nobody says, a material that is not known at the
+                field's carrier.
+
+        Example::
+
+            crossing = field.with_objects({"person": wr.Mesh(vertices, faces)}, materials={"person": "skin"})
+        """
+        return replace(self, **edited.with_objects(self, objects, materials or {}))
 
     # ------------------------------------------------------------------------------------------ asking
 

@@ -25,7 +25,11 @@ def taken_apart(parts: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str,
     """Tensors and header of the ``parts`` of a field, by the names of its attributes, but for what every model has."""
     s, p = parts["surface"], parts["parameters"]
     tensors = {f"surface/{name}": np.asarray(getattr(s, name)) for name in _SURFACE}
-    tensors |= {"mesh/vertices": s.mesh.vertices, "mesh/faces": s.mesh.faces}
+    tensors |= {
+        "mesh/vertices": s.mesh.vertices,
+        "mesh/faces": s.mesh.faces,
+        "surface/face_object": s.face_object,
+    }
     tensors |= {f"parameters/{name}": getattr(p, name) for name in _PARAMETERS}
     tensors |= {name: parts[name] for name in ("residual", "material")}
     if parts["errors"] is not None:
@@ -37,6 +41,7 @@ def taken_apart(parts: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str,
         "group_names": s.group_names,
         "position_error_m": s.position_error_m,
         "two_sided": s.two_sided,
+        "object_names": s.object_names,
     }
     return tensors, header
 
@@ -47,21 +52,25 @@ def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict
     Raises:
         KeyError, TypeError, ValueError: for what is missing or does not fit.
     """
-    names, two_sided = header["group_names"], header["two_sided"]
-    check_type("group_names", names, list)
+    names, objects, two_sided = header["group_names"], header.get("object_names", []), header["two_sided"]
     check_type("two_sided", two_sided, bool)
-    for name in names:
-        check_type("group_names", name, str)
+    for what, every in (("group_names", names), ("object_names", objects)):
+        check_type(what, every, list)
+        for name in every:
+            check_type(what, name, str)
     errors = {n.removeprefix("errors/"): t for n, t in tensors.items() if n.startswith("errors/")}
     parameters: dict[str, Any] = {name: tensors[f"parameters/{name}"] for name in _PARAMETERS}
     parameters |= {name: header[name] for name in _SINGLE}
+    arrays: dict[str, Any] = {name: tensors[f"surface/{name}"] for name in _SURFACE}
+    arrays["face_object"] = tensors.get("surface/face_object")  # older files know no objects
     return {
         "surface": Surface(
             mesh=Mesh(tensors["mesh/vertices"], tensors["mesh/faces"]),
             group_names=tuple(names),
+            object_names=tuple(objects),
             position_error_m=header["position_error_m"],
             two_sided=two_sided,
-            **{name: tensors[f"surface/{name}"] for name in _SURFACE},
+            **arrays,
         ),
         "effects": Effects(**header["effects"]),
         "sub_pixels": header["sub_pixels"],
