@@ -107,6 +107,25 @@ class Twin:
     groups: tuple[TwinGroup, ...] = dataclasses.field(repr=False)
     left_out: tuple[str, ...]
 
+    @property
+    def scattering_error_db(self) -> float:
+        """Error of the scattered power over all groups, rms weighted by area [dB]."""
+        return self._rms("scattering_error_db")
+
+    @property
+    def mirror_error_db(self) -> float:
+        """Error of the mirrored power over all groups, rms weighted by area [dB]."""
+        return self._rms("mirror_error_db")
+
+    @property
+    def lobe_error_db(self) -> float:
+        """Error of the lobes over all groups, rms weighted by area [dB]."""
+        return self._rms("lobe_error_db")
+
+    def _rms(self, name: str) -> float:
+        squares = [getattr(group, name) ** 2 for group in self.groups]
+        return float(np.sqrt(np.average(squares, weights=[group.area_m2 for group in self.groups])))
+
 
 @checked
 def write_twin(
