@@ -162,8 +162,9 @@ def check_steering(array: PlanarArray, directions: ArrayLike) -> np.ndarray:
         TypeError, ValueError: naming the argument.
     """
     check_type("array", array, PlanarArray)
-    if array.polarisation is not None:
-        raise ValueError(f"array: got polarisation {array.polarisation!r}, expected None: all are vertical")
+    if array.element.polarised:
+        known = array.polarisation or "of its own"
+        raise ValueError(f"array: got polarisation {known!r}, expected None: all are vertical")
     found = check_array("directions", directions, (..., 3))
     if found.ndim < 2 or found.size == 0:
         raise ValueError(f"directions: got shape {found.shape}, expected (..., 3)")

@@ -29,7 +29,7 @@ from warprrf.checks import (
 from warprrf.netcdf_files import Variable
 from warprrf.rf.channel import dispersion as dispersions
 from warprrf.rf.channel import response
-from warprrf.rf.channel.arrays import PlanarArray
+from warprrf.rf.channel.arrays import End
 from warprrf.rf.channel.path_arrays import PADDING, PathArrays
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.paths import sionna
@@ -56,8 +56,8 @@ class Paths(PathArrays):
 
     def to_sionna(
         self,
-        tx_array: PlanarArray | None = None,
-        rx_array: PlanarArray | None = None,
+        tx_array: End = None,
+        rx_array: End = None,
         *,
         diffuse: str | None = None,
         seed: int = 0,

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.checks import check_array, check_count, checked, one_line
-from warprrf.rf.channel.arrays import PlanarArray
+from warprrf.rf.channel.arrays import End
 from warprrf.rf.channel.path_arrays import EDGE, SCATTER, SLAB, PathArrays
 from warprrf.rf.channel.response import channel_taps, frequency_response, impulse_response
 from warprrf.rf.em.waves import carrier_phase, check_frequency
@@ -121,8 +121,8 @@ class SionnaPaths:
 
 def to_sionna(
     paths: PathArrays,
-    tx_array: PlanarArray | None = None,
-    rx_array: PlanarArray | None = None,
+    tx_array: End = None,
+    rx_array: End = None,
     *,
     diffuse: str | None = None,
     seed: int = 0,
