@@ -217,6 +217,11 @@ class PathArrays:
         jones = None if self.jones is None else self.jones * loss[..., None, None]
         return replace(self, gain=self.gain * loss, jones=jones, air=air)
 
+    def turned(self, turn: np.ndarray) -> Self:
+        """The same paths with their complex gains times ``turn``, shape as ``gain``."""
+        jones = None if self.jones is None else self.jones * turn[..., None, None]
+        return replace(self, gain=self.gain * turn, jones=jones)
+
     @property
     def carrier_hz(self) -> float:
         """Carrier [Hz].

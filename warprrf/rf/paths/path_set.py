@@ -15,12 +15,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf import netcdf_files
 from warprrf.checks import (
     Expected,
+    check_array,
     check_arrays,
     check_known_whole,
+    check_number,
     check_positive,
     checked,
     lengths,
@@ -32,7 +35,8 @@ from warprrf.rf.channel import response
 from warprrf.rf.channel.arrays import End
 from warprrf.rf.channel.path_arrays import PADDING, PathArrays
 from warprrf.rf.em.absorption import Air
-from warprrf.rf.paths import sionna
+from warprrf.rf.em.waves import carrier_phase
+from warprrf.rf.paths import doppler, sionna
 from warprrf.tensor_files import named
 
 
@@ -53,6 +57,26 @@ class Paths(PathArrays):
     taps = response.channel_taps
     diffuse_power = response.diffuse_power
     dispersion = dispersions.dispersion
+    doppler_hz = doppler.doppler_hz
+
+    def after(self, time_s: float, doppler_hz: ArrayLike) -> Paths:
+        """The same paths ``time_s`` later, each turned by its Doppler shift: exp(j 2 pi f_D t).
+
+        It holds while nothing has moved by more than a part of what changes the paths themselves, or their gains: trace anew for
+        longer times.
+
+        Args:
+            time_s: [s].
+            doppler_hz: shift of each path [Hz], as :meth:`doppler_hz` returns them; shape as ``tau``.
+
+        Raises:
+            ValueError: for another shape, or a path without a shift.
+        """
+        shift = check_array("doppler_hz", doppler_hz, self.tau.shape, finite=False)
+        if not np.isfinite(shift[self.valid]).all():
+            raise ValueError("doppler_hz: got NaN or infinite shifts, expected one for every path")
+        turn = carrier_phase(-check_number("time_s", time_s), np.where(self.valid, shift, 0.0))
+        return self.turned(turn)
 
     def to_sionna(
         self,
@@ -61,9 +85,10 @@ class Paths(PathArrays):
         *,
         diffuse: str | None = None,
         seed: int = 0,
+        doppler_hz: ArrayLike | None = None,
     ) -> sionna.SionnaPaths:
         """Arrays in the shapes and conventions of Sionna RT; see :func:`warprrf.rf.paths.sionna.to_sionna`."""
-        return sionna.to_sionna(self, tx_array, rx_array, diffuse=diffuse, seed=seed)
+        return sionna.to_sionna(self, tx_array, rx_array, diffuse=diffuse, seed=seed, doppler_hz=doppler_hz)
 
     @classmethod
     def from_sionna(
