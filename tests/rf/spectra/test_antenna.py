@@ -7,7 +7,8 @@ import pytest
 from path_makers import random_directions, random_paths
 
 import warprrf as wr
-from warprrf.rf.spectra.antenna import Antenna, horn, main_lobe, rotation_matrix
+from warprrf.cli.inputs import read_pattern
+from warprrf.rf.spectra.antenna import Antenna, horn, main_lobe, rotation_matrix, samples_of
 from warprrf.rf.spectra.readings import path_weights
 from warprrf.rf.spectra.spectrum import directions_from_angles, transverse_basis
 
@@ -230,7 +231,7 @@ def test_stores_tell_antennas_apart():
     for k, one in enumerate(sets):
         for other in sets[:k]:
             assert one.shape != other.shape or not np.allclose(one, other)
-    again = Antenna((lambda z, a: lopsided(z, a), lambda z, a: other_port(z, a))).samples()
+    again = samples_of(Antenna((lambda z, a: lopsided(z, a), lambda z, a: other_port(z, a))))
     np.testing.assert_array_equal(sets[0], again)
 
 
@@ -290,6 +291,9 @@ def test_an_msi_file_is_the_sum_of_its_cuts(tmp_path):
     assert 10 * np.log10(antenna.gain(between)[0]) == pytest.approx(expected, abs=1e-9)
     (tmp_path / "bare.PLN").write_text(msi(gain="15.35"))  # dBd
     np.testing.assert_allclose(Antenna.load(tmp_path / "bare.PLN").gain(d), antenna.gain(d), rtol=1e-9)
+    assert read_pattern(str(tmp_path / "bare.PLN")).peak_gain == pytest.approx(
+        antenna.peak_gain
+    )  # of the command line
     level = Antenna.load(tmp_path / "sector.msi").turned((0.0, -6 * DEGREE, 0.0))  # the tilt taken out
     assert 10 * np.log10(level.gain([1.0, 0, 0])) == pytest.approx(17.5, abs=1e-9)
 

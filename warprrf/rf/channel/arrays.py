@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from warprrf.cache import cached_property
 from warprrf.checks import check_array, check_count, check_positive, checked
-from warprrf.rf.spectra.antenna import Antenna, Pattern, check_rotation
+from warprrf.rf.spectra.antenna import Antenna, Pattern, as_antenna, check_rotation
 
 
 @checked
@@ -69,7 +69,7 @@ class PlanarArray:
     @cached_property
     def element(self) -> Antenna:
         """An element, turned as it stands in the world."""
-        return Antenna.of(self.pattern, self.polarisation).turned(self.rotation)
+        return as_antenna(self.pattern, self.polarisation).turned(self.rotation)
 
     @cached_property
     def rotation(self) -> np.ndarray:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -217,11 +217,6 @@ class PathArrays:
         jones = None if self.jones is None else self.jones * loss[..., None, None]
         return replace(self, gain=self.gain * loss, jones=jones, air=air)
 
-    def turned(self, turn: np.ndarray) -> Self:
-        """The same paths with their complex gains times ``turn``, shape as ``gain``."""
-        jones = None if self.jones is None else self.jones * turn[..., None, None]
-        return replace(self, gain=self.gain * turn, jones=jones)
-
     @property
     def carrier_hz(self) -> float:
         """Carrier [Hz].
@@ -335,6 +330,15 @@ class PathArrays:
         elif sources:
             common["transmitter"] = sources[0]
         return cls(**stacked, **common, receiver=receiver)
+
+
+P = TypeVar("P", bound=PathArrays)
+
+
+def turned(paths: P, turn: np.ndarray) -> P:
+    """The same paths with their complex gains times ``turn``, shape as ``gain``."""
+    jones = None if paths.jones is None else paths.jones * turn[..., None, None]
+    return replace(paths, gain=paths.gain * turn, jones=jones)
 
 
 def points_along(transmitter: np.ndarray, vertices: np.ndarray, receiver: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ technical report). What lets a wave straight through does not shift it.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -101,7 +102,7 @@ def _pushed(
     return np.asarray((velocity * (after - before)).sum(axis=-1))
 
 
-def _touched(scene: GeometryLike | None, moving: Mapping[str, ArrayLike], points: np.ndarray) -> np.ndarray:
+def _touched(scene: Any, moving: Mapping[str, ArrayLike], points: np.ndarray) -> np.ndarray:
     """Velocity of the surface at ``points`` (N, 3), shape ``(N, 3)``."""
     if not isinstance(moving, Mapping):
         raise TypeError(
@@ -111,7 +112,7 @@ def _touched(scene: GeometryLike | None, moving: Mapping[str, ArrayLike], points
         raise ValueError(
             f"scene: got {type(scene).__name__} with moving, expected a Scene, whose objects have names"
         )
-    mesh, velocity = as_mesh(scene), np.zeros((len(scene.mesh.faces), 3))
+    mesh, velocity = as_mesh(scene, "scene"), np.zeros((len(scene.mesh.faces), 3))
     objects, materials = list(scene.object_names), [material.name for material in scene.materials]
     for name, value in moving.items():
         pushed = _velocities(f"moving[{name!r}]", value, None)

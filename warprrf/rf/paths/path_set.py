@@ -33,7 +33,7 @@ from warprrf.netcdf_files import Variable
 from warprrf.rf.channel import dispersion as dispersions
 from warprrf.rf.channel import response
 from warprrf.rf.channel.arrays import End
-from warprrf.rf.channel.path_arrays import PADDING, PathArrays
+from warprrf.rf.channel.path_arrays import PADDING, PathArrays, turned
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import carrier_phase
 from warprrf.rf.paths import doppler, sionna
@@ -76,7 +76,7 @@ class Paths(PathArrays):
         if not np.isfinite(shift[self.valid]).all():
             raise ValueError("doppler_hz: got NaN or infinite shifts, expected one for every path")
         turn = carrier_phase(-check_number("time_s", time_s), np.where(self.valid, shift, 0.0))
-        return self.turned(turn)
+        return turned(self, turn)
 
     def to_sionna(
         self,

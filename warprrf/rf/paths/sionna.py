@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from warprrf import device as _device
 from warprrf.checks import check_array, check_count, check_positive, checked, one_line
 from warprrf.rf.channel.arrays import End
-from warprrf.rf.channel.path_arrays import EDGE, SCATTER, SLAB, PathArrays
+from warprrf.rf.channel.path_arrays import EDGE, SCATTER, SLAB, PathArrays, turned
 from warprrf.rf.channel.response import channel_taps, frequency_response, impulse_response
 from warprrf.rf.em.waves import carrier_phase, check_frequency
 
@@ -139,7 +139,7 @@ class SionnaPaths:
             h = work(self._paths)[:, :, :, None]
             return np.broadcast_to(h, (*h.shape[:3], len(time_s), *h.shape[4:])).copy()
         turns = (carrier_phase(-t, self.doppler[:, 0]) for t in time_s)
-        return np.stack([work(self._paths.turned(turn)) for turn in turns], axis=3)
+        return np.stack([work(turned(self._paths, turn)) for turn in turns], axis=3)
 
 
 def to_sionna(

@@ -17,6 +17,7 @@ degrees, 30 dB).
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -83,28 +84,6 @@ class Antenna:
                 f"polarisation: got {self.polarisation!r}, expected None, {', '.join(SLANTS_RAD)}"
             )
         _ = self.rotation, self._probed
-
-    @classmethod
-    def of(cls, pattern: Pattern, polarisation: str | None = None) -> Antenna:
-        """What is meant by a pattern: an antenna, a name, or a power gain [linear] over the angle off boresight, which is a
-        function of angles [rad] or samples at equally spaced angles from 0 to pi.
-
-        Raises:
-            TypeError, ValueError: if it is none of these; for a polarisation of what has one.
-        """
-        if isinstance(pattern, Antenna):
-            return pattern if polarisation is None else replace(pattern, polarisation=polarisation)
-        if isinstance(pattern, str):
-            return cls(pattern, polarisation)
-        if not callable(pattern):
-            samples = check_array("pattern", pattern, finite=False)
-            if samples.ndim != 1 or len(samples) < 2:
-                raise ValueError(
-                    f"pattern: got shape {samples.shape}, expected an Antenna, a function of the angle off boresight, or "
-                    "samples (N,) of it from 0 to pi"
-                )
-            pattern = partial(_interpolated, samples)
-        return cls(_OffBoresight(pattern), polarisation)
 
     @classmethod
     def from_grid(
@@ -299,29 +278,54 @@ class Antenna:
             )
         return self.pattern.at(check_array("angle", angle))
 
-    def gain_turned(self, angles: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Power gain [linear] when turned to each of ``angles`` (D, 2), zenith and azimuth [rad], towards unit vectors
-        ``directions`` (K, 3), shape ``(D, K)``. What is turned is a level mount: yaw, then pitch, on which the antenna stands
-        as :attr:`orientation` says."""
-        if isinstance(self.pattern, _OffBoresight) and self.rotation[0, 0] > 1.0 - 1e-15:  # rolled at most
-            cosine = directions_from_angles(*angles.T) @ directions.T
-            return self.pattern.at(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        turns = [rotation_matrix((azimuth, zenith - 0.5 * np.pi, 0.0)) for zenith, azimuth in angles]
-        return np.stack([self.gain(directions @ turn) for turn in turns]).reshape(
-            len(angles), len(directions)
-        )
-
-    def samples(self) -> np.ndarray:
-        """Its gains, or fields, by which one antenna is told from another: every half degree, or every twentieth off boresight."""
-        if isinstance(self.pattern, _OffBoresight) and not self.polarised:
-            return np.concatenate([self.pattern.at(np.linspace(0.0, np.pi, 3601)), self.rotation.ravel()])
-        directions = pixel_directions((360, 720)).reshape(-1, 3)
-        return self.field(directions) if self.polarised else self.gain(directions)
-
 
 Pattern: TypeAlias = Antenna | str | Callable[[np.ndarray], ArrayLike] | Sequence[float] | np.ndarray
 """An antenna; one of :data:`PATTERNS`; or power gain [linear] over the angle off boresight: a function of it [rad], or samples
 of it from 0 to pi."""
+
+
+def as_antenna(pattern: Pattern, polarisation: str | None = None, name: str = "pattern") -> Antenna:
+    """What is meant by a pattern; ``polarisation`` is that of a gain.
+
+    Raises:
+        TypeError, ValueError: naming the argument by ``name``, if it is none; for a polarisation of what has one.
+    """
+    if isinstance(pattern, Antenna):
+        return pattern if polarisation is None else replace(pattern, polarisation=polarisation)
+    try:
+        if isinstance(pattern, str):
+            return Antenna(pattern, polarisation)
+        if not callable(pattern):
+            samples = check_array("pattern", pattern, finite=False)
+            if samples.ndim != 1 or len(samples) < 2:
+                raise ValueError(
+                    f"pattern: got shape {samples.shape}, expected an Antenna, a function of the angle off boresight, or "
+                    "samples (N,) of it from 0 to pi"
+                )
+            pattern = partial(_interpolated, samples)
+        return Antenna(_OffBoresight(pattern), polarisation)
+    except (TypeError, ValueError) as error:
+        raise type(error)(re.sub("^pattern:", f"{name}:", str(error))) from error
+
+
+def turned_gain(antenna: Antenna, angles: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Power gain [linear] of an antenna turned to each of ``angles`` (D, 2), zenith and azimuth [rad], towards unit vectors
+    ``directions`` (K, 3), shape ``(D, K)``. What is turned is a level mount: yaw, then pitch, on which the antenna stands as
+    :attr:`Antenna.orientation` says."""
+    if isinstance(antenna.pattern, _OffBoresight) and antenna.rotation[0, 0] > 1.0 - 1e-15:  # rolled at most
+        cosine = directions_from_angles(*angles.T) @ directions.T
+        return antenna.pattern.at(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    turns = [rotation_matrix((azimuth, zenith - 0.5 * np.pi, 0.0)) for zenith, azimuth in angles]
+    found = [antenna.gain(directions @ turn) for turn in turns]
+    return np.reshape(found, (len(angles), len(directions)))
+
+
+def samples_of(antenna: Antenna) -> np.ndarray:
+    """Gains, or fields, by which one antenna is told from another: every half degree, or every twentieth off boresight."""
+    if isinstance(antenna.pattern, _OffBoresight) and not antenna.polarised:
+        return np.concatenate([antenna.pattern.at(np.linspace(0.0, np.pi, 3601)), antenna.rotation.ravel()])
+    directions = pixel_directions((360, 720)).reshape(-1, 3)
+    return antenna.field(directions) if antenna.polarised else antenna.gain(directions)
 
 
 def rotation_matrix(orientation: ArrayLike) -> np.ndarray:

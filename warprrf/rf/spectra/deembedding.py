@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from warprrf import device as _device
 from warprrf.checks import check_array, check_count, check_number, check_positive
 from warprrf.device import DeviceLike
-from warprrf.rf.spectra.antenna import Antenna, Pattern
+from warprrf.rf.spectra.antenna import Antenna, Pattern, as_antenna
 from warprrf.rf.spectra.spectrum import (
     check_shape,
     pixel_angles,
@@ -121,7 +121,7 @@ def scanned_kernel(
     """Azimuth spectrum of the response between rows, shape ``(W // 2 + 1, H, H)``; real, since patterns are even.
 
     Args:
-        pattern: An antenna that is the same all round its boresight, or what :meth:`Antenna.of` takes for one.
+        pattern: An antenna that is the same all round its boresight, or what stands for one as a pattern.
         shape: Rows and columns of the grid.
         boresight_gain_dbi: Scales the pattern to this gain at its strongest; None takes it as it is.
 
@@ -129,7 +129,7 @@ def scanned_kernel(
         TypeError: if ``pattern`` is neither.
         ValueError: if gains are negative, NaN, infinite, all zero or the same in all directions.
     """
-    gain = _gains(Antenna.of(pattern).gain_off_boresight(_angles_between(shape)), boresight_gain_dbi)
+    gain = _gains(as_antenna(pattern).gain_off_boresight(_angles_between(shape)), boresight_gain_dbi)
     flat_db = 0.1  # a pattern that varies less cannot tell directions apart
     if gain.min() > gain.max() * 10.0 ** (-flat_db / 10.0):
         raise ValueError(

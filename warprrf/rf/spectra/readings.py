@@ -35,7 +35,7 @@ from warprrf.checks import (
 )
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import NEPER, check_frequency
-from warprrf.rf.spectra.antenna import Antenna, Pattern, main_lobe
+from warprrf.rf.spectra.antenna import Antenna, Pattern, as_antenna, main_lobe, turned_gain
 from warprrf.rf.spectra.levels import FADING_DB, MARGIN_DB, free_space_gain, question_levels
 
 COLUMNS = {
@@ -212,7 +212,7 @@ class Readings(PowerTable):
         """The same of antennas with nothing but their main lobes; see :func:`main_lobe`."""
         names = ("receive_pattern", "transmit_pattern")
         cut: dict[str, Any] = {
-            name: main_lobe(antenna_of(name, p)) for name in names if (p := getattr(self, name)) is not None
+            name: main_lobe(as_antenna(p)) for name in names if (p := getattr(self, name)) is not None
         }
         return replace(self, **cut)
 
@@ -319,7 +319,7 @@ def question_readings(readings: Readings) -> None:
     r, gain_db, known = readings, 0.0, readings.chain == ""
     for pattern in (r.receive_pattern, r.transmit_pattern):
         if pattern is not None:
-            gain_db += 10.0 * np.log10(antenna_of("pattern", pattern).peak_gain)
+            gain_db += 10.0 * np.log10(as_antenna(pattern).peak_gain)
     free_space = np.minimum(
         free_space_gain(r.transmitters, r.receivers, r.frequency_hz) * 10.0 ** (gain_db / 10.0), 1.0
     )
@@ -436,7 +436,7 @@ def _path_weights(
     ):
         if turned is not None and pattern is not None:
             once, own = np.unique(turned[rows], axis=0, return_inverse=True)
-            weight *= antenna_of("pattern", pattern).gain_turned(once, path)[own.reshape(-1)]
+            weight *= turned_gain(as_antenna(pattern), once, path)[own.reshape(-1)]
     if r.delay_s is not None and r.bandwidth_hz is not None:
         weight *= _tap(r.bandwidth_hz * (r.delay_s[rows, None] - delay_s), r.window)
     return weight
@@ -457,13 +457,7 @@ def check_turned(name: str, value: ArrayLike, count: int) -> np.ndarray:
 
 def antenna_of(name: str, pattern: Pattern) -> Antenna:
     """The antenna that readings are taken with; ValueError or TypeError names the argument if it is none, or of several ports."""
-    if isinstance(pattern, Antenna):
-        found = pattern
-    else:
-        try:
-            found = Antenna.of(pattern)
-        except (TypeError, ValueError) as error:
-            raise type(error)(f"{name}: {str(error).removeprefix('pattern: ')}") from error
+    found = as_antenna(pattern, name=name)
     if found.ports > 1:
         raise ValueError(
             f"{name}: got an antenna of {found.ports} ports, expected one of a single port (Antenna.unpolarised())"

@@ -17,7 +17,7 @@ from scipy.sparse import csr_matrix
 from warprrf.device import Progress
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, READING_ERROR_DB
-from warprrf.rf.spectra.antenna import Antenna
+from warprrf.rf.spectra.antenna import Antenna, turned_gain
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_of
 from warprrf.rf.tracing.model import Model
 from warprrf.rf.tracing.records import Materials
@@ -121,7 +121,7 @@ class Sensitivity:
         summed = np.asarray(square.sum(axis=0)).ravel()
         if pointings is None:
             return summed, csr_matrix(summed / NOISE_DB**2)
-        gain = pointings.antenna.gain_turned(pointings.angles, pixel_directions(SHAPE).reshape(-1, 3))
+        gain = turned_gain(pointings.antenna, pointings.angles, pixel_directions(SHAPE).reshape(-1, 3))
         slope = NEPER * (gain @ table) / (gain @ total + self.floor)[:, None]
         return summed, csr_matrix(np.where(slope > LEAST_DB, (slope / READING_ERROR_DB) ** 2, 0.0))
 
