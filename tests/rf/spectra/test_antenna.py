@@ -225,9 +225,8 @@ def test_a_main_lobe_ends_where_that_of_the_same_gain_over_one_angle_does():
 
 def test_stores_tell_antennas_apart():
     """By their gains, their fields and how they stand, not by the functions that they are."""
-    sets = [
-        one.samples() for one in (BOTH, BOTH.turned((0, 0, 0.1)), BOTH.unpolarised(), horn(0.2), horn(0.3))
-    ]
+    several = (BOTH, BOTH.turned((0, 0, 0.1)), BOTH.unpolarised(), horn(0.2), horn(0.3))
+    sets = [samples_of(one) for one in several]
     for k, one in enumerate(sets):
         for other in sets[:k]:
             assert one.shape != other.shape or not np.allclose(one, other)
