@@ -73,7 +73,7 @@ def test_delays_of_an_unknown_clock_find_place_and_clock(field):
         ask = {"frequency_hz": field.frequency_hz, "floor": 1e-15, "bandwidth_hz": 2e9, "window": "hann"}
         empty = wr.Readings(source, UNSEEN[0], np.ones(120), delay_s=taps - late, **{**ask, "floor": 0.5})
         known = np.isfinite(paths.tau)
-        weigh = wr_weights(empty, paths, known)
+        weigh = of_taps(empty, paths, known)
         rows.append(weigh @ paths.power[known])
     power = np.concatenate(rows)
     profile = wr.Readings(
@@ -85,10 +85,10 @@ def test_delays_of_an_unknown_clock_find_place_and_clock(field):
     assert found.shifts["sounder"] == pytest.approx(late, abs=0.3e-9)
 
 
-def wr_weights(readings, paths, known):
-    """What a tap of a Hann window in frequency lets through of each delay: its transform squared."""
+def of_taps(readings, paths, known):
+    """What a tap of a Hann window in frequency lets through of each delay: its transform squared; all taps add up to 1."""
     x = 2e9 * (readings.delay_s[:, None] - paths.tau[known])
-    return (np.sinc(x) / (1.0 - np.where(np.abs(np.abs(x) - 1) < 1e-9, 0.0, x) ** 2)) ** 2
+    return (np.sinc(x) / (1.0 - x**2)) ** 2 / 1.5
 
 
 def test_what_cannot_be_located_is_refused(scene, field, horn):
