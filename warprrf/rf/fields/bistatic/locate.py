@@ -33,12 +33,15 @@ from warprrf.rf.spectra.spectrum import Spectrum
 from warprrf.rf.tracing.tracer import Tracer
 
 STARTS = 2  # places of the lattice that are searched from; in a lobby the best one is within it of the truth
-STEPS = 6, 4  # most Gauss-Newton steps, first with single mirrors, then with all effects
+STEPS = 4, 3  # most Gauss-Newton steps, first with single mirrors, then with all effects
 LONGEST_M, SHORTEST_M = 0.35, 3e-3  # steps: none is longer, and shorter ones are the last
 FIRST_DIFFERENCE_M, DIFFERENCE_M = 0.1, 0.04
 """First and least: half of the last step between. Over shorter ones the noise of few rays looks like slopes."""
 TURN_RAD, TAPS = 0.005, 0.02  # differences of azimuths and of delays, in taps
-SUB_PIXELS = 1  # square root of the rays a pixel
+SUB_PIXELS = (
+    1,
+    2,
+)  # square root of the rays a pixel, first and to the end: the noise of few rays moves the least loss
 SMOOTH = 3  # pixels of a spectrum that slopes are means over, along each axis: noise of slopes would pass for curvature
 HUBER = 3.0  # standard deviations
 LEAST_STD_DB = 0.3  # of a pixel: no field is so exact that tenths of a decibel tell places apart
@@ -181,8 +184,9 @@ class Question:
         return found
 
     def errors(self, unknown: np.ndarray, step_m: float, *, quick: bool) -> Found:
-        """What ``unknown`` (U,) leaves; slopes of the position are differences over ``step_m``. ``quick``: with single mirrors."""
-        points = unknown[:3] + step_m * np.concatenate([np.zeros((1, 3)), np.eye(3)])
+        """What ``unknown`` (U,) leaves; slopes are differences over ``step_m`` to either side. ``quick``: with few
+        rays and single mirrors."""
+        points = unknown[:3] + step_m * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
         kinds, further, seen = kinds_of(self.moved(unknown)), {}, dict[Any, Any]()
         for j, k in enumerate(self.shifted):
             step = TURN_RAD if k in self.turned else TAPS / self.data[k].bandwidth_hz  # type: ignore[union-attr]
@@ -208,9 +212,10 @@ class Question:
             target = target if weight is None else target.trusted(weight)
             error, *others = (target.error(power) / NOISE_DB for power in powers)
             rise = np.zeros((len(error), len(unknown)))
-            rise[:, :3] = (np.stack(others[:3], axis=1) - error[:, None]) / step_m
+            # Of both sides: the noise of one alone would hang together with that of the errors, and pull the place aside.
+            rise[:, :3] = (np.stack(others[:3], axis=1) - np.stack(others[3:6], axis=1)) / (2.0 * step_m)
             if shifted is not None:
-                rise[:, column] = (others[3] - error) / step
+                rise[:, column] = (others[6] - error) / step
             if chain is not None:
                 rise[:, chain] = target.slope(powers[0]) * powers[0] / NOISE_DB
             if weight is not None:
@@ -228,7 +233,9 @@ class Question:
         tracer, model = f.tracer(place.transmitter), f.state
         if quick:
             model = replace(model, effects=replace(model.effects, mirrors=min(model.effects.mirrors, 1)))
-        few = self._tracers.setdefault(place.seen_from, tracer.on_grid(place.shape, SUB_PIXELS))
+        few = self._tracers.setdefault(
+            (place.seen_from, quick), tracer.on_grid(place.shape, SUB_PIXELS[not quick])
+        )
         few.beam_sigma_rad = place.beam_sigma_rad
         paths = few.paths(points, model.effects)
         views = [
