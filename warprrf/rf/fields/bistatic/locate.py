@@ -140,6 +140,8 @@ class Question:
         self.shifted = self.turned + [
             k for k, one in tables.items() if one.delay_s is not None and clock_s > 0
         ]
+        # Half a metre off, taps of delay have nothing in common: the search often ends where it started.
+        self.reliable = all(one.delay_s is None for one in tables.values())
         self.spectra = all(isinstance(one, SpectrumDataset) for one in data)
         self.weights = [self._weight(one) for one in data]
         self._tracers: dict[Any, Tracer] = {}
@@ -324,7 +326,7 @@ def search(question: Question, maps: dict[bytes, FieldMap]) -> Location:
     )
     likelihood /= likelihood.sum()
     covariance, misfit = question.covariance(best, threshold), float(np.sqrt(spread))
-    close = float(np.sqrt(np.trace(covariance))) < SPACING_M
+    close = question.reliable and float(np.sqrt(np.trace(covariance))) < SPACING_M
     after = zip(question.shifted, best.unknown[3:].tolist(), strict=False)
     gains = (NEPER * best.unknown[3 + len(question.shifted) :]).tolist()
     return Location(
