@@ -243,7 +243,7 @@ class Question:
         views = [
             few.view(point, model.effects, paths=paths.of(np.array([k]))) for k, point in enumerate(points)
         ]
-        return views, model, f.evaluation(tracer)
+        return views, model, f.materials_of(tracer)
 
     def descend(self, unknown: np.ndarray, *, quick: bool) -> Found:
         """From ``unknown`` (U,) to where errors are least."""
