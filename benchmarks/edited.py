@@ -28,8 +28,8 @@ from benchmarks.runner import option
 from warprrf.rf.fields.bistatic.field import BistaticField
 
 HELP = """\
-A screen of skin crosses a 60 GHz link: power beside ITU-R P.526's screen, and seconds of a step. A cabinet of the office is moved:
-the old room's field with the new mesh beside a field that was fitted in the new room. A quarter of an hour on two cores.
+A screen of skin crosses a 60 GHz link: power beside ITU-R P.526's screen, and core seconds of a step. A cabinet of the office is
+moved: the old room's field with the new mesh beside a field that was fitted in the new room. A quarter of an hour on two cores.
 
 examples:
   python -m benchmarks edited
@@ -56,8 +56,8 @@ COLUMNS = {
         ("shadow_most_db", "largest [dB]", "{:.2f}"), ("lit_most_db", "beside it, largest [dB]", "{:.2f}"),
     ),
     "seconds": (
-        ("what", "a step, 90 x 180 pixels", "{}"), ("edit_s", "edit [s]", "{:.3f}"), ("step_s", "then [s]", "{:.2f}"),
-        ("whole_s", "whole spectrum, all effects [s]", "{:.2f}"), ("share", "of that", "{:.2f}"),
+        ("what", "a step, 90 x 180 pixels", "{}"), ("edit_s", "edit [core s]", "{:.3f}"), ("step_s", "then [core s]", "{:.2f}"),
+        ("whole_s", "whole spectrum, all effects [core s]", "{:.2f}"), ("share", "of that", "{:.2f}"),
     ),
     "rows": (
         ("field", "field", "{}"), ("n_train", "spectra", "{}"), ("test", "receivers", "{}"), ("psnr_db", "PSNR [dB]", "{:.2f}"),
@@ -136,16 +136,16 @@ def walk(x: float) -> Row:
 
 
 def step_seconds(what: str, **effects: Any) -> Row:
-    """Seconds of a person's step through the office under ``effects``, and of a whole spectrum with all of them. A link alone,
+    """Core seconds of a person's step through the office under ``effects``, and of a whole spectrum with all of them. A link alone,
     where nothing scatters, needs no grid of rays."""
     whole, field = (prior(office(), **e).on_grid((90, 180)) for e in ({}, effects))
     field = field if field.effects.scatterings else field.on_grid((10, 20))
     receiver, steps = ENDS[1] - [2.0, 1.5, 0.0], []
 
     def seconds(work: Callable[[], Any]) -> float:
-        start = time.perf_counter()
+        start = time.process_time()
         work()
-        return time.perf_counter() - start
+        return time.process_time() - start
 
     for k in range(3):
         at = {"person": screen(2.5, 2.0 + 0.1 * k)}
@@ -225,7 +225,7 @@ def rows(options: Options, fits: Fits) -> Iterator[Row]:
         "a spectrum, single bounces and edges": EFFECTS,
     }
     for what, effects in {**steps, "a spectrum, all effects": {}}.items():
-        yield {"part": "seconds", **fits.row(f"seconds {what}", partial(step_seconds, what, **effects))}
+        yield {"part": "seconds", **fits.row(f"core seconds {what}", partial(step_seconds, what, **effects))}
     cabinet = Cabinet(options, fits)
     for count in options.counts:
         found = fits.row(f"cabinet {count}", partial(cabinet.scored, count))

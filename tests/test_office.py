@@ -28,7 +28,7 @@ def write_readings(truth, folder):
     for k in range(3):
         for azimuth in range(-180, 180, 15):
             ahead = np.array([np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth)), 0.0])
-            gain = wr.horn(np.radians(HORN_DEG))(np.arccos((toward @ ahead).clip(-1, 1)))
+            gain = wr.horn(np.radians(HORN_DEG)).gain_off_boresight(np.arccos((toward @ ahead).clip(-1, 1)))
             power = 10 * np.log10(truth.path_gain[k].reshape(-1) @ gain) + CHAIN_DB
             rows.append(f"{ends[k]},{azimuth},0,{power:.2f},horn")
     (folder / "horn.csv").write_text("\n".join(rows) + "\n")

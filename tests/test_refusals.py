@@ -9,7 +9,7 @@ from path_makers import random_paths
 
 import warprrf as wr
 from warprrf.rf.channel.dispersion import coherence_bandwidth, delay_spread
-from warprrf.rf.spectra.antenna import Scan
+from warprrf.rf.spectra.deembedding import Scan
 
 ENDS = {"transmitter": TX, "receivers": RECEIVERS[:1], "frequency_hz": F}
 

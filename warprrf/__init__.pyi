@@ -24,7 +24,7 @@ from warprrf.rf.maps.placing import place as place
 from warprrf.rf.spectra.metrics import evaluate as evaluate
 
 # the pattern of a horn antenna
-from warprrf.rf.spectra.readings import horn as horn
+from warprrf.rf.spectra.antenna import horn as horn
 
 # what any of them holds, in the browser: drag a receiver
 from warprrf.viewer import view as view
@@ -68,6 +68,9 @@ from warprrf.rf.tracing.model import Effects as Effects
 
 # propagation paths, and the channels, taps and spreads that follow
 from warprrf.rf.paths.path_set import Paths as Paths
+
+# an antenna by name, from numbers on a grid of angles, or from a file: gain, or field in two polarisations
+from warprrf.rf.spectra.antenna import Antenna as Antenna
 
 # an antenna array
 from warprrf.rf.channel.arrays import PlanarArray as PlanarArray

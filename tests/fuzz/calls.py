@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
@@ -40,6 +41,7 @@ ABSTRACT = ("RadioField", "BistaticField", "HarmonicField")
 """Classes that nobody makes by calling them."""
 REFUSED = (
     "Paths.from_sionna",
+    "interop.array_from_sionna",
     "Scene.from_sionna",
     "interop.load_sionna_scene",
     "reconstruct",
@@ -163,6 +165,7 @@ CLASSES: dict[str, Callable[[Place], Any]] = {
     "HarmonicField": lambda p: p.harmonic,
     "FitOptions": lambda p: FitOptions(),
     "FieldOptions": lambda p: FieldOptions(),
+    "Antenna": lambda p: replace(wr.horn(0.3), polarisation="VH"),
     "PlanarArray": lambda p: wr.PlanarArray(2, 3, polarisation="VH"),
     "RadioMap": lambda p: p.map,
     "channel.ArraySpectra": lambda p: wr.channel.ArraySpectra(
@@ -282,6 +285,20 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "RadioMap.picture": lambda p: {"path": "map.png"},
     "Relevance.load": lambda p: {"path": p.folder / "relevance.json"},
     # channels
+    "Antenna": lambda p: {"pattern": "dipole", "polarisation": "V", "orientation": (0.1, 0.2, 0.3)},
+    "Antenna.from_grid": lambda p: {
+        "zenith": np.linspace(0.0, np.pi, 7), "azimuth": np.linspace(-np.pi, np.pi, 12, endpoint=False), "gain": np.ones((7, 12)),
+    },
+    "Antenna.load": lambda p: {"path": p.folder / "sector.msi"},
+    "Antenna.gain": lambda p: {"directions": TOWARDS},
+    "Antenna.field": lambda p: {"directions": TOWARDS},
+    "Antenna.gain_off_boresight": lambda p: {"angle": np.array([0.0, 0.3])},
+    "Antenna.turned": lambda p: {"orientation": (0.1, 0.2, 0.3)},
+    "Paths.after": lambda p: {"time_s": 1e-3, "doppler_hz": p.paths.doppler_hz(receiver_velocity=[1.0, 0.0, 0.0])},
+    "Paths.doppler_hz": lambda p: {
+        "transmitter_velocity": [1.0, 0.0, 0.0], "moving": {p.scene.object_names[0]: (0.0, 1.0, 0.0)}, "scene": p.scene,
+    },
+    "interop.array_from_sionna": lambda p: {"rt_array": "not of Sionna"},
     "Paths.as_several": lambda p: {"self": p.paths.row(0)},
     "Paths.cfr": lambda p: {"frequencies_hz": 300e9 + np.linspace(-1e9, 1e9, 8), **LINK},
     "Paths.concatenate": lambda p: {"parts": [p.paths.row(0), p.paths.row(0)]},

@@ -394,6 +394,7 @@ FORMATS: dict[str, Format] = {
         lambda place, folder: TWIN(place, folder).with_name("materials.json"), _scene, "json", "sealed"
     ),
     "materials": Format(_copy("materials.json"), wr.em.load_materials, "json"),
+    "antenna": Format(_copy("sector.msi"), wr.Antenna.load, "words"),
     "readings": Format(_copy("readings.csv"), lambda p: wr.Readings.load(p, **READINGS), "words"),
     "receivers CSV": Format(
         _text("receivers.csv", "x,y,z\n1.0,2.0,1.5\n3.0,1.0,1.2\n"), lambda p: read_receivers([str(p)]), "words"

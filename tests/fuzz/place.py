@@ -75,6 +75,10 @@ class Place:
         at = ",".join(map(str, [*TRANSMITTER, *self.receivers[0]]))
         table = f"tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,power_db\n{at},-80.0\n{at},-81.5\n"
         (self.folder / "readings.csv").write_text(table)
+        cut = "\n".join(f"{angle} {min(angle, 360 - angle) / 10}" for angle in range(0, 360, 10))
+        (self.folder / "sector.msi").write_text(
+            f"NAME sector\nGAIN 12 dBi\nHORIZONTAL 36\n{cut}\nVERTICAL 36\n{cut}\n"
+        )
         self._make_pictures()
         self._make_colmap()
         (self.folder / "made").touch()

@@ -82,19 +82,30 @@ def kernels_of(name):
 def compiled(kernels, folder):
     """:class:`Code` of each of ``kernels`` by label; a kernel that the compiler left out has none."""
     found = {}
-    for module in {k.module for k in kernels.values()}:
-        paths = wp.compile_aot_module(module, arch=ARCHITECTURE, use_ptx=False, module_dir=folder)
-        code = {
-            name: c
-            for path in paths
-            if path.suffix == ".cubin"
-            for name, c in _code(path.read_bytes()).items()
-        }
-        for label, kernel in kernels.items():
-            if kernel.module is module:
-                named = re.compile(rf"{kernel.key}_[0-9a-f]{{8}}_cuda_kernel_forward")
-                found.update((label, c) for name, c in code.items() if named.fullmatch(name))
+    for paths, own in _files(kernels, folder, use_ptx=False):
+        code = {}
+        for path in paths:
+            code |= _code(path.read_bytes()) if path.suffix == ".cubin" else {}
+        for label, kernel in own.items():
+            named = re.compile(rf"{kernel.key}_[0-9a-f]{{8}}_cuda_kernel_forward")
+            found.update((label, c) for name, c in code.items() if named.fullmatch(name))
     return found
+
+
+def translated(kernels, folder):
+    """Labels of ``kernels`` that are in the compiler's PTX, which takes half as long as machine code."""
+    found = set()
+    for paths, own in _files(kernels, folder, use_ptx=True):
+        text = "".join(path.read_text() for path in paths).replace(".visible", "")
+        found |= {label for label, kernel in own.items() if f".entry {kernel.key}" in text}
+    return found
+
+
+def _files(kernels, folder, use_ptx):
+    """The files that each module of ``kernels`` is compiled to, and its kernels by label."""
+    for module in {k.module for k in kernels.values()}:
+        paths = wp.compile_aot_module(module, arch=ARCHITECTURE, use_ptx=use_ptx, module_dir=folder)
+        yield paths, {label: k for label, k in kernels.items() if k.module is module}
 
 
 REGISTERS, LOCAL = 0x2F, 0x12  # EIATTR_REGCOUNT, EIATTR_MIN_STACK_SIZE, as `cuobjdump -elf` names them

@@ -87,7 +87,7 @@ def add_pattern(parser: Any, flag: str, text: str) -> None:
     parser.add_argument(
         flag, metavar="PATTERN",
         help=f"{text}: a horn's width at half maximum in degrees, with its side lobes' level in dB where known (10 or "
-        "10,-25), a file of linear gains from 0 to 180 degrees, or isotropic",
+        "10,-25), a file of linear gains from 0 to 180 degrees, an MSI Planet file (.msi, .pln), or isotropic",
     )  # fmt: skip
 
 
@@ -231,6 +231,8 @@ def read_pattern(text: str) -> Any:
     try:
         width, *level = (float(word) for word in text.split(","))
     except ValueError:
+        if text.lower().endswith((".msi", ".pln")):
+            return wr.Antenna.load(text)
         return read_rows(existing(text), "gains from 0 to 180 degrees, a number a row", 1)[:, 0]
     if len(level) > 1:
         raise ValueError(f"pattern: got {text!r}, expected WIDTH or WIDTH,LEVEL in degrees and dB")

@@ -464,7 +464,8 @@ class Mesh:
             margin = 1e-6 * float(np.ptp(self.bounds, axis=0).max())
             bounds = [corners.min(axis=1) - margin, corners.max(axis=1) + margin]
             low, high = (wp.array(x.astype(np.float32), dtype=wp.vec3, device=where) for x in bounds)
-            return wp.Bvh(low, high), wp.array(np.ascontiguousarray(corners), dtype=wp.vec3d, device=where)
+            bvh = wp.Bvh(low, high, constructor="sah")  # as on a CPU
+            return bvh, wp.array(np.ascontiguousarray(corners), dtype=wp.vec3d, device=where)
 
         return self._boxed.get(str(where), build)
 

@@ -120,6 +120,7 @@ class RaySearch:
             mesh = wp.Mesh(
                 points=wp.array(self._vertices, dtype=wp.vec3, device=device),
                 indices=wp.array(self._faces.reshape(-1), dtype=wp.int32, device=device),
+                bvh_constructor="sah",  # as on a CPU: slower to build than a GPU's own, and for good
             )
             return mesh, wp.array(self._planes, dtype=wp.vec4d, device=device)
 

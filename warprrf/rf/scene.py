@@ -19,6 +19,7 @@ from warprrf.checks import check_array, check_arrays, check_number, check_type, 
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import MeshOptions, is_mesh_file
+from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.materials import Material
 from warprrf.rf.positions import is_free
 from warprrf.rf.scene_parts import MaterialChoice, Materials, ScenePart, read_mesh_scene
@@ -40,6 +41,7 @@ class Scene:
         object_names: names of the objects.
         xml_path: the file it was loaded from, or None.
         transmitters, receivers: positions [m] by name, each ``(3,)``; may be empty.
+        antennas: the array of a transmitter or receiver by its name, turned as it stands; may be empty.
     """
 
     def __init__(
@@ -53,6 +55,7 @@ class Scene:
         xml_path: str | os.PathLike[str] | None = None,
         transmitters: Mapping[str, ArrayLike] | None = None,
         receivers: Mapping[str, ArrayLike] | None = None,
+        antennas: Mapping[str, PlanarArray] | None = None,
     ) -> None:
         faces = len(mesh.faces)
         if face_object is None:
@@ -65,6 +68,11 @@ class Scene:
         self.xml_path = None if xml_path is None else Path(xml_path)
         self.transmitters = _positions("transmitters", transmitters)
         self.receivers = _positions("receivers", receivers)
+        self.antennas = dict(antennas or {})
+        for name, array in self.antennas.items():
+            check_type(f"antennas[{name!r}]", array, PlanarArray)
+            if name not in self.transmitters | self.receivers:
+                raise ValueError(f"antennas: got {name!r}, expected names of transmitters and receivers")
         if len(set(self.object_names)) < len(self.object_names):
             raise ValueError("object_names: got a name twice, expected each once")
         known = {"face_material": index_to("materials", "F"), "face_object": index_to("objects", "F")}
@@ -138,7 +146,8 @@ class Scene:
         """The surfaces, materials, transmitters and receivers of a live ``sionna.rt.Scene``.
 
         Load it with ``merge_shapes=False`` to keep its objects apart. A radio material with a law of its own in Python
-        is known for the scene's frequency alone; antennas and orientations are not taken over.
+        is known for the scene's frequency alone. What ``tx_array`` or ``rx_array`` is to a transmitter or receiver, turned as
+        it stands, is in :attr:`antennas` under its name, custom patterns included (:func:`warprrf.interop.array_from_sionna`).
 
         Args:
             rt_scene: the scene.
@@ -148,11 +157,21 @@ class Scene:
             ImportError: if Sionna RT is missing.
             TypeError: for what is no such scene.
             ValueError: for a scene without objects, or a material with a pattern that we don't have.
+
+        Warns:
+            UserWarning: of an array that does not stand in rows and columns, which is left out.
+
+        Example::
+
+            scene = wr.Scene.from_sionna(rt_scene)
+            paths = wr.trace_paths(scene, transmitter=scene.transmitters["tx"], receivers=scene.receivers["rx"],
+                                   frequency_hz=28e9)
+            h = paths.cfr([28e9], tx_array=scene.antennas["tx"], rx_array=scene.antennas["rx"])
         """
         choice = MaterialChoice(materials, None, extrapolate)
-        parts, transmitters, receivers = parts_of(rt_scene, choice)
+        parts, devices = parts_of(rt_scene, choice)
         choice.check_used()
-        return cls._of_parts(parts, transmitters=transmitters, receivers=receivers)
+        return cls._of_parts(parts, **devices)
 
     @classmethod
     def _of_parts(cls, parts: Sequence[ScenePart], **options: Any) -> Scene:
@@ -176,7 +195,7 @@ class Scene:
         """The scene as a ``sionna.rt.Scene``, with scattering patterns, transmitters and receivers.
 
         Objects keep their names (with ``_`` for ``.``) and are not merged; one of several materials becomes one object
-        for each. Materials follow ``frequency`` of what comes back.
+        for each. Antennas stay here: Sionna has one array for all transmitters. Materials follow ``frequency`` of what comes back.
 
         Args:
             frequency_hz: carrier frequency [Hz]; Sionna RT's own default if none is given.

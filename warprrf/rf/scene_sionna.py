@@ -1,8 +1,8 @@
-"""Scenes of Sionna RT 2 in memory, from and to: objects, materials, transmitters and receivers.
+"""Scenes of Sionna RT 2 in memory, from and to: objects, materials, transmitters and receivers; and its antenna arrays.
 
 Sionna RT holds one radio material an object, in single precision, for one frequency. Materials of ITU-R P.2040 and
 constant ones are read for all frequencies; one with a law of its own in Python for the frequency that the scene has.
-Radio devices are read as positions; antennas and orientations stay with Sionna.
+Radio devices are read as positions, and as the scene's array turned as each stands.
 
 Here too is how Sionna RT and Mitsuba are imported, on an LLVM and a variant that they can use. Dr.Jit takes any LLVM on a
 CPU: 15 and 16 abort the process, 14 is too old, so the choice isn't left to it.
@@ -13,19 +13,23 @@ from __future__ import annotations
 import glob
 import os
 import re
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from warprrf.checks import checked
+from warprrf.checks import checked, users_level
 from warprrf.device import require
+from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.materials import Band, Material, itu_material
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.scene_parts import MaterialChoice, ScenePart
+from warprrf.rf.spectra.antenna import PATTERNS, SLANTS_RAD, Antenna
+from warprrf.rf.spectra.spectrum import pixel_directions
 
 _FOLDERS = (
     "/usr/lib/*-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/local/lib", "/usr/lib/llvm-*/lib", "/opt/homebrew/opt/llvm*/lib",
@@ -34,12 +38,15 @@ _FOLDERS = (
 Positions = dict[str, np.ndarray]
 
 
-def parts_of(rt_scene: Any, choice: MaterialChoice) -> tuple[list[ScenePart], Positions, Positions]:
-    """Objects, transmitters and receivers of a ``sionna.rt.Scene``.
+def parts_of(rt_scene: Any, choice: MaterialChoice) -> tuple[list[ScenePart], dict[str, Any]]:
+    """Objects of a ``sionna.rt.Scene``; and its transmitters, receivers and antennas by the arguments of :class:`Scene`.
 
     Raises:
         TypeError: for what is no such scene.
         ValueError: for a scene without objects, or a material that cannot be read, naming it.
+
+    Warns:
+        UserWarning: of arrays that do not stand in rows and columns.
     """
     rt = sionna_rt()
     if not isinstance(rt_scene, rt.Scene):
@@ -57,12 +64,87 @@ def parts_of(rt_scene: Any, choice: MaterialChoice) -> tuple[list[ScenePart], Po
         vertices = np.array(mesh.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
         faces = np.array(mesh.faces_buffer(), dtype=np.int32).reshape(-1, 3)
         found.append(ScenePart(str(name), vertices, faces, material))
-    devices = (rt_scene.transmitters, rt_scene.receivers)
-    transmitters, receivers = (
-        {str(name): _shortest(np.array(device.position)) for name, device in group.items()}
-        for group in devices
-    )
-    return found, transmitters, receivers
+    devices: dict[str, Any] = {"antennas": {}}
+    ends = ("transmitters", "tx_array"), ("receivers", "rx_array")
+    for kind, common in ends:
+        group, array = getattr(rt_scene, kind), getattr(rt_scene, common)
+        devices[kind] = {str(name): _shortest(np.array(device.position)) for name, device in group.items()}
+        if group and array is not None:
+            try:
+                own = array_from_sionna(array)
+            except ValueError as error:
+                text = str(error).removeprefix("rt_array: ")
+                warnings.warn(
+                    f"rt_scene.{common}: {text}; it is left out", UserWarning, stacklevel=users_level()
+                )
+                continue
+            devices["antennas"] |= {
+                str(name): replace(own, orientation=_shortest(np.array(device.orientation)))
+                for name, device in group.items()
+            }
+    return found, devices
+
+
+@checked
+def array_from_sionna(rt_array: Any) -> PlanarArray:
+    """A ``sionna.rt.PlanarArray`` as ours, unturned: elements, spacing, pattern and polarisation.
+
+    Sionna's own patterns become ours of those names; any other is asked of Sionna whenever it is evaluated, in its single
+    precision.
+
+    Raises:
+        TypeError: for what is no antenna array of Sionna RT.
+        ValueError: for elements that do not stand in rows and columns as those of a ``PlanarArray``.
+    """
+    if not hasattr(rt_array, "antenna_pattern") or not hasattr(rt_array, "normalized_positions"):
+        raise TypeError(f"rt_array: got {type(rt_array).__name__}, expected a sionna.rt.PlanarArray")
+    place = np.array(rt_array.normalized_positions, dtype=np.float64).reshape(3, -1).T
+    rows, cols = (len(np.unique(np.round(place[:, axis], 4))) for axis in (2, 1))
+    sides = [
+        (float(_shortest(np.ptp(place[:, axis]) / (n - 1))[0]) if n > 1 else 0.5)
+        for axis, n in ((2, rows), (1, cols))
+    ]
+    found = PlanarArray(rows, cols, sides, pattern=_antenna(rt_array.antenna_pattern))
+    if len(place) != rows * cols or np.abs(found.positions(1.0) - place).max() > 1e-4:
+        raise ValueError(
+            f"rt_array: got {len(place)} elements that do not stand in rows and columns about the middle, column by column "
+            "from the top, expected those of a sionna.rt.PlanarArray"
+        )
+    return found
+
+
+def _antenna(pattern: Any) -> Antenna:
+    """Our antenna of a ``sionna.rt.AntennaPattern``: by name where it is everywhere the same as ours of a name."""
+    live = Antenna(tuple(_SionnaPort(port) for port in pattern.patterns))
+    towards = pixel_directions((18, 36)).reshape(-1, 3)
+    fields = live.field(towards)
+    for name in PATTERNS:
+        for polarisation in SLANTS_RAD:
+            known = Antenna(name, polarisation)
+            if known.ports == live.ports and np.abs(known.field(towards) - fields).max() < 1e-4:
+                return known
+    return live
+
+
+@dataclass(frozen=True, eq=False)
+class _SionnaPort:
+    """One of the functions of a ``sionna.rt.AntennaPattern`` on NumPy's arrays."""
+
+    function: Any
+
+    def __call__(self, zenith: np.ndarray, azimuth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        floats = select_variant().Float
+        # where padded, directions are not known: Sionna gets some number, and what it says of it is unknown too
+        known = np.isfinite(zenith)
+        theta, phi = (floats(np.where(known, a, 0.0).astype(np.float32).ravel()) for a in (zenith, azimuth))
+
+        def numbers(field: Any) -> np.ndarray:
+            parts = (np.array(part, np.float64) for part in (field.real, field.imag))
+            re, im = (np.broadcast_to(part, theta.numpy().shape).reshape(zenith.shape) for part in parts)
+            return np.where(known, re + 1j * im, np.nan)
+
+        along, across = self.function(theta, phi)
+        return numbers(along), numbers(across)
 
 
 def _shortest(values: Any) -> np.ndarray:

@@ -4,13 +4,8 @@ import numpy as np
 import pytest
 from path_makers import random_directions
 
-from warprrf.rf.channel.arrays import (
-    PATTERNS,
-    PlanarArray,
-    orientation_towards,
-    plane_wave_error,
-    rotation_matrix,
-)
+from warprrf.rf.channel.arrays import PlanarArray, orientation_towards, plane_wave_error
+from warprrf.rf.spectra.antenna import PATTERNS, rotation_matrix
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_solid_angles, transverse_basis
 
 WAVELENGTH = 1e-3

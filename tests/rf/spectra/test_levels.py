@@ -10,9 +10,10 @@ from radio_scenes import box_mesh
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fields.base import RadioField
+from warprrf.rf.spectra.antenna import horn
 from warprrf.rf.spectra.dataset import SpectrumDataset, question_spectra
 from warprrf.rf.spectra.levels import MARGIN_DB
-from warprrf.rf.spectra.readings import Readings, horn, question_readings
+from warprrf.rf.spectra.readings import Readings, question_readings
 
 TX, RX, F = np.zeros(3), np.array([[2.0, 0, 0], [5.0, 0, 0], [9.0, 3.0, 0]]), 28e9
 FREE_DB = 20 * np.log10(299_792_458 / F / (4 * np.pi * np.linalg.norm(RX, axis=1)))
@@ -62,7 +63,7 @@ def test_powers_of_another_unit_are_questioned_and_the_unit_guessed(spoil, unit,
 def test_powers_that_can_be_pass():
     """What adds to line of sight up to the margin, fading, the gain of antennas, chains of unknown gain; the lobby."""
     strong = np.full(3, 0.9 * MARGIN_DB) + FREE_DB
-    gain_db = 10 * np.log10(horn(0.2)(np.array(0.0)))
+    gain_db = 10 * np.log10(horn(0.2).peak_gain)
     turned = {"arrival": np.tile([np.pi / 2, np.pi], (3, 1)), "receive_pattern": horn(0.2)}
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -194,7 +194,7 @@ def _steps() -> str:
     return _edited(
         "seconds",
         (
-            ("what", "step of", "{}"), ("edit_s", "edit [s]", "{:.2f}"), ("step_s", "then [s]", "{:.2f}"),
-            ("whole_s", "whole [s]", "{:.2f}"), ("share", "step / whole", "{:.2f}"),
+            ("what", "step of", "{}"), ("edit_s", "edit [core s]", "{:.2f}"), ("step_s", "then [core s]", "{:.2f}"),
+            ("whole_s", "whole [core s]", "{:.2f}"), ("share", "step / whole", "{:.2f}"),
         ),
     )  # fmt: skip

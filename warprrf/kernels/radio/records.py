@@ -25,7 +25,7 @@ MOST = 7
 MIRROR, SCATTER, SLAB, SOURCE = 1, 2, 4, 16
 """Kinds of interactions, as far as it has them Sionna RT's: a mirror, a surface that scatters, a slab that is passed, an element
 that sends. 0 for none."""
-EXCESS, MIRRORED, THROUGH = 0, 1, 2
+EXCESS_COLUMN, MIRRORED_COLUMN, THROUGH_COLUMN = 0, 1, 2
 """Columns of a material's parameters behind those of its lobe weights: logarithms of epsilon_r - 1, of the mirrored share, and of
 the share let through."""
 MOMENTS = 3
@@ -343,13 +343,13 @@ def build(real: type) -> Any:
                             bent = raised(t, m, m.excess, i, begin, end, k)
                             size = wp.ddot(run, run)
                             if size > real(0.0):
-                                slope[b, column + wp.static(EXCESS)] += (
+                                slope[b, column + wp.static(EXCESS_COLUMN)] += (
                                     real(2.0) * p * wp.ddot(run, bent) / size
                                 )
                             if kind_of(t, i, k) == wp.static(MIRROR):
-                                slope[b, column + wp.static(MIRRORED)] += p
+                                slope[b, column + wp.static(MIRRORED_COLUMN)] += p
                             else:
-                                slope[b, column + wp.static(THROUGH)] += p
+                                slope[b, column + wp.static(THROUGH_COLUMN)] += p
                 if kind_of(t, i, t.rough) == wp.static(SCATTER):
                     row = m.row[t.index[i, t.rough]]
                     angle = t.angle[i, t.rough]
@@ -363,7 +363,7 @@ def build(real: type) -> Any:
                     if m.reciprocal[row] == 1:
                         r2 = half_space(m.excess[row], angle[1])
                         rise = real(0.5) * (rise + wp.dot(r2, half_space_slope(m.excess[row], angle[1])))
-                    slope[b, place[row] + lobes + wp.static(EXCESS)] += (
+                    slope[b, place[row] + lobes + wp.static(EXCESS_COLUMN)] += (
                         p * rise / unpolarised(m, m.excess[row], row, angle)
                     )
                 if kind_of(t, i, t.rough) == wp.static(SOURCE):
@@ -374,7 +374,7 @@ def build(real: type) -> Any:
                     if whole > real(0.0):
                         for j in range(lobes):
                             slope[b, place[row] + j] += p * m.weight[row, j] / whole
-                    slope[b, place[row] + lobes + wp.static(EXCESS)] += p * m.even_slope[row]
+                    slope[b, place[row] + lobes + wp.static(EXCESS_COLUMN)] += p * m.even_slope[row]
 
     @wp.kernel(module="unique", enable_backward=False)
     def bin_components(

@@ -161,7 +161,7 @@ def check_steering(array: PlanarArray, directions: ArrayLike) -> np.ndarray:
         TypeError, ValueError: naming the argument.
     """
     check_type("array", array, PlanarArray)
-    check_unpolarised("array", array, "all are vertical")
+    check_unpolarised("array", array)
     found = check_array("directions", directions, (..., None, 3))
     if found.size == 0:
         raise ValueError(f"directions: got shape {found.shape}, expected (..., 3)")

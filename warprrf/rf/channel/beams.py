@@ -25,9 +25,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_count, check_positive, checked, one_line
-from warprrf.rf.channel.arrays import ISOTROPIC, PlanarArray, check_unpolarised
+from warprrf.rf.channel.arrays import ISOTROPIC, End, PlanarArray, array_of, check_unpolarised
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.waves import carrier_phase
+from warprrf.rf.spectra.antenna import Antenna
 from warprrf.rf.spectra.spectrum import Spectrum, directions_from_angles, pixel_directions, unit_vectors
 
 
@@ -144,7 +145,7 @@ def dft_codebook(array: PlanarArray, oversampling: int = 1) -> Codebook:
     Raises:
         ValueError: for a polarised array, or oversampling below 1.
     """
-    check_unpolarised("array", array, "powers choose beams")
+    check_unpolarised("array", array)
     times = check_count("oversampling", oversampling)
     return Codebook(array, (_dft(array.cols, times), _dft(array.rows, times)))
 
@@ -167,7 +168,7 @@ def steering_codebook(
     Raises:
         ValueError: naming the argument; for a polarised array.
     """
-    check_unpolarised("array", array, "powers choose beams")
+    check_unpolarised("array", array)
     if (directions is None) == (points is None):
         raise ValueError("directions: expected either directions or points, and got both or neither")
     name, given = ("directions", directions) if points is None else ("points", points)
@@ -182,8 +183,8 @@ def steering_codebook(
 
 Source = PathArrays | Spectrum
 """Where predicted power comes from and how much: :class:`Paths` of one receiver or several, or a :class:`Spectrum`."""
-Ends = PlanarArray | Codebook | None
-"""Beams of one end: those given, an array's DFT codebook, or a single isotropic element."""
+Ends = End | Codebook
+"""Beams of one end: those given, an array's DFT codebook, an antenna as it stands, or a single isotropic element."""
 
 
 @checked
@@ -431,10 +432,19 @@ def codebook_of(name: str, value: Ends) -> Codebook:
     """The beams of an end; ``name`` is the argument that ``value`` came by."""
     if value is None:
         return Codebook(ISOTROPIC, (np.ones((1, 1), dtype=complex),))
-    if isinstance(value, PlanarArray):
-        check_unpolarised(name, value, "powers choose beams")
-        return dft_codebook(value)
-    return value
+    if isinstance(value, Codebook):
+        return value
+    if not isinstance(value, PlanarArray | Antenna):
+        raise TypeError(
+            f"{name}: got {type(value).__name__}, expected a PlanarArray, an Antenna or a Codebook"
+        )
+    array = array_of(name, value)
+    check_unpolarised(name, array)
+    return dft_codebook(array)
+
+
+def _isotropic(array: PlanarArray) -> bool:
+    return isinstance(array.element.pattern, str) and array.element.pattern == "isotropic"
 
 
 def squared(values: np.ndarray) -> np.ndarray:

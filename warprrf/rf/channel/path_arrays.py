@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -316,6 +316,15 @@ class PathArrays:
             alike = len(sources) < len(parts) or all(np.array_equal(s, sources[0]) for s in sources)
             common["transmitter"] = sources[0] if alike else np.stack(sources)
         return cls(**stacked, **common, receiver=receiver)
+
+
+P = TypeVar("P", bound=PathArrays)
+
+
+def turned(paths: P, turn: np.ndarray) -> P:
+    """The same paths with their complex gains times ``turn``, shape as ``gain``."""
+    jones = None if paths.jones is None else paths.jones * turn[..., None, None]
+    return replace(paths, gain=paths.gain * turn, jones=jones)
 
 
 def points_along(transmitter: np.ndarray, vertices: np.ndarray, receiver: np.ndarray) -> np.ndarray:

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_choice, check_count, check_positive, check_seed
-from warprrf.rf.channel.arrays import ISOTROPIC, SLANTS_RAD, PlanarArray, check_unpolarised
+from warprrf.rf.channel.arrays import End, PlanarArray, array_of, check_unpolarised
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.channel.sums import (
     LEAST_FREQUENCIES,
@@ -56,8 +56,8 @@ class LinkOptions(TypedDict, total=False):
     """What stands at the ends of the paths, and how waves cross the arrays.
 
     Attributes:
-        tx_array: Transmitting array about the transmitter; one isotropic element by default.
-        rx_array: Receiving array about every receiver; one isotropic element by default.
+        tx_array: Transmitting array about the transmitter, or an antenna; one isotropic element by default.
+        rx_array: Receiving array about every receiver, or an antenna; one isotropic element by default.
         wave: "plane" (default) or "spherical".
         squint: Whether elements differ in delay (default) or only in carrier phase.
         diffuse: "random_phase", "power" or "given"; must be stated if there are diffuse paths.
@@ -65,8 +65,8 @@ class LinkOptions(TypedDict, total=False):
         normalize_delays: Count delays (and phases) from each receiver's first path; False by default.
     """
 
-    tx_array: PlanarArray | None
-    rx_array: PlanarArray | None
+    tx_array: End
+    rx_array: End
     wave: str
     squint: bool
     diffuse: str | None
@@ -190,9 +190,7 @@ def impulse_response(paths: PathArrays, **link: Unpack[LinkOptions]) -> tuple[np
     return (np.stack(coefficients), np.stack(delays)) if paths.batched else (coefficients[0], delays[0])
 
 
-def diffuse_power(
-    paths: PathArrays, *, tx_array: PlanarArray | None = None, rx_array: PlanarArray | None = None
-) -> np.ndarray:
+def diffuse_power(paths: PathArrays, *, tx_array: End = None, rx_array: End = None) -> np.ndarray:
     """Mean power that diffuse paths of random phase add to |H_mn|^2 of any pair of elements, shape ``()`` or ``(R,)``.
 
     For arrays without polarisation. It is flat in frequency.
@@ -200,9 +198,9 @@ def diffuse_power(
     Raises:
         ValueError: if an array is polarised.
     """
-    tx, rx = tx_array or ISOTROPIC, rx_array or ISOTROPIC
+    tx, rx = array_of("tx_array", tx_array), array_of("rx_array", rx_array)
     for name, array in (("tx_array", tx), ("rx_array", rx)):
-        check_unpolarised(name, array, "diffuse paths hold powers alone")
+        check_unpolarised(name, array)
     scattered = np.where(paths.kind == "diffuse", paths.power, 0.0)
     whole = scattered > 0
     gains = np.zeros(scattered.shape)
@@ -279,8 +277,8 @@ def random_turns(paths: PathArrays, seed: int) -> np.ndarray:
 
 def _links(
     paths: PathArrays,
-    tx_array: PlanarArray | None = None,
-    rx_array: PlanarArray | None = None,
+    tx_array: End = None,
+    rx_array: End = None,
     wave: str = "plane",
     squint: bool = True,
     diffuse: str | None = None,
@@ -297,7 +295,7 @@ def _links(
             "(left out of the sum) or 'given' (phases as they are)"
         )
     check_seed(seed)
-    tx, rx = tx_array or ISOTROPIC, rx_array or ISOTROPIC
+    tx, rx = array_of("tx_array", tx_array), array_of("rx_array", rx_array)
     carrier = paths.carrier_hz
     places = [array.positions(SPEED_OF_LIGHT / carrier) for array in (tx, rx)]
     for k in range(len(paths.gain) if paths.batched else 1):
@@ -367,17 +365,21 @@ def _gridded_with_air(job: Sum, f: np.ndarray, loss: np.ndarray, length_m: np.nd
 
 def _amplitudes(paths: PathArrays, tx: PlanarArray, rx: PlanarArray) -> np.ndarray:
     """Amplitudes between elements at the arrays' centres, shape ``(Kr, Kt, P)``."""
-    if tx.polarisation is None and rx.polarisation is None:
+    if not tx.element.polarised and not rx.element.polarised:
         return (paths.gain * np.sqrt(tx.gain(paths.departure) * rx.gain(paths.arrival)))[None, None]
-    if tx.polarisation is None or rx.polarisation is None:
+    if not (tx.element.polarised and rx.element.polarised):
+        known = [
+            "of its own" if a.element.polarised and a.polarisation is None else a.polarisation
+            for a in (rx, tx)
+        ]
         raise ValueError(
-            f"rx_array: got polarisation {rx.polarisation!r} beside {tx.polarisation!r} of the transmitting array, "
-            f"expected both polarised ({', '.join(SLANTS_RAD)}) or neither"
+            f"rx_array: got polarisation {known[0]!r} beside {known[1]!r} of the transmitting array, expected both polarised or "
+            "neither (Antenna.unpolarised())"
         )
     if paths.jones is None or not np.isfinite(paths.jones).all():
         raise ValueError(
             "paths: polarised arrays need polarised amplitudes, but some paths hold powers alone; trace them in a "
-            "scene with materials, or use arrays without polarisation"
+            "scene with materials, or use arrays and antennas without polarisation"
         )
     received, transmitted = rx.field(paths.arrival), tx.field(paths.departure)
     return np.einsum("apx,pxy,bpy->abp", received, paths.jones, transmitted)

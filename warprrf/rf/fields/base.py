@@ -44,7 +44,7 @@ from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
 from warprrf.rf.paths.path_set import PATH_VARIABLES, Paths, arrays_of, ends_and_attributes
 from warprrf.rf.positions import Ends, check_positions
-from warprrf.rf.spectra.antenna import Pattern, sample_pattern
+from warprrf.rf.spectra.antenna import Antenna, Pattern, samples_of
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.spectra.spectrum import (
@@ -624,9 +624,11 @@ def _progress_after(progress: Progress, before: int, total: int, stage: str, don
 
 
 def _sampled(option: Any) -> Any:
-    """An option as a store is known by it: of an array's pattern that is a function, its gains."""
-    if isinstance(option, PlanarArray) and callable(option.pattern):
-        return replace(option, pattern=sample_pattern(option.pattern, np.linspace(0.0, np.pi, 3601)))
+    """An option as a store is known by it: of antennas, whose patterns may be functions, their gains."""
+    if isinstance(option, Antenna):
+        return samples_of(option)
+    if isinstance(option, PlanarArray):
+        return option.rows, option.cols, option.spacing, option.rotation, samples_of(option.element)
     return option
 
 

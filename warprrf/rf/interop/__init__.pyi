@@ -11,6 +11,9 @@ from warprrf.rf.interop.twin import Twin as Twin
 # paths in Sionna RT's shapes (`Paths.to_sionna`)
 from warprrf.rf.paths.sionna import SionnaPaths as SionnaPaths
 
+# an antenna array of Sionna RT's, custom patterns included
+from warprrf.rf.scene_sionna import array_from_sionna as array_from_sionna
+
 # choose an LLVM that Dr.Jit can use
 from warprrf.rf.scene_sionna import select_llvm as select_llvm
 

@@ -15,12 +15,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf import netcdf_files
 from warprrf.checks import (
     Expected,
+    check_array,
     check_arrays,
     check_known_whole,
+    check_number,
     check_positive,
     checked,
     lengths,
@@ -29,9 +32,10 @@ from warprrf.checks import (
 from warprrf.netcdf_files import Variable
 from warprrf.rf.channel import dispersion as dispersions
 from warprrf.rf.channel import response
-from warprrf.rf.channel.path_arrays import PADDING, PathArrays
+from warprrf.rf.channel.path_arrays import PADDING, PathArrays, turned
 from warprrf.rf.em.absorption import Air
-from warprrf.rf.paths import sionna
+from warprrf.rf.em.waves import carrier_phase
+from warprrf.rf.paths import doppler, sionna
 from warprrf.tensor_files import named
 
 
@@ -52,6 +56,26 @@ class Paths(PathArrays):
     taps = response.channel_taps
     diffuse_power = response.diffuse_power
     dispersion = dispersions.dispersion
+    doppler_hz = doppler.doppler_hz
+
+    def after(self, time_s: float, doppler_hz: ArrayLike) -> Paths:
+        """The same paths ``time_s`` later, each turned by its Doppler shift: exp(j 2 pi f_D t).
+
+        It holds while nothing has moved by more than a part of what changes the paths themselves, or their gains: trace anew for
+        longer times.
+
+        Args:
+            time_s: [s].
+            doppler_hz: shift of each path [Hz], as :meth:`doppler_hz` returns them; shape as ``tau``.
+
+        Raises:
+            ValueError: for another shape, or a path without a shift.
+        """
+        shift = check_array("doppler_hz", doppler_hz, self.tau.shape, finite=False)
+        if not np.isfinite(shift[self.valid]).all():
+            raise ValueError("doppler_hz: got NaN or infinite shifts, expected one for every path")
+        turn = carrier_phase(-check_number("time_s", time_s), np.where(self.valid, shift, 0.0))
+        return turned(self, turn)
 
     to_sionna = sionna.to_sionna
 

@@ -8,17 +8,18 @@ there: polarisation by polarisation, then element by element. There is one trans
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_count, checked, one_line
-from warprrf.rf.channel.arrays import PlanarArray
-from warprrf.rf.channel.path_arrays import EDGE, SCATTER, SLAB, PathArrays
+from warprrf.checks import check_array, check_count, check_positive, checked, one_line
+from warprrf.rf.channel.arrays import End
+from warprrf.rf.channel.path_arrays import EDGE, SCATTER, SLAB, PathArrays, turned
 from warprrf.rf.channel.response import channel_taps, frequency_response, impulse_response
 from warprrf.rf.em.waves import carrier_phase, check_frequency
 
@@ -38,6 +39,7 @@ class SionnaPaths:
         interactions: ``sionna.rt.InteractionType`` (1 specular, 2 diffuse, 4 refraction, 8 diffraction, 0 none), shape
             ``(depth, R, 1, L)``.
         vertices: Interaction points [m], shape ``(depth, R, 1, L, 3)``; 0 where none.
+        doppler: Doppler shifts [Hz], shape ``(R, 1, L)``; 0 where nothing was said to move.
         synthetic_array: always True.
     """
 
@@ -52,27 +54,35 @@ class SionnaPaths:
     valid: np.ndarray
     interactions: np.ndarray
     vertices: np.ndarray
+    doppler: np.ndarray
     synthetic_array: ClassVar[bool] = True
     _paths: PathArrays
     _options: dict[str, Any]
 
     def cir(
-        self, *, num_time_steps: int = 1, normalize_delays: bool = True, out_type: str = "numpy"
+        self,
+        *,
+        sampling_frequency: float = 1.0,
+        num_time_steps: int = 1,
+        normalize_delays: bool = True,
+        out_type: str = "numpy",
     ) -> tuple[Any, Any]:
         """Baseband coefficients ``(R, M, 1, N, L, T)`` and delays ``(R, 1, L)``, as ``sionna.rt.Paths.cir``.
 
-        Nothing moves: all ``num_time_steps`` T are alike. ``out_type`` "torch" gives complex64 and float32 tensors.
+        The ``num_time_steps`` T, ``sampling_frequency`` [Hz] of them a second, differ by the paths' Doppler shifts. ``out_type``
+        "torch" gives complex64 and float32 tensors.
         """
         a, tau = impulse_response(self._paths, normalize_delays=normalize_delays, **self._options)
-        a = a[:, :, None, ..., None]
-        steps = check_count("num_time_steps", num_time_steps, most=MOST_TIME_STEPS)
-        a = np.broadcast_to(a, (*a.shape[:-1], steps)).copy()
+        time_s = _times(num_time_steps, sampling_frequency)
+        turn = carrier_phase(-time_s, self.doppler[:, None, :, None, :, None])
+        a = _one_transmitter(a)[..., None] * turn
         return _as(a, out_type), _as(np.where(self.valid, tau[:, None], -1.0), out_type)
 
     def cfr(
         self,
         frequencies: ArrayLike,
         *,
+        sampling_frequency: float = 1.0,
         num_time_steps: int = 1,
         normalize_delays: bool = True,
         normalize: bool = False,
@@ -83,10 +93,15 @@ class SionnaPaths:
         ``normalize`` scales each link to unit mean energy.
         """
         f = self._paths.carrier_hz + check_array("frequencies", frequencies, (None,))
-        h = frequency_response(
-            self._paths, f, squint=False, normalize_delays=normalize_delays, **self._options
+        work = partial(
+            frequency_response,
+            frequencies_hz=f,
+            squint=False,
+            normalize_delays=normalize_delays,
+            **self._options,
         )
-        return _as(_time_steps(h, num_time_steps, normalize, mean=True), out_type)
+        h = self._over_time(work, _times(num_time_steps, sampling_frequency))
+        return _as(_normalised(h, normalize, mean=True), out_type)
 
     def taps(
         self,
@@ -94,35 +109,62 @@ class SionnaPaths:
         l_min: int,
         l_max: int,
         *,
+        sampling_frequency: float | None = None,
         num_time_steps: int = 1,
         normalize: bool = False,
         normalize_delays: bool = True,
         out_type: str = "numpy",
     ) -> Any:
-        """Taps ``(R, M, 1, N, T, l_max - l_min + 1)``, as ``sionna.rt.Paths.taps``."""
-        link = {"squint": False, "normalize_delays": normalize_delays} | self._options
-        h = channel_taps(self._paths, bandwidth, l_min, l_max, **link)
-        return _as(_time_steps(h, num_time_steps, normalize, mean=False), out_type)
+        """Taps ``(R, M, 1, N, T, l_max - l_min + 1)``, as ``sionna.rt.Paths.taps``; T of them a second are ``bandwidth`` by
+        default."""
+        work = partial(
+            channel_taps,
+            bandwidth_hz=bandwidth,
+            l_min=l_min,
+            l_max=l_max,
+            squint=False,
+            normalize_delays=normalize_delays,
+            **self._options,
+        )
+        every = bandwidth if sampling_frequency is None else sampling_frequency
+        h = self._over_time(work, _times(num_time_steps, every))
+        return _as(_normalised(h, normalize, mean=False), out_type)
+
+    def _over_time(self, work: Callable[[PathArrays], np.ndarray], time_s: np.ndarray) -> np.ndarray:
+        """``work`` on the paths at each of the times (T,), ``(R, M, N, T, ...)``."""
+        if not self.doppler.any():
+            h = work(self._paths)[:, :, :, None]
+            return np.broadcast_to(h, (*h.shape[:3], len(time_s), *h.shape[4:])).copy()
+        turns = (carrier_phase(-t, self.doppler[:, 0]) for t in time_s)
+        return np.stack([work(turned(self._paths, turn)) for turn in turns], axis=3)
 
 
 def to_sionna(
     paths: PathArrays,
-    tx_array: PlanarArray | None = None,
-    rx_array: PlanarArray | None = None,
+    tx_array: End = None,
+    rx_array: End = None,
     *,
     diffuse: str | None = None,
     seed: int = 0,
+    doppler_hz: ArrayLike | None = None,
 ) -> SionnaPaths:
     """``paths`` in Sionna RT's shapes: plane waves, carrier phases across arrays.
 
     Args:
         tx_array, rx_array: One isotropic element without polarisation by default.
         diffuse, seed: see :func:`~warprrf.rf.channel.response.frequency_response`.
+        doppler_hz: shift of each path [Hz], as of :meth:`Paths.doppler_hz`; None: nothing moves.
 
     Raises:
-        ValueError: as there.
+        ValueError: as there; for shifts that are not those of the paths.
     """
     several = paths.as_several()
+    shift = np.zeros(several.gain.shape)
+    if doppler_hz is not None:
+        given = check_array("doppler_hz", doppler_hz, paths.gain.shape, finite=False)
+        shift = np.where(several.valid, given.reshape(shift.shape), 0.0)
+        if not np.isfinite(shift).all():
+            raise ValueError("doppler_hz: got NaN or infinite shifts, expected one for every path")
     options: dict[str, Any] = {"tx_array": tx_array, "rx_array": rx_array, "diffuse": diffuse, "seed": seed}
     coefficient, tau = impulse_response(several, **options)
     valid = several.valid & np.isfinite(tau)
@@ -144,6 +186,7 @@ def to_sionna(
         valid=valid[:, None],
         interactions=np.moveaxis(np.where(there, several.interactions, 0).astype(int), -1, 0)[:, :, None],
         vertices=np.moveaxis(np.where(there[..., None], several.vertices, 0.0), -2, 0)[:, :, None],
+        doppler=shift[:, None],
         _paths=several,
         _options=options,
     )
@@ -225,16 +268,25 @@ def repeated(paths: PathArrays) -> np.ndarray:
     return np.asarray(np.tril(same, -1).any(axis=1))
 
 
-def _time_steps(h: np.ndarray, count: int, normalize: bool, *, mean: bool) -> np.ndarray:
-    """``(R, M, N, F)`` as ``(R, M, 1, N, T, F)``; normalised over a link's mean energy, or its energy in all taps."""
-    count = check_count("num_time_steps", count, most=MOST_TIME_STEPS)
+def _one_transmitter(h: np.ndarray) -> np.ndarray:
+    """``(R, M, N, ...)`` as ``(R, M, 1, N, ...)``."""
+    return h[:, :, None]
+
+
+def _times(count: int, per_second: float) -> np.ndarray:
+    """Times [s] of ``count`` steps."""
+    every = check_positive("sampling_frequency", per_second)
+    return np.arange(check_count("num_time_steps", count, most=MOST_TIME_STEPS)) / every
+
+
+def _normalised(h: np.ndarray, normalize: bool, *, mean: bool) -> np.ndarray:
+    """``(R, M, N, T, F)`` as ``(R, M, 1, N, T, F)``; normalised over a link's mean energy, or its energy in all taps."""
     if normalize:
         energy = np.abs(h) ** 2
         energy = energy.mean(axis=-1) if mean else energy.sum(axis=-1)
-        energy = energy.mean(axis=(1, 2))[:, None, None, None]
+        energy = energy.mean(axis=(1, 2, 3))[:, None, None, None, None]
         h = np.divide(h, np.sqrt(energy), out=np.zeros_like(h), where=energy > 0)
-    several = h[:, :, None, :, None]
-    return np.broadcast_to(several, (*several.shape[:-2], count, several.shape[-1])).copy()
+    return _one_transmitter(h)
 
 
 def _as(values: np.ndarray, out_type: str) -> Any:

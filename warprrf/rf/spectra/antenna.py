@@ -1,279 +1,557 @@
-"""Taking a receiver's antenna out of measured spectra.
+"""Antennas: power gain, or polarised field, over two angles in axes of their own.
 
-Two ways to measure. *Scanned*: an antenna with a rotationally symmetric pattern G is steered to every pixel centre; the
-value there is y(d) = sum over paths of path gain times G(angle between d and the path), a convolution on the sphere.
-It is undone by Richardson-Lucy steps (Richardson 1972, Lucy 1974), weighted by the pixels' solid angles: estimates stay
-non-negative, a known noise power is part of the model, and each step conserves the total
-``sum_i Omega_i (y_i - noise) / integral of G``, which is the total path gain whatever the horn. *Fixed*: the antenna
-does not turn and directions were distinguished by other means; its pattern over absolute directions divides out.
+Axes are those of Sionna RT and 3GPP TR 38.901: an antenna looks along its local +x, zeniths count from its +z, azimuths from
++x to +y. A *gain* G is power gain over isotropic [linear]: its mean over the sphere is the antenna's efficiency, and the
+integral of G over it 4 pi of a lossless one. A *field* (F_theta, F_phi) is complex, along the zenith and azimuth unit
+vectors of the direction, with |F_theta|^2 + |F_phi|^2 = G. Of a field F_t that is sent through a path of Jones matrix J an antenna
+of field F_r receives F_r^T J F_t: without a conjugate, so that links are reciprocal (IEEE Std 145).
+
+What is called a pattern in arrays and readings is an :class:`Antenna` or what one is made of: a name of :data:`PATTERNS`, or a
+power gain over the angle off boresight alone.
+
+Names: "isotropic"; "dipole", the short dipole along local z, gain 1.5 sin^2 (Balanis, Antenna Theory, eq. (4-26a));
+"half_wave_dipole", 1.643 (cos(pi/2 cos theta) / sin theta)^2 (eq. (4-84)); "tr38901", 3GPP TR 38.901 table 7.3-1 (8 dBi, 65
+degrees, 30 dB).
 """
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf import device as _device
-from warprrf.checks import check_array, check_count, check_number, check_positive
-from warprrf.device import DeviceLike
+from warprrf.cache import cached_property
+from warprrf.checks import check_array, check_number, check_positive, checked
+from warprrf.rf.spectra.antenna_files import read_cuts
 from warprrf.rf.spectra.spectrum import (
-    check_shape,
-    pixel_angles,
+    angles_from_directions,
+    directions_from_angles,
     pixel_directions,
-    pixel_solid_angles,
-    spread_paths,
+    transverse_basis,
 )
 
-SCANNED = "scanned antenna: Richardson-Lucy on the sphere, then spread by the stated beam"
-FIXED = "fixed antenna: divided by its gain in each direction"
+SLANTS_RAD = {
+    "V": (0.0,),
+    "H": (0.5 * np.pi,),
+    "VH": (0.0, 0.5 * np.pi),
+    "cross": (-0.25 * np.pi, 0.25 * np.pi),
+}
+"""Slant angle zeta of each port, by the name of a polarisation: (F_theta, F_phi) = sqrt(G) (cos zeta, sin zeta); 3GPP TR 38.901,
+eqs. (7.3-4) and (7.3-5), model 2."""
+
+Shape: TypeAlias = Callable[[np.ndarray, np.ndarray], Any]
+"""Of zeniths and azimuths [rad], arrays alike, to power gains [linear] of their shape, or to a pair of complex fields."""
 
 
-Pattern: TypeAlias = Callable[[np.ndarray], ArrayLike] | Sequence[float] | np.ndarray
-"""Power gain [linear]: a function of the angle off boresight [rad], or samples of it from 0 to pi."""
-
-
-@dataclass(frozen=True)
-class Scan:
-    """How a scanned antenna is taken out.
-
-    Attributes:
-        noise: Mean noise power in every measured value [linear, over transmitted power].
-        snapshots: Over how many independent ones each value was averaged: noise power scatters by ``noise`` over the
-            root of it.
-        iterations: Most Richardson-Lucy steps for one receiver.
-        tolerance: Steps stop when the misfit is this small against the measurement, both weighted by solid angle,
-            after the first 50 when it is as small as the noise's scatter, or when it fell by less than 1 % over the
-            last 50; paths between pixel centres leave a few percent, so that stalling ends most.
-        device: Where estimates are spread by the beam.
-    """
-
-    noise: float = 0.0
-    snapshots: int = 1
-    iterations: int = 2000
-    tolerance: float = 1e-3
-    device: DeviceLike = None
-
-    def __post_init__(self) -> None:
-        check_number("noise", self.noise, 0.0)
-        for name in ("iterations", "snapshots"):
-            check_count(name, getattr(self, name))
-        check_positive("tolerance", self.tolerance)
-
-
-class Deembedded(NamedTuple):
-    """Spectra without the antenna.
-
-    Attributes:
-        path_gain: Path gain per pixel [linear], shape ``(R, H, W)``, float64.
-        source: Index ``row * W + column`` of the measured pixel that each pixel's strongest path comes from, shape
-            ``(R, H, W)``, int; -1 where empty.
-        steps: Steps taken, shape ``(R,)``, int; 0 for a fixed antenna.
-        misfit: Relative misfit of the measurement, weighted by solid angle, shape ``(R,)``; 0 for a fixed antenna.
-        covered: Share of the sphere of which the spectrum is known.
-        method: What was done, :data:`SCANNED` or :data:`FIXED`.
-    """
-
-    path_gain: np.ndarray
-    source: np.ndarray
-    steps: np.ndarray
-    misfit: np.ndarray
-    covered: float
-    method: str
-
-
-def deembed(
-    path_gain: ArrayLike,
-    pattern: Pattern,
-    beam_sigma_rad: float,
-    *,
-    boresight_gain_dbi: float | None = None,
-    noise: float = 0.0,
-    progress: _device.Progress | None = None,
-    **options: Any,
-) -> Deembedded:
-    """``path_gain`` (R, H, W) without the antenna; see :meth:`warprrf.SpectrumDataset.deembed`.
-
-    A pattern ``(H, W)`` is a fixed antenna's, which takes the option ``limit_db``; any other a scanned one's, with those
-    of :class:`Scan`.
-
-    Raises:
-        TypeError: for an option of the other kind of antenna.
-        ValueError: for noise with a fixed antenna, or naming another argument.
-    """
-    power = check_array("path_gain", path_gain, (None, None, None))
-    if (power < 0).any():
-        raise ValueError(f"path_gain: got {int((power < 0).sum())} negative values, expected linear power")
-    if not callable(pattern):
-        pattern = check_array("pattern", pattern, finite=False)
-    if callable(pattern) or pattern.ndim != 2:
-        kernel = scanned_kernel(pattern, check_shape(power.shape[1:]), boresight_gain_dbi)
-        return _deembed_scanned(power, kernel, beam_sigma_rad, Scan(noise=noise, **options), progress)
-    if noise != 0.0:
-        raise ValueError("noise: a fixed antenna's spectra are divided as they are; take the noise off first")
-    gain = _gains(check_array("pattern", pattern, power.shape[1:]), boresight_gain_dbi)
-    return _deembed_fixed(power, gain, **options)
-
-
-def scanned_kernel(
-    pattern: Pattern, shape: tuple[int, int], boresight_gain_dbi: float | None = None
-) -> np.ndarray:
-    """Azimuth spectrum of the response between rows, shape ``(W // 2 + 1, H, H)``; real, since patterns are even.
+@checked
+@dataclass(frozen=True, eq=False)
+class Antenna:
+    """An antenna of one port or two: where it sends and receives how much, in which polarisation.
 
     Args:
-        pattern: Power gain [linear] over the angle off boresight: a function of angles (any shape) [rad], or samples
-            ``(N,)`` at equally spaced angles from 0 to pi, both included, interpolated linearly.
-        shape: Rows and columns of the grid.
-        boresight_gain_dbi: Scales the pattern to this gain at its strongest; None takes it as it is.
+        pattern: one of :data:`PATTERNS`; a function of zenith and azimuth [rad] that returns power gains [linear], or the
+            pair of complex fields (F_theta, F_phi); or a sequence of such functions of fields, one for each port.
+        polarisation: "V", "H", "VH" or "cross": what a power gain is polarised along. None: nothing is known of it, or the
+            fields say it themselves.
+        orientation: yaw, pitch and roll [rad], or a rotation matrix from its own axes, shape ``(3, 3)``.
 
     Raises:
-        TypeError: if ``pattern`` is neither.
-        ValueError: if gains are negative, NaN, infinite, all zero or the same in all directions.
+        TypeError, ValueError: naming the argument; for gains that are negative or not finite.
+
+    Example::
+
+        sector = wr.Antenna.load("sector.msi", polarisation="cross").turned((0.0, np.radians(6), 0.0))  # 6 degrees down
+        channel = paths.cfr(f, tx_array=sector, rx_array=wr.Antenna("dipole", "V"))
     """
-    gain = _gains(sample_pattern(pattern, _angles_between(shape)), boresight_gain_dbi)
-    flat_db = 0.1  # a pattern that varies less cannot tell directions apart
-    if gain.min() > gain.max() * 10.0 ** (-flat_db / 10.0):
-        raise ValueError(
-            "pattern: got the same gain in all directions; scanning it tells nothing of directions, expected a "
-            "directive antenna (a fixed isotropic one is an array of ones over the pixels)"
+
+    pattern: str | Shape | Sequence[Shape] = "isotropic"
+    polarisation: str | None = None
+    orientation: ArrayLike = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.pattern, str) and self.pattern not in PATTERNS:
+            raise ValueError(
+                f"pattern: got {self.pattern!r}, expected {', '.join(PATTERNS)}, an Antenna, a function or samples"
+            )
+        if self.polarisation is not None and self.polarisation not in SLANTS_RAD:
+            raise ValueError(
+                f"polarisation: got {self.polarisation!r}, expected None, {', '.join(SLANTS_RAD)}"
+            )
+        _ = self.rotation, self._probed
+
+    @classmethod
+    def from_grid(
+        cls,
+        zenith: ArrayLike,
+        azimuth: ArrayLike,
+        gain: ArrayLike | None = None,
+        *,
+        field: ArrayLike | None = None,
+        polarisation: str | None = None,
+    ) -> Antenna:
+        """An antenna of numbers on a grid of angles, interpolated linearly, gains as gains and fields as complex numbers.
+
+        Args:
+            zenith: T rising zeniths [rad] from 0 to pi; what is missing at the ends, less than a step, is continued.
+            azimuth: P rising azimuths [rad] all the way round, of which the last may repeat the first.
+            gain: power gain [linear], shape ``(T, P)``.
+            field: complex (F_theta, F_phi) instead, shape ``(T, P, 2)``, or ``(K, T, P, 2)`` of K ports. Of magnitudes alone:
+                a gain with a ``polarisation``.
+            polarisation: of a gain; see :class:`Antenna`.
+
+        Raises:
+            TypeError, ValueError: naming the argument.
+        """
+        rows, columns, turn = (
+            check_array("zenith", zenith, (None,)),
+            check_array("azimuth", azimuth, (None,)),
+            2 * np.pi,
         )
-    return np.fft.rfft(gain, axis=-1).real.transpose(2, 0, 1).copy()
+        for name, angles, least in (("zenith", rows, 2), ("azimuth", columns, 3)):
+            if len(angles) < least or not (np.diff(angles) > 0).all():
+                raise ValueError(f"{name}: got {len(angles)} angles, expected {least} or more, rising [rad]")
+        step = np.diff(rows).max() * 1.001
+        if rows[0] < -1e-6 or rows[0] > step or rows[-1] > np.pi + 1e-6 or rows[-1] < np.pi - step:
+            raise ValueError(
+                f"zenith: got {rows[0]:g} to {rows[-1]:g}, expected 0 to pi (elevations: from the zenith down)"
+            )
+        if (
+            columns[-1] - columns[0] > turn + 1e-6
+            or turn - (columns[-1] - columns[0]) > np.diff(columns).max() * 1.001
+        ):
+            raise ValueError(
+                f"azimuth: got {columns[0]:g} to {columns[-1]:g}, expected angles all the way round, 2 pi; give a gain of 0 "
+                "where nothing is sent"
+            )
+        if (gain is None) == (field is None):
+            raise ValueError("gain: got both of gain and field or neither, expected one of them")
+        shape = len(rows), len(columns)
+        if field is None or gain is not None:
+            return cls(_Grid.of(rows, columns, check_array("gain", gain, shape)), polarisation)  # type: ignore[arg-type]
+        ports = check_array("field", field, dtype=complex)
+        ports = ports[None] if ports.ndim == 3 else ports
+        if ports.ndim != 4 or ports.shape[1:] != (*shape, 2) or not 1 <= len(ports) <= 2:
+            raise ValueError(
+                f"field: got shape {np.shape(field)}, expected {(*shape, 2)}, or that of one or two ports {('K', *shape, 2)}"
+            )
+        return cls(tuple(_Grid.of(rows, columns, port) for port in ports), polarisation)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], polarisation: str | None = None) -> Antenna:
+        """An antenna of an MSI Planet file (``.msi``, ``.pln``): a horizontal and a vertical cut of losses, and a gain.
+
+        The losses of both cuts add up in decibels, G = gain - H(azimuth) - V(elevation), as 3GPP TR 38.901, table 7.3-1, has
+        it of an element, the vertical cut being that of the front; between the angles of a cut they are interpolated linearly
+        in decibels. A file's azimuths run clockwise from above, its elevations down; a gain without a unit is in dBd. An electrical
+        tilt is in the cuts; a mechanical one is yours: ``turned((0, tilt_rad, 0))``.
+
+        Args:
+            path: the file.
+            polarisation: of the antenna; see :class:`Antenna`. The file's own word for it is not read.
+
+        Raises:
+            OSError: naming the file, if it cannot be read.
+            ValueError: naming file and line, if it is no such file, or damaged.
+        """
+        return cls(read_cuts(path), polarisation)
+
+    @cached_property
+    def rotation(self) -> np.ndarray:
+        """Rotation from its own axes, shape ``(3, 3)``."""
+        return check_rotation(self.orientation)
+
+    @cached_property
+    def _probed(self) -> tuple[bool, float]:
+        """Whether the pattern is one of fields, and the largest gain found over the sphere.
+
+        Raises:
+            ValueError: if it returns something else than gains or fields.
+        """
+        angles = angles_from_directions(pixel_directions((45, 90)).reshape(-1, 3))
+        ahead = angles_from_directions(directions_from_angles([0.5 * np.pi], [0.0]))
+        zenith, azimuth = (np.concatenate(pair) for pair in zip(ahead, angles, strict=True))
+        if isinstance(self.pattern, _OffBoresight):  # a narrow beam may lie between the directions
+            zenith, azimuth = np.full(3601, 0.5 * np.pi), np.linspace(0.0, np.pi, 3601)
+        found = [_evaluated(shape, zenith, azimuth) for shape in self._shapes]
+        fields = [port.ndim == zenith.ndim + 1 for port in found]
+        if any(fields) and self.polarisation is not None:
+            raise ValueError(
+                f"polarisation: got {self.polarisation!r} for a pattern of fields, which has its own; expected None"
+            )
+        if len(found) > 1 and not all(fields):
+            raise ValueError("pattern: got gains for one of several ports, expected pairs of fields for each")
+        gains = [
+            (np.abs(port) ** 2).sum(axis=-1) if of_fields else port
+            for port, of_fields in zip(found, fields, strict=True)
+        ]
+        if not max(g.max() for g in gains) > 0:
+            raise ValueError("pattern: got no gain in any direction, expected linear power gains")
+        return any(fields), float(np.mean(gains, axis=0).max())
+
+    @property
+    def _shapes(self) -> tuple[Shape, ...]:
+        if isinstance(self.pattern, str):
+            return (PATTERNS[self.pattern],)
+        return (self.pattern,) if callable(self.pattern) else tuple(self.pattern)
+
+    @property
+    def polarised(self) -> bool:
+        """Whether it has fields, so that it goes with Jones matrices; else it goes with powers."""
+        return self.polarisation is not None or self._probed[0]
+
+    @property
+    def ports(self) -> int:
+        """Number of ports."""
+        return len(self._shapes if self.polarisation is None else SLANTS_RAD[self.polarisation])
+
+    @property
+    def peak_gain(self) -> float:
+        """Its largest gain [linear], the mean over the ports, among directions a few degrees apart and along the boresight."""
+        return self._probed[1]
+
+    @cached_property
+    def efficiency(self) -> float:
+        """Mean of the gain over the sphere: power radiated over power accepted; 1 of a lossless antenna."""
+        node, weight = np.polynomial.legendre.leggauss(720)  # a beam of a degree takes a few of them
+        zenith, azimuth = np.meshgrid(np.arccos(node), (np.arange(1440) + 0.5) * np.pi / 720.0, indexing="ij")
+        gain = self.gain(directions_from_angles(zenith, azimuth) @ self.rotation.T)
+        return float(0.5 * weight @ gain.mean(axis=1))
+
+    def turned(self, orientation: ArrayLike) -> Antenna:
+        """The same antenna turned, with what it was turned by before: yaw, pitch and roll [rad], or a rotation ``(3, 3)``."""
+        return replace(self, orientation=check_rotation(orientation) @ self.rotation)
+
+    def unpolarised(self) -> Antenna:
+        """The same gain without polarisation, mean over the ports: for what reckons with powers, as beams and readings do."""
+        if not self.polarised:
+            return self
+        own: Shape | str = self.pattern if self.polarisation is not None else _GainOf(self._shapes)  # type: ignore[assignment]
+        return replace(self, pattern=own, polarisation=None)
+
+    def gain(self, directions: ArrayLike) -> np.ndarray:
+        """Power gain [linear] towards ``directions`` (..., 3) of any length, shape ``(...)``; the mean over the ports."""
+        local = check_array("directions", directions, (..., 3), finite=False) @ self.rotation
+        found = [_evaluated(shape, *angles_from_directions(local)) for shape in self._shapes]
+        gains = [(np.abs(port) ** 2).sum(axis=-1) if port.ndim == local.ndim else port for port in found]
+        return np.asarray(gains[0] if len(gains) == 1 else np.mean(gains, axis=0))
+
+    def field(self, directions: ArrayLike) -> np.ndarray:
+        """(F_theta, F_phi) along the zenith and azimuth unit vectors of unit vectors ``directions`` (..., 3).
+
+        Returns:
+            Shape ``(K, ..., 2)`` of K ports; real where no port's field is complex.
+
+        Raises:
+            ValueError: if nothing is known of its polarisation.
+        """
+        if not self.polarised:
+            raise ValueError(
+                f"polarisation: got None, expected {', '.join(SLANTS_RAD)}, or a pattern of fields"
+            )
+        world = check_array("directions", directions, (..., 3), finite=False)
+        local = world @ self.rotation
+        found = [_evaluated(shape, *angles_from_directions(local)) for shape in self._shapes]
+        if self.polarisation is not None:
+            slants = np.array(SLANTS_RAD[self.polarisation])
+            found = [np.sqrt(found[0])[..., None] * np.array([np.cos(z), np.sin(z)]) for z in slants]
+        turn = np.einsum(
+            "...ai,ij,...bj->...ab", transverse_basis(world), self.rotation, transverse_basis(local)
+        )
+        return np.stack([(turn @ port[..., None])[..., 0] for port in found])
+
+    def gain_off_boresight(self, angle: ArrayLike) -> np.ndarray:
+        """Power gain [linear] at ``angle`` off boresight [rad], shape as ``angle``, of an antenna that has no other angle.
+
+        Raises:
+            ValueError: for one whose gain is a function of two angles.
+        """
+        if not isinstance(self.pattern, _OffBoresight):
+            raise ValueError(
+                "pattern: got an antenna whose gain is a function of two angles, expected one that is the same all round its "
+                "boresight: a function of the angle off boresight, or samples of it from 0 to pi"
+            )
+        return self.pattern.at(check_array("angle", angle))
 
 
-def _angles_between(shape: tuple[int, int]) -> np.ndarray:
-    """Angle [rad] between the pixels of column 0 and all others, shape ``(H, H, W)``."""
-    rows, columns = check_shape(shape)
-    zenith = pixel_angles(shape)[0]
-    azimuth = np.arange(columns) * 2.0 * np.pi / columns
-    # Half the chord, not the cosine: it does not cancel for small angles.
-    half = (
-        np.sin(0.5 * (zenith[:, None] - zenith[None, :]))[..., None] ** 2
-        + np.sin(zenith)[:, None, None] * np.sin(zenith)[None, :, None] * np.sin(0.5 * azimuth) ** 2
-    )
-    return 2.0 * np.arcsin(np.sqrt(np.clip(half, 0.0, 1.0)))
+Pattern: TypeAlias = Antenna | str | Callable[[np.ndarray], ArrayLike] | Sequence[float] | np.ndarray
+"""An antenna; one of :data:`PATTERNS`; or power gain [linear] over the angle off boresight: a function of it [rad], or samples
+of it from 0 to pi."""
 
 
-def respond(path_gain: ArrayLike, kernel: np.ndarray) -> np.ndarray:
-    """What the scanned antenna measures of ``path_gain`` (..., H, W): power at each pixel it is steered to, same shape.
+def as_antenna(pattern: Pattern, polarisation: str | None = None, name: str = "pattern") -> Antenna:
+    """What is meant by a pattern; ``polarisation`` is that of a gain.
 
-    ``kernel`` is what :func:`scanned_kernel` returned. Exact on the grid: rows are convolved in azimuth by FFT.
+    Raises:
+        TypeError, ValueError: naming the argument by ``name``, if it is none; for a polarisation of what has one.
     """
-    image = np.asarray(path_gain, dtype=np.float64)
-    columns = image.shape[-1]
-    waves = np.moveaxis(np.fft.rfft(image.reshape(-1, *image.shape[-2:]), axis=-1), 0, -1).transpose(1, 0, 2)
-    waves = np.ascontiguousarray(waves)  # (W // 2 + 1, H, R), as pairs of real numbers below
-    turned = (kernel @ waves.view(np.float64)).view(np.complex128)
-    return np.fft.irfft(turned.transpose(2, 1, 0), n=columns, axis=-1).reshape(image.shape)
-
-
-def _deembed_scanned(
-    power: np.ndarray,
-    kernel: np.ndarray,
-    beam_sigma_rad: float,
-    scan: Scan,
-    progress: _device.Progress | None,
-) -> Deembedded:
-    """Spectra by this package's conventions from the powers that a steered antenna measured, ``(R, H, W)``."""
-    count, shape = len(power), check_shape(power.shape[1:])
-    directions = pixel_directions(shape).reshape(-1, 3)
-    path_gain, source = np.zeros(power.shape), np.full(power.shape, -1)
-    steps, misfit = np.zeros(count, dtype=int), np.zeros(count)
-    dynamic_range_db = 60.0  # what an estimate holds that far below its strongest direction is dropped [dB]
-    together = 32  # receivers whose estimates are refined at once
-    for first in range(0, count, together):
-        part = slice(first, min(first + together, count))
-        estimate, steps[part], misfit[part] = _richardson_lucy(power[part], kernel, scan)
-        for k, one in enumerate(estimate, start=first):
-            kept = np.where(one > one.max() * 10.0 ** (-dynamic_range_db / 10.0), one, 0.0)
-            if kept.any():
-                kept *= one.sum() / kept.sum()
-                path_gain[k], source[k] = spread_paths(
-                    directions, kept.reshape(-1), shape, beam_sigma_rad, device=scan.device
+    if isinstance(pattern, Antenna):
+        return pattern if polarisation is None else replace(pattern, polarisation=polarisation)
+    try:
+        if isinstance(pattern, str):
+            return Antenna(pattern, polarisation)
+        if not callable(pattern):
+            samples = check_array("pattern", pattern, finite=False)
+            if samples.ndim != 1 or len(samples) < 2:
+                raise ValueError(
+                    f"pattern: got shape {samples.shape}, expected an Antenna, a function of the angle off boresight, or "
+                    "samples (N,) of it from 0 to pi"
                 )
-            if progress is not None:
-                progress("deembed", k + 1, count)
-    return Deembedded(path_gain, source, steps, misfit, 1.0, SCANNED)
+            pattern = partial(_interpolated, samples)
+        return Antenna(_OffBoresight(pattern), polarisation)
+    except (TypeError, ValueError) as error:
+        raise type(error)(re.sub("^pattern:", f"{name}:", str(error))) from error
 
 
-def _richardson_lucy(
-    measured: np.ndarray, kernel: np.ndarray, scan: Scan
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Path gain per direction ``(R, H, W)``, steps ``(R,)`` and relative misfit ``(R,)``."""
-    weight = np.broadcast_to(pixel_solid_angles(measured.shape[1:])[:, None], measured.shape[1:])
-    back = respond(weight, kernel)  # what a path of unit gain adds to the weighted sum of the measurement
-    signed = (weight * (measured - scan.noise)).sum(axis=(1, 2))
-    # Uniform per solid angle to begin with: a pole's small pixels start with little.
-    estimate = weight / (weight * back).sum() * np.maximum(signed, 0.0)[:, None, None]
-    size = np.sqrt((weight * measured**2).sum(axis=(1, 2)))
-    goal = scan.tolerance * size
-    # The first steps only gather power where it is: they are safe whatever the noise, and never left out.
-    noisy_goal = np.maximum(goal, scan.noise / np.sqrt(scan.snapshots) * np.sqrt(weight.sum()))
-    steps, misfit = np.zeros(len(measured), dtype=int), np.where(size > 0, 1.0, 0.0)
-    before = np.full(len(measured), np.inf)
-    going = np.flatnonzero(signed > 0)
-    together = 50  # steps
-    for step in range(scan.iterations):
-        expected = np.maximum(respond(estimate[going], kernel), 0.0) + scan.noise
-        error = np.sqrt((weight * (measured[going] - expected) ** 2).sum(axis=(1, 2)))
-        misfit[going] = error / size[going]
-        left = error > (goal if step < together else noisy_goal)[going]
-        if step % together == 0:
-            left &= error < 0.99 * before[going]
-            before[going] = error
-        going, expected = going[left], expected[left]
-        if len(going) == 0:
-            break
-        ratio = np.divide(measured[going], expected, out=np.zeros(expected.shape), where=expected > 0)
-        estimate[going] *= np.maximum(respond(weight * ratio, kernel), 0.0) / back
-        if scan.noise > 0:  # the noise takes its share of each value only on average: hold the total
-            scale = signed[going] / (estimate[going] * back).sum(axis=(1, 2))
-            estimate[going] *= scale[:, None, None]
-        steps[going] = step + 1
-    return estimate, steps, misfit
+def turned_gain(antenna: Antenna, angles: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Power gain [linear] of an antenna turned to each of ``angles`` (D, 2), zenith and azimuth [rad], towards unit vectors
+    ``directions`` (K, 3), shape ``(D, K)``. What is turned is a level mount: yaw, then pitch, on which the antenna stands as
+    :attr:`Antenna.orientation` says."""
+    if isinstance(antenna.pattern, _OffBoresight) and antenna.rotation[0, 0] > 1.0 - 1e-15:  # rolled at most
+        cosine = directions_from_angles(*angles.T) @ directions.T
+        return antenna.pattern.at(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    turns = [rotation_matrix((azimuth, zenith - 0.5 * np.pi, 0.0)) for zenith, azimuth in angles]
+    found = [antenna.gain(directions @ turn) for turn in turns]
+    return np.reshape(found, (len(angles), len(directions)))
 
 
-def _deembed_fixed(power: np.ndarray, gain: np.ndarray, limit_db: float = 20.0) -> Deembedded:
-    """Spectra divided by the gain of an antenna that does not turn.
+def samples_of(antenna: Antenna) -> np.ndarray:
+    """Gains, or fields, by which one antenna is told from another: every half degree, or every twentieth off boresight."""
+    if isinstance(antenna.pattern, _OffBoresight) and not antenna.polarised:
+        return np.concatenate([antenna.pattern.at(np.linspace(0.0, np.pi, 3601)), antenna.rotation.ravel()])
+    directions = pixel_directions((360, 720)).reshape(-1, 3)
+    return antenna.field(directions) if antenna.polarised else antenna.gain(directions)
 
-    Directions in which the antenna is more than ``limit_db`` below its peak come out empty: dividing there would only
-    blow up noise and leakage. The total path gain is then that of the directions that are left.
+
+def rotation_matrix(orientation: ArrayLike) -> np.ndarray:
+    """Rotation from local to world axes of yaw, pitch and roll [rad]; 3GPP TR 38.901, eq. (7.1-4)."""
+    (ca, cb, cg), (sa, sb, sg) = np.cos(orientation), np.sin(orientation)
+    return np.array(
+        [
+            [ca * cb, ca * sb * sg - sa * cg, ca * sb * cg + sa * sg],
+            [sa * cb, sa * sb * sg + ca * cg, sa * sb * cg - ca * sg],
+            [-sb, cb * sg, cb * cg],
+        ]
+    )
+
+
+def check_rotation(orientation: ArrayLike) -> np.ndarray:
+    """The rotation (3, 3) of three angles or a matrix; ValueError or TypeError names ``orientation``."""
+    value = check_array("orientation", orientation)
+    if value.shape == (3,):
+        return rotation_matrix(value)
+    if value.shape != (3, 3) or not np.allclose(value @ value.T, np.eye(3), atol=1e-9):
+        raise ValueError(
+            f"orientation: got shape {value.shape}, expected three angles (3,) or a rotation (3, 3)"
+        )
+    if np.linalg.det(value) < 0:
+        raise ValueError(
+            "orientation: got a matrix of determinant -1, which mirrors the antenna; expected a rotation, of "
+            "determinant 1: turn one of its columns round"
+        )
+    return value
+
+
+def horn(width_rad: float, floor_db: float = -60.0) -> Antenna:
+    """A horn whose gain is Gaussian in the angle off boresight, lossless.
+
+    Args:
+        width_rad: full width at half maximum [rad], at most 2 pi / 3, that of the widest; a larger number is one in degrees.
+        floor_db: of the side lobes below the peak [dB].
+
+    Raises:
+        ValueError: for other numbers.
     """
-    check_positive("limit_db", limit_db, "number of decibels")
-    known = gain >= gain.max() * 10.0 ** (-limit_db / 10.0)
-    path_gain = np.divide(power, gain, out=np.zeros(power.shape), where=known)
-    source = np.where(path_gain > 0, np.arange(gain.size).reshape(gain.shape), -1)
-    weight = pixel_solid_angles(gain.shape)[:, None]
-    covered = float((weight * known).sum() / (weight * np.ones_like(gain)).sum())
-    none = np.zeros(len(power))
-    return Deembedded(path_gain, source, none.astype(int), none, covered, FIXED)
+    width, low = check_positive("width_rad", width_rad), check_number("floor_db", floor_db, -200.0, 0.0)
+    if width > 2.0 * np.pi / 3.0:
+        raise ValueError(
+            f"width_rad: got {width:g}, expected radians, at most 2.09: "
+            f"horn(np.radians({width:g})) is {width:g} degrees wide"
+        )
+    angle = np.linspace(0.0, np.pi, 20_001)
+    mean = 0.5 * np.trapezoid(_horn_gain(width, low, 1.0, angle) * np.sin(angle), angle)
+    return Antenna(_OffBoresight(partial(_horn_gain, width, low, mean)))
 
 
-def sample_pattern(pattern: Pattern, angle: np.ndarray) -> np.ndarray:
-    """The pattern at ``angle`` [rad], shape as ``angle``."""
-    if callable(pattern):
-        gain = check_array("pattern", pattern(angle), finite=False)
+def main_lobe(antenna: Antenna) -> Antenna:
+    """The gain of ``antenna`` without side lobes: nothing beyond where it first stops falling, from the boresight out, below half
+    of its peak."""
+    angle = np.linspace(0.0, np.pi, 3601)
+    if isinstance(antenna.pattern, _OffBoresight):
+        end = _flank_end(angle, antenna.pattern.at(angle), antenna.pattern.at(angle).max())
+        return replace(
+            antenna, pattern=_OffBoresight(partial(_up_to, antenna.pattern.gain, end)), polarisation=None
+        )
+    own = replace(antenna.unpolarised(), orientation=(0.0, 0.0, 0.0))
+    around = np.linspace(-np.pi, np.pi, 73)
+    gain = own.gain(_off_boresight_directions(angle[:, None], around))
+    ends = np.array([_flank_end(angle, row, gain.max()) for row in gain.T])
+    return replace(antenna, pattern=_MainLobe(own, around, ends), polarisation=None)
+
+
+# ------------------------------------------------------------------------------------------------------- patterns
+
+
+def _isotropic(zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    return np.ones(zenith.shape)
+
+
+def _dipole(zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    return np.asarray(1.5 * np.sin(zenith) ** 2)
+
+
+def _half_wave_dipole(zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    sine = np.sin(zenith)
+    steep = sine > 1e-9  # the limit along the axis is zero
+    field = np.where(steep, np.cos(0.5 * np.pi * np.cos(zenith)) / np.where(steep, sine, 1.0), 0.0)
+    return np.asarray(1.643 * field**2)
+
+
+def _tr38901(zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    width = np.deg2rad(65.0)  # TR 38.901, table 7.3-1
+    vertical = -np.minimum(12.0 * ((zenith - 0.5 * np.pi) / width) ** 2, 30.0)
+    horizontal = -np.minimum(12.0 * (azimuth / width) ** 2, 30.0)
+    return np.asarray(10.0 ** (0.1 * (8.0 - np.minimum(-(vertical + horizontal), 30.0))))
+
+
+PATTERNS: dict[str, Shape] = {
+    "isotropic": _isotropic, "dipole": _dipole, "half_wave_dipole": _half_wave_dipole, "tr38901": _tr38901,
+}  # fmt: skip
+"""Power gains by name."""
+
+
+@dataclass(frozen=True, eq=False)
+class _OffBoresight:
+    """A gain over the angle off boresight alone."""
+
+    gain: Callable[[np.ndarray], ArrayLike]
+
+    def __call__(self, zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+        x, y, z = np.moveaxis(directions_from_angles(zenith, azimuth), -1, 0)
+        return self.at(np.arctan2(np.hypot(y, z), x))
+
+    def at(self, angle: np.ndarray) -> np.ndarray:
+        """The gain at ``angle`` [rad], shape as ``angle``."""
+        gain = check_array("pattern", self.gain(angle), finite=False)
         if gain.shape not in ((), angle.shape):
             raise ValueError(f"pattern: got shape {gain.shape} for angles {angle.shape}, expected the same")
-        return np.broadcast_to(gain, angle.shape)
-    samples = check_array("pattern", pattern, finite=False)
-    if samples.ndim != 1 or len(samples) < 2:
-        raise ValueError(
-            f"pattern: got shape {samples.shape}, expected a function of the angle, samples (N,) from 0 to pi, or a "
-            "gain for each pixel (H, W)"
+        return _checked_gain(np.broadcast_to(gain, angle.shape), angle)
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Values ``(T, P, ...)`` at zeniths (T,) and azimuths (P,), the last of which repeats the first."""
+
+    zenith: np.ndarray
+    azimuth: np.ndarray
+    values: np.ndarray
+
+    @classmethod
+    def of(cls, zenith: np.ndarray, azimuth: np.ndarray, values: np.ndarray) -> _Grid:
+        if azimuth[-1] - azimuth[0] < 2.0 * np.pi - 1e-6:
+            azimuth = np.append(azimuth, azimuth[0] + 2.0 * np.pi)
+            values = np.concatenate([values, values[:, :1]], axis=1)
+        return cls(zenith, azimuth, values)
+
+    def __call__(self, zenith: np.ndarray, azimuth: np.ndarray) -> Any:
+        row, down = _place(self.zenith, zenith)
+        column, across = _place(
+            self.azimuth, self.azimuth[0] + np.mod(azimuth - self.azimuth[0], 2.0 * np.pi)
         )
+        if self.values.ndim > 2:
+            down, across = down[..., None], across[..., None]
+        v = self.values
+        upper = (1.0 - across) * v[row, column] + across * v[row, column + 1]
+        lower = (1.0 - across) * v[row + 1, column] + across * v[row + 1, column + 1]
+        found = (1.0 - down) * upper + down * lower
+        return found if v.ndim == 2 else (found[..., 0], found[..., 1])
+
+
+def _place(grid: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Interval of ``grid`` that each angle lies in, and its share of it; NaN stays NaN."""
+    known = np.where(np.isnan(angle), grid[0], np.clip(angle, grid[0], grid[-1]))
+    first = np.clip(np.searchsorted(grid, known, side="right") - 1, 0, len(grid) - 2)
+    return first, np.where(np.isnan(angle), np.nan, (known - grid[first]) / (grid[first + 1] - grid[first]))
+
+
+@dataclass(frozen=True, eq=False)
+class _GainOf:
+    """Mean gain of ports of fields."""
+
+    ports: tuple[Shape, ...]
+
+    def __call__(self, zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+        gains = [(np.abs(_evaluated(port, zenith, azimuth)) ** 2).sum(axis=-1) for port in self.ports]
+        return np.asarray(np.mean(gains, axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class _MainLobe:
+    """The gain of an antenna up to ends (A,) off boresight at the angles ``around`` it (A,)."""
+
+    antenna: Antenna
+    around: np.ndarray
+    end: np.ndarray
+
+    def __call__(self, zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+        d = directions_from_angles(zenith, azimuth)
+        end = np.interp(np.arctan2(d[..., 2], d[..., 1]), self.around, self.end)
+        off = np.arctan2(np.hypot(d[..., 1], d[..., 2]), d[..., 0])
+        return np.where(off <= end, self.antenna.gain(d), 0.0)
+
+
+def _off_boresight_directions(angle: np.ndarray, around: np.ndarray) -> np.ndarray:
+    """Directions at ``angle`` off +x, turned ``around`` it from +y to +z, shape ``(..., 3)``."""
+    y, z = np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around)
+    return np.stack(np.broadcast_arrays(np.cos(angle), y, z), axis=-1)
+
+
+def _flank_end(angle: np.ndarray, gain: np.ndarray, peak: float) -> float:
+    flank = np.arange(len(gain) - 1) >= gain.argmax()
+    past = np.flatnonzero(flank & (gain[:-1] < 0.5 * peak) & (np.diff(gain) >= 0))
+    return float(angle[past[0]]) if len(past) else np.pi
+
+
+def _up_to(gain: Callable[[np.ndarray], ArrayLike], end: float, angle: np.ndarray) -> np.ndarray:
+    return np.where(angle <= end, gain(angle), 0.0)
+
+
+def _horn_gain(width: float, floor_db: float, mean: float, angle: ArrayLike) -> np.ndarray:
+    lobe = np.exp(-4.0 * np.log(2.0) * (np.asarray(angle) / width) ** 2)
+    return np.maximum(lobe, 10.0 ** (floor_db / 10.0)) / mean
+
+
+def _interpolated(samples: np.ndarray, angle: np.ndarray) -> np.ndarray:
     return np.interp(angle, np.linspace(0.0, np.pi, len(samples)), samples)
 
 
-def _gains(gain: np.ndarray, boresight_gain_dbi: float | None) -> np.ndarray:
-    if not np.isfinite(gain).all() or (gain < 0).any():
+def _checked_gain(gain: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Gains that are none are refused; those at unknown angles (NaN) are unknown."""
+    if not np.isfinite(gain[np.isfinite(angle)]).all() or (gain < 0).any():
         raise ValueError("pattern: got negative, NaN or infinite gains, expected linear power gains")
-    if not gain.max() > 0:
-        raise ValueError("pattern: got a gain of zero in all directions, expected linear power gains")
-    if boresight_gain_dbi is None:
-        return gain
-    largest_gain_dbi = 100.0  # an aperture of ten thousand wavelengths
-    peak_db = check_number("boresight_gain_dbi", boresight_gain_dbi, -largest_gain_dbi, largest_gain_dbi)
-    return gain / gain.max() * 10.0 ** (peak_db / 10.0)
+    return gain
+
+
+def _evaluated(shape: Shape, zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    """Gains, shape as ``zenith``, or fields ``(..., 2)``."""
+    found = shape(zenith, azimuth)
+    if isinstance(found, tuple | list):
+        if len(found) != 2:
+            raise ValueError(f"pattern: got {len(found)} fields, expected two, along zenith and azimuth")
+        pair = [
+            np.broadcast_to(check_array("pattern", f, dtype=complex, finite=False), zenith.shape)
+            for f in found
+        ]
+        field = np.stack(pair, axis=-1)
+        if not np.isfinite(field[np.isfinite(zenith)]).all():
+            raise ValueError("pattern: got NaN or infinite fields, expected finite ones")
+        return field if np.iscomplexobj(found[0]) or np.iscomplexobj(found[1]) else field.real
+    gain = check_array("pattern", found, finite=False)
+    if gain.shape not in ((), zenith.shape):
+        raise ValueError(f"pattern: got shape {gain.shape} for angles {zenith.shape}, expected the same")
+    return _checked_gain(np.broadcast_to(gain, zenith.shape), zenith)

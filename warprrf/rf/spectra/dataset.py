@@ -17,7 +17,8 @@ from warprrf.device import DeviceLike
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra import dataset_files
-from warprrf.rf.spectra.antenna import Pattern, deembed
+from warprrf.rf.spectra.antenna import Pattern
+from warprrf.rf.spectra.deembedding import deembed
 from warprrf.rf.spectra.levels import free_space_gain, question_levels
 from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
@@ -398,15 +399,15 @@ class SpectrumDataset:
         """These spectra without the antenna that measured them.
 
         A *scanned* antenna was steered to every pixel centre, and a pixel holds what it received there over what was
-        transmitted: path gain times antenna gain, summed over all directions. ``pattern`` is then its power gain over
-        the angle off boresight [rad]: a function, or samples ``(N,)`` from 0 to pi, both included. The result is
-        spread by ``beam_sigma_rad``, and its sum is the total path gain between isotropic antennas: that of
-        ``sum over pixels of (value - noise) times solid angle / integral of the pattern over the sphere``; a spectrum
-        of which noise leaves nothing comes out empty.
+        transmitted: path gain times antenna gain, summed over all directions. ``pattern`` is then an antenna whose gain
+        is one over the angle off boresight [rad] (:func:`horn`), a function of it, or samples ``(N,)`` from 0 to pi, both
+        included. The result is spread by ``beam_sigma_rad``, and its sum is the total path gain between isotropic
+        antennas: that of ``sum over pixels of (value - noise) times solid angle / integral of the pattern over the
+        sphere``; a spectrum of which noise leaves nothing comes out empty.
 
         A *fixed* antenna did not turn, and directions were distinguished otherwise. ``pattern`` is then its gain in each
-        pixel's direction, ``(H, W)``: pixels are divided by it. Where it lies more than ``limit_db`` below its peak
-        nothing is known: those pixels become empty, and the sum is that of the others.
+        pixel's direction, ``(H, W)`` (:meth:`Antenna.gain`): pixels are divided by it. Where it lies more than
+        ``limit_db`` below its peak nothing is known: those pixels become empty, and the sum is that of the others.
 
         Delay and angle of departure are those measured in the direction that gives a pixel most of its power. The
         floor and range are chosen anew; attributes ``deembedded...`` say what was done.

@@ -23,8 +23,8 @@ from scipy.ndimage import uniform_filter
 
 from warprrf.checks import check_alike, check_array, check_number, checked
 from warprrf.device import Progress
-from warprrf.rf.spectra.antenna import respond, scanned_kernel
 from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.deembedding import respond, scanned_kernel
 from warprrf.rf.spectra.spectrum import (
     NARROWEST_BEAM_RAD,
     Spectrum,

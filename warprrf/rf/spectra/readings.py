@@ -13,7 +13,6 @@ import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
@@ -36,9 +35,8 @@ from warprrf.checks import (
 )
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import NEPER, check_frequency
-from warprrf.rf.spectra.antenna import Pattern, sample_pattern
+from warprrf.rf.spectra.antenna import Antenna, Pattern, as_antenna, main_lobe, turned_gain
 from warprrf.rf.spectra.levels import FADING_DB, MARGIN_DB, free_space_gain, question_levels
-from warprrf.rf.spectra.spectrum import directions_from_angles
 
 COLUMNS = {
     "transmitter": ("tx_x", "tx_y", "tx_z"),
@@ -112,8 +110,10 @@ class Readings(PowerTable):
         arrival: zenith and azimuth [rad] that the receiving antenna is turned to, shape ``(N, 2)``; None for an isotropic
             one.
         departure: those of the transmitting antenna.
-        receive_pattern, transmit_pattern: gain of those antennas [linear] over the angle off boresight: a function of
-            angles [rad], or samples from 0 to pi. :func:`horn` makes one.
+        receive_pattern, transmit_pattern: those antennas, of one port: an :class:`Antenna`, such as a :func:`horn`, or its gain
+            [linear] over the angle off boresight: a function of angles [rad], or samples from 0 to pi. It is turned by yaw and
+            pitch; what else it is turned by on its mount is its own :attr:`Antenna.orientation`. Powers hold both polarisations, so
+            only its gain counts.
         delay_s: delay of the tap that a reading is [s], shape ``(N,)``; None where all delays are received together.
         bandwidth_hz: of the sounder, for taps.
         window: of its frequency response: ``"rectangular"`` or ``"hann"``.
@@ -169,7 +169,7 @@ class Readings(PowerTable):
                 raise ValueError(f"{pattern}: got one of it and {turned}; expected both or neither")
             if value is not None:
                 fields[turned] = check_turned(turned, value, count)
-                check_gains(pattern, gain)
+                fields[pattern] = antenna_of(pattern, gain)
         if (self.delay_s is None) != (self.bandwidth_hz is None):
             raise ValueError("bandwidth_hz: got one of it and delay_s; expected both or neither")
         if self.delay_s is not None:
@@ -211,7 +211,9 @@ class Readings(PowerTable):
     def without_side_lobes(self) -> Readings:
         """The same of antennas with nothing but their main lobes; see :func:`main_lobe`."""
         names = ("receive_pattern", "transmit_pattern")
-        cut: dict[str, Any] = {name: main_lobe(p) for name in names if (p := getattr(self, name)) is not None}
+        cut: dict[str, Any] = {
+            name: main_lobe(as_antenna(p)) for name in names if (p := getattr(self, name)) is not None
+        }
         return replace(self, **cut)
 
     @classmethod
@@ -317,7 +319,7 @@ def question_readings(readings: Readings) -> None:
     r, gain_db, known = readings, 0.0, readings.chain == ""
     for pattern in (r.receive_pattern, r.transmit_pattern):
         if pattern is not None:
-            gain_db += 10.0 * np.log10(sample_pattern(pattern, np.linspace(0.0, np.pi, 721)).max())
+            gain_db += 10.0 * np.log10(as_antenna(pattern).peak_gain)
     free_space = np.minimum(
         free_space_gain(r.transmitters, r.receivers, r.frequency_hz) * 10.0 ** (gain_db / 10.0), 1.0
     )
@@ -434,50 +436,10 @@ def _path_weights(
     ):
         if turned is not None and pattern is not None:
             once, own = np.unique(turned[rows], axis=0, return_inverse=True)
-            cosine = directions_from_angles(*once.T) @ path.T
-            weight *= sample_pattern(pattern, np.arccos(np.clip(cosine, -1.0, 1.0)))[own.reshape(-1)]
+            weight *= turned_gain(as_antenna(pattern), once, path)[own.reshape(-1)]
     if r.delay_s is not None and r.bandwidth_hz is not None:
         weight *= _tap(r.bandwidth_hz * (r.delay_s[rows, None] - delay_s), r.window)
     return weight
-
-
-def horn(width_rad: float, floor_db: float = -60.0) -> Pattern:
-    """Gain of a horn over the angle off boresight: Gaussian in the angle, lossless.
-
-    Args:
-        width_rad: full width at half maximum [rad], at most 2 pi / 3, that of the widest; a larger number is one in degrees.
-        floor_db: of the side lobes below the peak [dB].
-
-    Raises:
-        ValueError: for other numbers.
-    """
-    width, low = check_positive("width_rad", width_rad), check_number("floor_db", floor_db, -200.0, 0.0)
-    if width > 2.0 * np.pi / 3.0:
-        raise ValueError(
-            f"width_rad: got {width:g}, expected radians, at most 2.09: "
-            f"horn(np.radians({width:g})) is {width:g} degrees wide"
-        )
-    angle = np.linspace(0.0, np.pi, 20_001)
-    mean = 0.5 * np.trapezoid(_horn_gain(width, low, 1.0, angle) * np.sin(angle), angle)
-    return partial(_horn_gain, width, low, mean)
-
-
-def main_lobe(pattern: Pattern) -> Pattern:
-    """``pattern`` without side lobes: nothing beyond where it first stops falling below half of its peak."""
-    angle = np.linspace(0.0, np.pi, 3601)
-    gain = sample_pattern(pattern, angle)
-    flank = np.arange(len(gain) - 1) >= gain.argmax()
-    past = np.flatnonzero(flank & (gain[:-1] < 0.5 * gain.max()) & (np.diff(gain) >= 0))
-    return partial(_up_to, pattern, float(angle[past[0]]) if len(past) else np.pi)
-
-
-def _up_to(pattern: Pattern, end: float, angle: np.ndarray) -> np.ndarray:
-    return np.where(angle <= end, sample_pattern(pattern, angle), 0.0)
-
-
-def _horn_gain(width: float, floor_db: float, mean: float, angle: ArrayLike) -> np.ndarray:
-    lobe = np.exp(-4.0 * np.log(2.0) * (np.asarray(angle) / width) ** 2)
-    return np.maximum(lobe, 10.0 ** (floor_db / 10.0)) / mean
 
 
 def check_turned(name: str, value: ArrayLike, count: int) -> np.ndarray:
@@ -493,11 +455,14 @@ def check_turned(name: str, value: ArrayLike, count: int) -> np.ndarray:
     return angles
 
 
-def check_gains(name: str, pattern: Pattern) -> None:
-    """Raise ValueError, naming the argument, unless a pattern holds gains, some above zero."""
-    gain = sample_pattern(pattern, np.linspace(0.0, np.pi, 721))
-    if not np.isfinite(gain).all() or (gain < 0).any() or not gain.max() > 0:
-        raise ValueError(f"{name}: got negative, NaN, infinite or no gains; expected linear power gains")
+def antenna_of(name: str, pattern: Pattern) -> Antenna:
+    """The antenna that readings are taken with; ValueError or TypeError names the argument if it is none, or of several ports."""
+    found = as_antenna(pattern, name=name)
+    if found.ports > 1:
+        raise ValueError(
+            f"{name}: got an antenna of {found.ports} ports, expected one of a single port (Antenna.unpolarised())"
+        )
+    return found
 
 
 def _tap(place: np.ndarray, window: str) -> np.ndarray:

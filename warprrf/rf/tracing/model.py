@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import block_diag, bsr_matrix, csr_matrix, identity
 
 from warprrf.checks import Expected, check_array, check_arrays, check_count, check_number, check_type, checked
-from warprrf.kernels.radio.records import EXCESS, MIRRORED, THROUGH
+from warprrf.kernels.radio.records import EXCESS_COLUMN, MIRRORED_COLUMN, THROUGH_COLUMN
 from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.em.materials import NARROWEST_LOBE
 
@@ -258,15 +258,15 @@ class Layout:
 
     def excess(self, group: np.ndarray) -> np.ndarray:
         """Places of the permittivity of each of ``group``."""
-        return self.stride * group + self.lobes + EXCESS
+        return self.stride * group + self.lobes + EXCESS_COLUMN
 
     def mirror(self, group: np.ndarray) -> np.ndarray:
         """Places of the mirror share of each of ``group``."""
-        return self.stride * group + self.lobes + MIRRORED
+        return self.stride * group + self.lobes + MIRRORED_COLUMN
 
     def let_through(self, group: np.ndarray) -> np.ndarray:
         """Places of what each of ``group`` lets through, if that is free."""
-        return self.stride * group + self.lobes + THROUGH
+        return self.stride * group + self.lobes + THROUGH_COLUMN
 
     def columns(self, groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where the parameters of each group begin in a table of those of ``groups`` alone, shape ``(G,)`` int32, and the places of
@@ -278,7 +278,7 @@ class Layout:
 
     def pack(self, p: Parameters) -> np.ndarray:
         """Vector of ``p``."""
-        columns = {EXCESS: p.log_excess, MIRRORED: p.log_mirror, THROUGH: p.log_through}
+        columns = {EXCESS_COLUMN: p.log_excess, MIRRORED_COLUMN: p.log_mirror, THROUGH_COLUMN: p.log_through}
         shown = [columns[k] for k in range(self.stride - self.lobes)]
         table = np.column_stack([p.log_weight, *shown]).ravel()
         single = [p.log_gain] * self.gain + [p.roughness] * self.roughness
@@ -287,8 +287,8 @@ class Layout:
     def unpack(self, vector: np.ndarray, like: Parameters) -> Parameters:
         """Parameters of a vector; what it does not hold is as in ``like``."""
         table = vector[: self.groups * self.stride].reshape(self.groups, self.stride)
-        excess, mirror = (table[:, self.lobes + k].copy() for k in (EXCESS, MIRRORED))
-        through = table[:, self.lobes + THROUGH].copy() if self.through else like.log_through
+        excess, mirror = (table[:, self.lobes + k].copy() for k in (EXCESS_COLUMN, MIRRORED_COLUMN))
+        through = table[:, self.lobes + THROUGH_COLUMN].copy() if self.through else like.log_through
         return replace(
             like, log_through=through, log_weight=table[:, : self.lobes].copy(), log_excess=excess,
             log_mirror=mirror, log_gains=vector[self.first_chain :].copy(),
@@ -299,7 +299,7 @@ class Layout:
     def slopes_at_ratio(self, p: Parameters, ratio: float) -> csr_matrix:
         """Derivatives of the vector of ``p.at_ratio(ratio)`` (rows) to that of ``p`` (columns)."""
         weight, mirror, n = p.weight, np.exp(p.log_mirror), self.lobes
-        mirrored = n + MIRRORED
+        mirrored = n + MIRRORED_COLUMN
         scattered = weight.sum(axis=1)
         both = scattered + mirror
         share, own = np.zeros((2, self.groups, self.stride))  # of ln both, and of ln mirror

@@ -19,8 +19,9 @@ from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.gauss_newton import Problem
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, WeighedPaths, read
 from warprrf.rf.fields.bistatic.observations import OWN_GAIN, observe, places_of
+from warprrf.rf.spectra.antenna import horn
 from warprrf.rf.spectra.beam import BeamOperator
-from warprrf.rf.spectra.readings import Readings, horn, path_weights
+from warprrf.rf.spectra.readings import Readings, path_weights
 from warprrf.rf.tracing.interreflection import irradiance
 from warprrf.rf.tracing.model import SETS, Effects, Layout
 from warprrf.rf.tracing.records import Bins, Materials

@@ -13,9 +13,10 @@ from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import training
 from warprrf.rf.fields.bistatic.observations import Target
 from warprrf.rf.positions import is_free
+from warprrf.rf.spectra.antenna import horn
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import evaluate
-from warprrf.rf.spectra.readings import COLUMNS, Readings, horn, path_weights
+from warprrf.rf.spectra.readings import COLUMNS, Readings, path_weights
 from warprrf.rf.spectra.spectrum import directions_from_angles
 from warprrf.rf.tracing.model import SETS
 
@@ -40,7 +41,7 @@ def horn_readings(scene, side_lobes_db):
     seen = directions_from_angles(zenith.ravel(), azimuth.ravel())
     pointing = np.array([(z, a) for z in (np.pi / 2, 2.0) for a in np.radians(np.arange(-180, 180, 20))])
     angle = np.arccos(np.clip(directions_from_angles(*pointing.T) @ seen.T, -1.0, 1.0))
-    gain = horn(WIDTH, side_lobes_db)(angle)
+    gain = horn(WIDTH, side_lobes_db).gain_off_boresight(angle)
     power = np.stack([gain @ engine.receive(r).path_gain.ravel() for r in RECEIVERS[:6]])
     floor = np.repeat(power.max(axis=1) * 1e-3, len(pointing)) * 10 ** (CHAIN_DB / 10)
     return Readings(
@@ -287,9 +288,9 @@ def test_a_reading_weighs_paths_by_directions_and_delay():
 def test_a_horn_of_a_width_is_lossless():
     angle = np.linspace(0, np.pi, 100_001)
     for width in (0.05, 0.5, 2.0):
-        gain = horn(width)(angle)
+        gain = horn(width).gain_off_boresight(angle)
         assert 0.5 * np.trapezoid(gain * np.sin(angle), angle) == pytest.approx(1.0, rel=1e-3)
-        assert horn(width)(np.array([width / 2]))[0] == pytest.approx(0.5 * gain[0], rel=1e-3)
+        assert horn(width).gain_off_boresight([width / 2])[0] == pytest.approx(0.5 * gain[0], rel=1e-3)
     with pytest.raises(ValueError, match=r"width_rad: got 10, expected radians.*np\.radians"):
         horn(10)
 

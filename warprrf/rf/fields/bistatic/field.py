@@ -71,8 +71,8 @@ from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.antenna import Pattern
 from warprrf.rf.spectra.beam import BeamOperator, beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.readings import check_gains, check_turned
-from warprrf.rf.spectra.spectrum import Spectrum, default_floor, directions_from_angles, to_db
+from warprrf.rf.spectra.readings import antenna_of, check_turned
+from warprrf.rf.spectra.spectrum import Spectrum, default_floor, to_db
 from warprrf.rf.tracing.model import ARRAYS as PARAMETER_ARRAYS
 from warprrf.rf.tracing.model import MOST_NEPERS, SETS, Effects, Layout, Model, Parameters
 from warprrf.rf.tracing.records import Materials
@@ -543,9 +543,8 @@ class BistaticField(RadioField):
                 "receive_pattern: it goes with arrival, got one of the two; expected both or neither"
             )
         if arrival is not None and receive_pattern is not None:
-            check_gains("receive_pattern", receive_pattern)
             angles = check_turned("arrival", arrival, len(places))
-            pointings = Pointings(directions_from_angles(*angles.T), receive_pattern)
+            pointings = Pointings(angles, antenna_of("receive_pattern", receive_pattern))
         sensitivity, unknowns = self._sensitivity(self.transmitter)
         return suggest(
             sensitivity, unknowns, places, n, measured=self.fitted_on, pointings=pointings, progress=progress

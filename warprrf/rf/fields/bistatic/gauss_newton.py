@@ -32,16 +32,16 @@ from warprrf.rf.tracing.records import Materials, Records
 from warprrf.rf.tracing.render import materials_of
 from warprrf.rf.tracing.tracer import SPECULAR
 
-WEIGHT, EXCESS, MIRROR = 2.0, 0.8, 1.5
+WEIGHT_STD, EXCESS_STD, MIRROR_STD = 2.0, 0.8, 1.5
 """Standard deviations a priori of lobe weights, permittivity less one and mirrored share from where a fit starts [nepers]."""
-THROUGH, KNOWN_THROUGH = 1.5, 0.02
+THROUGH_STD, KNOWN_THROUGH_STD = 1.5, 0.02
 """Those of the share let through from what it is before any measurement: where that is assumed, and of a slab of known thickness
 and permittivity. The latter is small because hundreds of pixels hold one path and err together."""
-ENERGY = 0.25
+ENERGY_STD = 0.25
 """That of scattered and mirrored shares from a sum of one."""
-GAIN, CHAIN = 1.0, 10.0
+GAIN_STD, CHAIN_STD = 1.0, 10.0
 """Those of the common gain and of a measuring chain's unknown gain from one [nepers]."""
-CARRIER = 1.0
+CARRIER_STD = 1.0
 """That of the power of the carrier that roughness goes with, from Ament's 2."""
 LONGEST = 1.5  # change of a logarithm in one step
 TOLERANCE = 1e-3  # relative fall of the objective that ends a fit
@@ -69,7 +69,7 @@ class Problem:
     material: np.ndarray
     chains: int = 0
     gain_offset: bool = False
-    energy: float = ENERGY
+    energy: float = ENERGY_STD
     known_through: np.ndarray | None = None
 
     @classmethod
@@ -221,20 +221,26 @@ def priors(
         rows.append(block)
 
     for j, places in enumerate(layout.weight(own).T):
-        add((p.log_weight[:, j] - start.log_weight[:, j]) / WEIGHT, places, 1.0 / WEIGHT)
-    add((p.log_excess - start.log_excess) / EXCESS, layout.excess(own), 1.0 / EXCESS)
-    add((p.log_mirror - start.log_mirror) / MIRROR, layout.mirror(own), 1.0 / MIRROR)
+        add((p.log_weight[:, j] - start.log_weight[:, j]) / WEIGHT_STD, places, 1.0 / WEIGHT_STD)
+    add((p.log_excess - start.log_excess) / EXCESS_STD, layout.excess(own), 1.0 / EXCESS_STD)
+    add((p.log_mirror - start.log_mirror) / MIRROR_STD, layout.mirror(own), 1.0 / MIRROR_STD)
     if layout.through:
         centre, std = (
-            (start.log_through, np.full(layout.groups, THROUGH)) if known_through is None else known_through
+            (start.log_through, np.full(layout.groups, THROUGH_STD))
+            if known_through is None
+            else known_through
         )
         add((p.log_through - centre) / std, layout.let_through(own), 1.0 / std[:, None])
     if layout.gain:
-        add(np.array([p.log_gain / GAIN]), np.array([layout.common_gain]), 1.0 / GAIN)
+        add(np.array([p.log_gain / GAIN_STD]), np.array([layout.common_gain]), 1.0 / GAIN_STD)
     if layout.roughness:
-        add(np.array([(p.roughness - ROUGHNESS) / CARRIER]), np.array([layout.carrier_power]), 1.0 / CARRIER)
+        add(
+            np.array([(p.roughness - ROUGHNESS) / CARRIER_STD]),
+            np.array([layout.carrier_power]),
+            1.0 / CARRIER_STD,
+        )
     if layout.chains:
-        add(p.log_gains / CHAIN, layout.first_chain + np.arange(layout.chains), 1.0 / CHAIN)
+        add(p.log_gains / CHAIN_STD, layout.first_chain + np.arange(layout.chains), 1.0 / CHAIN_STD)
     shares = np.column_stack([p.weight, np.exp(p.log_mirror)])  # S^2 by lobes, and 1 - S^2
     places = np.column_stack([layout.weight(own), layout.mirror(own)])
     add((shares.sum(axis=1) - 1.0) / energy, places, shares / energy)

@@ -18,7 +18,7 @@ import numpy as np
 from warprrf.cache import cached_property
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
-from warprrf.kernels.radio.records import EXCESS, MIRROR, MIRRORED, THROUGH
+from warprrf.kernels.radio.records import EXCESS_COLUMN, MIRROR, MIRRORED_COLUMN, THROUGH_COLUMN
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.fresnel import fresnel_curves
@@ -38,7 +38,7 @@ from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings, fading_db, path_weights, question_readings
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, to_db
 from warprrf.rf.tracing.model import SETS, Effects, Layout, Model, Parameters
-from warprrf.rf.tracing.records import Bins, Materials, Records
+from warprrf.rf.tracing.records import Bins, Materials
 from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.tracer import SPECULAR, View
 
@@ -251,7 +251,9 @@ class Observation:
         own, count = self.ray_bins
         surface = self.view.tracer.surface
         group, bins, power = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0)]
-        for records in self.further_tables(effects):
+        for name, records in self.view.traced(effects).items():
+            if name in ("S", SPECULAR):
+                continue
             group.append(records.rough_groups(surface.side_group))
             bins.append(own[records.ray])
             power.append(records.powers(materials))
@@ -264,11 +266,6 @@ class Observation:
         return found, np.maximum(
             self.measured.of_bins(table.astype(np.float32), quick=True).T, 0.0
         ) / np.float32(self.floor)
-
-    def further_tables(self, effects: Effects) -> list[Records]:
-        """Of paths over more than one surface, at least one of which scatters."""
-        single = self.view.traced(SETS["single"])
-        return [table for name, table in self.view.traced(effects).items() if name not in single]
 
     def direct(self, effects: Effects, materials: Materials, power: np.ndarray) -> np.ndarray:
         """Readings of line of sight and mirrors of ``power`` (L,) in units of the floor, shape ``(N,)``."""
@@ -308,8 +305,8 @@ class Observation:
             )
             for path, mirror in zip(*np.nonzero(specular.index >= 0), strict=True):
                 at = place[materials.material[specular.index[path, mirror]]] + len(p.lobes)
-                rise[path, at + EXCESS] += slope[path, mirror]
-                share = MIRRORED if specular.kind[path, mirror] == MIRROR else THROUGH
+                rise[path, at + EXCESS_COLUMN] += slope[path, mirror]
+                share = MIRRORED_COLUMN if specular.kind[path, mirror] == MIRROR else THROUGH_COLUMN
                 rise[path, at + share] += 0.5 * amplitude[path]
         return np.asarray((rise * kept[:, None]).T.astype(np.float32) @ columns)
 
@@ -372,14 +369,14 @@ class Columns:
             row[: layout.lobes] += (
                 p.weight[g] * np.einsum("c,lcn->nl", alpha[g].astype(np.float32), columns)
             ).T
-            row[layout.lobes + EXCESS] += p.weight[g] @ np.einsum(
+            row[layout.lobes + EXCESS_COLUMN] += p.weight[g] @ np.einsum(
                 "c,lcn->ln", rise[g].astype(np.float32), columns
             )
         even, steeper = curves.even(p.log_excess)
         for g, column in zip(self.senders, self.further, strict=True):
             row = found[np.searchsorted(seen, g)]
             row[: layout.lobes] += (p.weight[g] * even[g])[:, None] * column
-            row[layout.lobes + EXCESS] += p.weight[g].sum() * steeper[g] * column
+            row[layout.lobes + EXCESS_COLUMN] += p.weight[g].sum() * steeper[g] * column
         index = layout.stride * seen[:, None] + np.arange(layout.stride)
         return found.reshape(index.size, found.shape[-1]), index.ravel()
 

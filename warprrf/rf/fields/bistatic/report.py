@@ -13,7 +13,7 @@ import numpy as np
 from warprrf.checks import some_of, users_level
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import Measured
-from warprrf.rf.fields.bistatic.gauss_newton import THROUGH, layout_of
+from warprrf.rf.fields.bistatic.gauss_newton import THROUGH_STD, layout_of
 from warprrf.rf.fields.bistatic.needs import MOST_BLOCKED, RARE, RAYS, evenly, total
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, frame_of, huber, observe
 from warprrf.rf.fields.bistatic.training import Choice, Training, Unexplained
@@ -107,7 +107,7 @@ def covariance_of(t: Training, choice: Choice) -> np.ndarray:
     )
     free = np.ones(whole.size, bool)
     free[whole.let_through(np.arange(whole.groups))] = through
-    covariance = np.where(free, 0.0, THROUGH**2) * np.eye(whole.size)
+    covariance = np.where(free, 0.0, THROUGH_STD**2) * np.eye(whole.size)
     covariance[np.ix_(free, free)] = choice.solution.covariance[: layout.size, : layout.size]
     return covariance
 

@@ -17,7 +17,7 @@ from scipy.sparse import csr_matrix
 from warprrf.device import Progress
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, READING_ERROR_DB
-from warprrf.rf.spectra.antenna import Pattern, sample_pattern
+from warprrf.rf.spectra.antenna import Antenna, turned_gain
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_of
 from warprrf.rf.tracing.model import Model
 from warprrf.rf.tracing.records import Materials
@@ -35,10 +35,10 @@ LEAST_DB = 1e-3  # per neper: readings that change less tell nothing
 
 @dataclass(frozen=True)
 class Pointings:
-    """Antennas turned to directions ``toward`` (K, 3), unit vectors, with a gain over the angle off boresight."""
+    """An antenna turned to ``angles`` (K, 2), zeniths and azimuths [rad]."""
 
-    toward: np.ndarray
-    pattern: Pattern
+    angles: np.ndarray
+    antenna: Antenna
 
 
 @dataclass(frozen=True)
@@ -121,8 +121,7 @@ class Sensitivity:
         summed = np.asarray(square.sum(axis=0)).ravel()
         if pointings is None:
             return summed, csr_matrix(summed / NOISE_DB**2)
-        cosine = pointings.toward @ pixel_directions(SHAPE).reshape(-1, 3).T
-        gain = sample_pattern(pointings.pattern, np.arccos(np.clip(cosine, -1.0, 1.0)))
+        gain = turned_gain(pointings.antenna, pointings.angles, pixel_directions(SHAPE).reshape(-1, 3))
         slope = NEPER * (gain @ table) / (gain @ total + self.floor)[:, None]
         return summed, csr_matrix(np.where(slope > LEAST_DB, (slope / READING_ERROR_DB) ** 2, 0.0))
 
@@ -165,14 +164,14 @@ def suggest(
     told: dict[int, csr_matrix] = {}
     for k, place in enumerate(places):
         mine = np.flatnonzero(own.reshape(-1) == k)
-        turned = None if pointings is None else replace(pointings, toward=pointings.toward[mine])
+        turned = None if pointings is None else replace(pointings, angles=pointings.angles[mine])
         whole, rows = sensitivity.of(place, turned)
         square += len(mine) * whole
         told |= {int(c): rows[j if len(rows.indptr) > 2 else 0] for j, c in enumerate(mine)}
         if progress is not None:
             progress("suggest", k + 1, total)
     if pointings is not None:
-        pointings = replace(pointings, toward=np.unique(pointings.toward, axis=0))
+        pointings = replace(pointings, angles=np.unique(pointings.angles, axis=0))
     after = None if progress is None else lambda stage, done, _: progress(stage, len(places) + done, total)
     known = sensitivity.precision(measured, pointings, after)
     return _greedy(told, square, unknowns, known, n)

@@ -21,7 +21,13 @@ from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.fields.base import Data, Measured
-from warprrf.rf.fields.bistatic.gauss_newton import KNOWN_THROUGH, THROUGH, Problem, Solution, gauss_newton
+from warprrf.rf.fields.bistatic.gauss_newton import (
+    KNOWN_THROUGH_STD,
+    THROUGH_STD,
+    Problem,
+    Solution,
+    gauss_newton,
+)
 from warprrf.rf.fields.bistatic.measured import WeighedPaths
 from warprrf.rf.fields.bistatic.needs import evenly, needed
 from warprrf.rf.fields.bistatic.observations import (
@@ -371,7 +377,7 @@ class Training:
     def known_through(self, material: np.ndarray) -> np.ndarray:
         """ln of the share that materials let through before any measurement, and its standard deviation, shape ``(2, M)``."""
         eta, _, through = self.surface.slabs(frame_of(self.data).frequency_hz)
-        std = np.where(np.abs(eta) > 0, KNOWN_THROUGH, THROUGH)
+        std = np.where(np.abs(eta) > 0, KNOWN_THROUGH_STD, THROUGH_STD)
         return np.stack([np.bincount(material, own) for own in (through, std)]) / np.bincount(material)
 
     def problem(
