@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -66,7 +67,7 @@ def horn_readings(ds: wr.SpectrumDataset, k: int, seed: int | None, turn: float 
     own = np.sqrt((HORN_DEG * PER_DEG) ** 2 - np.degrees(ds.beam_sigma_rad) ** 2) / PER_DEG
     toward = directions_from_angles(*(POINTINGS + [0.0, turn]).T)
     cosine = np.clip(toward @ pixel_directions(ds.shape).reshape(-1, 3).T, -1.0, 1.0)
-    power = np.asarray(wr.horn(np.radians(own))(np.arccos(cosine))) @ ds.path_gain[k].ravel()  # type: ignore[operator]
+    power = wr.horn(np.radians(own)).gain_off_boresight(np.arccos(cosine)) @ ds.path_gain[k].ravel()
     if seed is None:
         return np.asarray(power)
     return np.asarray(
@@ -119,7 +120,7 @@ def rows(options: Options, fits: Fits) -> Iterator[Row]:
     turned = np.stack([
         [horn_readings(pool, r, None, turn) for turn in 2.0 * np.pi / TURNS * np.arange(TURNS)] for r in range(len(pool))
     ]) if "horn" in options.parts else np.zeros(0)  # fmt: skip
-    ask = {"store": fits.job.out / "map.nc", "progress": fits.job.progress}
+    ask: dict[str, Any] = {"store": fits.job.out / "map.nc", "progress": fits.job.progress}
     field.locate(test.subset([0]), **ask)  # makes the map, which does not count
     for part in options.parts:
         found = []

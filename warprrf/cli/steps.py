@@ -427,9 +427,6 @@ def add_locate(add: Add) -> None:
         "--receiver", type=int, metavar="K", help="which one of the spectra, from 0 (the only one)"
     )
     loc.add_argument(
-        "--clock", type=float, metavar="S", default=0.0, help="how far off the delays' clock may be"
-    )
-    loc.add_argument(
         "--map", metavar="FILE", help="NetCDF file that keeps the field's map for the next question"
     )
     add_measured_options(loc)
@@ -445,7 +442,6 @@ def _locate(args: argparse.Namespace, out: Output) -> None:
     examples:
       warprrf locate field.safetensors spectra.nc --receiver 3
       warprrf locate field.safetensors horn.csv --noise-floor-db -150 --receive-pattern 10 --azimuth unknown
-      warprrf locate field.safetensors profiles.csv --noise-floor-db -140 --bandwidth 2e9 --clock 50e-9
     """
     field = wr.RadioField.load(existing(args.field), device=args.device)
     if args.frequency is None:
@@ -458,12 +454,12 @@ def _locate(args: argparse.Namespace, out: Output) -> None:
                 raise ValueError(f"--receiver: {one} has {len(ds)} receivers, expected the number of one")
             one = ds.subset([args.receiver or 0])
         measured.append(one)
-    found = field.locate(measured, clock_s=args.clock, store=args.map, progress=out)
+    found = field.locate(measured, store=args.map, progress=out)
     result = {
         name: getattr(found, name)
         for name in ("position", "covariance", "candidates", "likelihoods", "known", "misfit")
     }
-    result |= {"gains_db": dict(found.gains_db), "shifts": dict(found.shifts)}
+    result |= {"gains_db": dict(found.gains_db), "azimuth_zeros": dict(found.azimuth_zeros)}
     if args.out:
         write_json(args.out, plain(result))
     said = "known" if found.known else "not known: see candidates"

@@ -462,7 +462,6 @@ class RadioField(ABC):
         self,
         measured: Measured | Spectrum | Sequence[Measured],
         *,
-        clock_s: float = 0.0,
         store: str | os.PathLike[str] | None = None,
         progress: Progress | None = None,
     ) -> Location:
@@ -473,10 +472,8 @@ class RadioField(ABC):
 
         Args:
             measured: the spectrum of one receiver; or its readings under transmitters of known places: of a horn's pointings,
-                delay profiles, power alone; or an array's spectrum; or a list of them. Where they say the receiver stood is
+                or power alone; or an array's spectrum; or a list of them. Where they say the receiver stood is
                 not looked at. Gains of measuring chains (``chain``), and azimuths with ``azimuth_known=False``, are found too.
-            clock_s: by how much the clock that delays are counted from may be off [s], the same for all of a table; it is
-                then found too. 0: delays are absolute. By delays a place is never said to be known: the search is rough.
             store: a NetCDF-4 file that keeps the map, for another process.
             progress: called as ``progress("map", done, total)``.
 

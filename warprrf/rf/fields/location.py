@@ -23,7 +23,7 @@ class Location:
             is small beside the distance of the places searched, and what was read is explained.
         misfit: root mean square error of what was read, over what the field and the readings state: about 1.
         gains_db: of measuring chains of unknown gain, by name [dB].
-        shifts: by table's name what was added to azimuths of an unknown zero [rad], or taken from delays of an unknown clock [s].
+        azimuth_zeros: what was added to azimuths of an unknown zero, by table's name [rad].
     """
 
     __repr__ = one_line
@@ -35,7 +35,7 @@ class Location:
     known: bool
     misfit: float
     gains_db: Mapping[str, float]
-    shifts: Mapping[str, float]
+    azimuth_zeros: Mapping[str, float]
 
     @property
     def std_m(self) -> float:

@@ -40,7 +40,7 @@ def horn(field):
         ],
         1,
     )
-    gain = np.asarray(pattern(np.arccos(np.clip(toward @ paths.arrival.T, -1.0, 1.0))))
+    gain = pattern.gain_off_boresight(np.arccos(np.clip(toward @ paths.arrival.T, -1.0, 1.0)))
     power = 0.02 * gain @ paths.power
     return replace(like, arrival=angles - [0.0, TURN], power=power, floor=1e-3 * power.max())
 
@@ -63,35 +63,7 @@ def test_a_horn_of_unknown_gain_and_azimuth_finds_all_three(field, horn):
     found = field.locate(horn)
     assert np.linalg.norm(found.position - UNSEEN[1]) < 0.15
     assert found.gains_db["horn"] == pytest.approx(10.0 * np.log10(0.02), abs=0.5)
-    assert abs(np.angle(np.exp(1j * (found.shifts["scan"] - TURN)))) < np.radians(2.0)
-
-
-@pytest.mark.xfail(
-    reason="half a metre off taps have nothing in common, and the search stays where it started"
-)
-def test_delays_of_an_unknown_clock_find_place_and_clock(field):
-    taps, late, rows = np.arange(120) / 2e9, 7.3e-9, []
-    for source in OTHERS:
-        paths = field.paths(UNSEEN[0], source)
-        ask = {"frequency_hz": field.frequency_hz, "floor": 1e-15, "bandwidth_hz": 2e9, "window": "hann"}
-        empty = wr.Readings(source, UNSEEN[0], np.ones(120), delay_s=taps - late, **{**ask, "floor": 0.5})
-        known = np.isfinite(paths.tau)
-        weigh = of_taps(empty, paths, known)
-        rows.append(weigh @ paths.power[known])
-    power = np.concatenate(rows)
-    profile = wr.Readings(
-        np.repeat(OTHERS, 120, axis=0), UNSEEN[0], np.maximum(power, 1e-20), **{**ask, "floor": 1e-3 * power.max()},
-        delay_s=np.tile(taps, 3), name="sounder",
-    )  # fmt: skip
-    found = field.locate(profile, clock_s=20e-9)
-    assert np.linalg.norm(found.position - UNSEEN[0]) < 0.1
-    assert found.shifts["sounder"] == pytest.approx(late, abs=0.3e-9)
-
-
-def of_taps(readings, paths, known):
-    """What a tap of a Hann window in frequency lets through of each delay: its transform squared; all taps add up to 1."""
-    x = 2e9 * (readings.delay_s[:, None] - paths.tau[known])
-    return (np.sinc(x) / (1.0 - x**2)) ** 2 / 1.5
+    assert abs(np.angle(np.exp(1j * (found.azimuth_zeros["scan"] - TURN)))) < np.radians(2.0)
 
 
 def test_what_cannot_be_located_is_refused(scene, field, horn):
@@ -102,5 +74,3 @@ def test_what_cannot_be_located_is_refused(scene, field, horn):
     ):  # fmt: skip
         with pytest.raises((TypeError, ValueError), match=text):
             as_data(field, what)
-    with pytest.raises(ValueError, match="clock_s"):
-        field.locate(ds.subset([0]), clock_s=-1.0)

@@ -554,12 +554,11 @@ class BistaticField(RadioField):
         self,
         measured: Measured | Spectrum | Sequence[Measured],
         *,
-        clock_s: float = 0.0,
         store: str | os.PathLike[str] | None = None,
         progress: Progress | None = None,
     ) -> Location:
         """Where a receiver is; see :meth:`RadioField.locate`, and :mod:`warprrf.rf.fields.bistatic.locate` for how."""
-        return locate(self, measured, clock_s, store, progress)
+        return locate(self, measured, store, progress)
 
     def gain_std_db(self, progress: Progress | None = None) -> np.ndarray:
         """How far the gain of what each element of the surface scatters is known after spectra at ``fitted_on``: standard

@@ -19,7 +19,6 @@ from warprrf.device import Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.netcdf_files import Variable
 from warprrf.rf.channel.array_spectra import ArraySpectra
-from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import Measured
 from warprrf.rf.fields.batches import Batch
 from warprrf.rf.positions import Ends, is_free
@@ -37,15 +36,9 @@ PIXELS = SHAPE[0] * SHAPE[1]
 BLUR_RAD = np.radians(7.0)
 """Of the beam through which spectra are compared: sharp peaks become wide valleys. Half the spacing at 3 m is 5 degrees."""
 TURNS = 120  # azimuths' zeros that are tried
-CLOCK_TAPS = 0.5  # clocks that are tried are so many taps apart
 MOST_DIRECTIONS = 400  # of an array's spectrum
 CLEARANCE_M = 0.1  # of its places from surfaces
-LENGTH_STEP_M, LENGTHS = 0.1, 800
-"""Lengths of paths that are told apart, and how many: what is longer counts to the last."""
-VARIABLES = {
-    "image": Variable(("receiver", "zenith", "azimuth"), "1"),
-    "lengths": Variable(("receiver", "length"), "1"),
-}
+VARIABLES = {"image": Variable(("receiver", "zenith", "azimuth"), "1")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +48,10 @@ class FieldMap:
     Attributes:
         places: in the air [m], shape ``(P, 3)``.
         image: path gain by direction of arrival, shape ``(P, H, W)`` float32.
-        lengths: path gain by length, shape ``(P, L)`` float32.
     """
 
     places: np.ndarray
     image: np.ndarray
-    lengths: np.ndarray
     _read: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
 
     def decibels(self, key: Hashable, read: Callable[[], np.ndarray]) -> np.ndarray:
@@ -73,11 +64,10 @@ class FieldMap:
 
         return self._read.get(key, made)
 
-    def weighed(self, weights: np.ndarray, of: str = "image") -> np.ndarray:
-        """Readings at every place [dB], shape ``(P, N)``, of which ``weights`` (N, H W) or (N, L) say what each takes of
-        ``image`` or ``lengths``."""
-        power = getattr(self, of).reshape(len(self.places), -1)
-        return self.decibels((weights.tobytes(), of), lambda: power @ weights.T.astype(np.float32))
+    def weighed(self, weights: np.ndarray) -> np.ndarray:
+        """Readings at every place [dB], shape ``(P, N)``, of which ``weights`` (N, H W) say what each takes of ``image``."""
+        power = self.image.reshape(len(self.places), -1)
+        return self.decibels(weights.tobytes(), lambda: power @ weights.T.astype(np.float32))
 
 
 def maps_of(
@@ -90,7 +80,7 @@ def maps_of(
     places = lattice(bistatic.mesh, bistatic.transmitter, bistatic.device)
     every = np.tile(places, (len(transmitters), 1)), np.repeat(transmitters, len(places), axis=0)
     batch = Batch("map", Ends.of(*every), store, None, progress)
-    found = batch.gather(partial(_mapped, bistatic), VARIABLES, {}, bistatic._known_by(batch, SHAPE, LENGTHS))
+    found = batch.gather(partial(_mapped, bistatic), VARIABLES, {}, bistatic._known_by(batch, SHAPE))
     parts = [
         np.asarray(found[name]).reshape(len(transmitters), len(places), *found[name].shape[1:])
         for name in VARIABLES
@@ -110,7 +100,7 @@ def lattice(mesh: Mesh, transmitter: np.ndarray, device: Any, spacing_m: float =
 
 
 def _mapped(bistatic: Any, part: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
-    """Image and lengths at receivers (K, 3) under a transmitter (3,)."""
+    """Path gain by direction at receivers (K, 3) under a transmitter (3,)."""
     receivers, transmitter = part
     tracer, count = bistatic.tracer(transmitter), len(receivers)
     model = bistatic.state
@@ -120,29 +110,23 @@ def _mapped(bistatic: Any, part: tuple[np.ndarray, np.ndarray]) -> dict[str, np.
     paths, rays = view.paths, gains.by_ray()
     pixel = np.ravel_multi_index((paths.receiver, *pixel_of(paths.arrival, SHAPE)), (count, *SHAPE))
     image = rays + np.bincount(pixel, gains.specular, len(rays))
-    metres = np.concatenate([view.single_bounce_m(), paths.delay_m])
-    owner = np.concatenate([np.repeat(np.arange(count), len(rays) // count), paths.receiver])
-    step = np.minimum((metres / LENGTH_STEP_M).astype(int), LENGTHS - 1)
-    lengths = np.bincount(owner * LENGTHS + step, np.concatenate([rays, gains.specular]), count * LENGTHS)
-    return {
-        "image": image.reshape(count, *SHAPE).astype(np.float32), "lengths": lengths.reshape(count, -1).astype(np.float32)
-    }  # fmt: skip
+    return {"image": image.reshape(count, *SHAPE).astype(np.float32)}
 
 
 def best_on_map(
-    one: Measured, maps: dict[bytes, FieldMap], chains: Sequence[str], clock_s: float
+    one: Measured, maps: dict[bytes, FieldMap], chains: Sequence[str]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How well the places of a lattice suit a data set: mean absolute error [dB] ``(P,)`` under the shift and the gains of chains
-    that suit each best, that shift ``(P,)`` and these ``(P, C)`` [dB]."""
-    read = (
+    """How well the places of a lattice suit a data set: mean absolute error [dB] ``(P,)`` under the turn and the gains of chains
+    that suit each best, that turn ``(P,)`` [rad] and these ``(P, C)`` [dB]."""
+    read: Callable[..., Rough] = (
         _spectrum if isinstance(one, SpectrumDataset) else _array if isinstance(one, ArraySpectra) else _table
     )
-    power, floor, chain, parts, columns, shifts = read(one, maps, chains, clock_s)
+    power, floor, chain, parts, columns, turns = read(one, maps, chains)
     floor_db, places = 10.0 * np.log10(floor), len(parts[0][1])
     db = np.maximum(10.0 * np.log10(np.maximum(power, 1e-300)), floor_db)
     known, heard = np.full(len(db), -1) if chain is None else chain, db > floor_db
-    least, shift, gains = np.full(places, np.inf), np.zeros(places), np.zeros((places, len(chains) + 1))
-    for by, own in zip(shifts, columns, strict=True):
+    least, turn, gains = np.full(places, np.inf), np.zeros(places), np.zeros((places, len(chains) + 1))
+    for by, own in zip(turns, columns, strict=True):
         found, gain = np.empty((places, len(db)), np.float32), np.zeros_like(gains)
         for rows, table in parts:
             found[:, rows] = table[:, own[rows]]
@@ -151,15 +135,15 @@ def best_on_map(
             found[:, known == c] += gain[:, c, None]
         error = np.abs(np.maximum(found, floor_db) - db).mean(axis=1)
         better = error < least
-        least[better], shift[better], gains[better] = error[better], by, gain[better]
-    return least, shift, gains[:, : len(chains)]
+        least[better], turn[better], gains[better] = error[better], by, gain[better]
+    return least, turn, gains[:, : len(chains)]
 
 
 Rough = tuple[
     np.ndarray, np.ndarray, np.ndarray | None, list[tuple[np.ndarray, np.ndarray]], np.ndarray, np.ndarray
 ]
 """What was read as maps know it: powers and floors (N,); indices of unknown gains, -1 for none; for each transmitter which rows
-are under it and what its map gives (P, M) [dB]; of those M the column of each reading, by shift (T, N); shifts (T,)."""
+are under it and what its map gives (P, M) [dB]; of those M the column of each reading, by turn (T, N); turns (T,) [rad]."""
 
 
 def _spectrum(one: SpectrumDataset, maps: dict[bytes, FieldMap], *_: Any) -> Rough:
@@ -186,7 +170,7 @@ def _spectrum(one: SpectrumDataset, maps: dict[bytes, FieldMap], *_: Any) -> Rou
     )
 
 
-def _array(one: ArraySpectra, maps: dict[bytes, FieldMap], chains: Sequence[str], _: float) -> Rough:
+def _array(one: ArraySpectra, maps: dict[bytes, FieldMap], chains: Sequence[str]) -> Rough:
     """An array's beams hear powers: how paths' phases add up is left to the exact search."""
     toward, pixels = one.directions.reshape(-1, 3), pixel_directions(SHAPE).reshape(-1, 3)
     kept = np.flatnonzero(np.isfinite(one.power[0].ravel()))
@@ -206,28 +190,22 @@ def _array(one: ArraySpectra, maps: dict[bytes, FieldMap], chains: Sequence[str]
     )
 
 
-def _table(one: Readings, maps: dict[bytes, FieldMap], chains: Sequence[str], clock_s: float) -> Rough:
+def _table(one: Readings, maps: dict[bytes, FieldMap], chains: Sequence[str]) -> Rough:
     one = one.subset(np.isfinite(one.power))
     index = {name: c for c, name in enumerate(chains)}
     chain = np.array([index.get(str(name), -1) for name in np.asarray(one.chain)])
-    toward, delay = pixel_directions(SHAPE).reshape(-1, 3), np.zeros(PIXELS)
-    shifts, of, ask = np.zeros(1), "image", dict[str, Any]()
+    toward, ask = pixel_directions(SHAPE).reshape(-1, 3), dict[str, Any]()
+    turns: np.ndarray = np.zeros(1)
     columns = np.zeros((1, len(one)), int)
-    if one.delay_s is not None and one.bandwidth_hz is not None:
-        of, step = "lengths", CLOCK_TAPS / one.bandwidth_hz
-        shifts = step * np.arange(-np.ceil(clock_s / step), np.ceil(clock_s / step) + 1)
-        number, columns = np.unique(np.round((one.delay_s - shifts[:, None]) / step), return_inverse=True)
-        columns, ask = columns.reshape(len(shifts), -1), {"delay_s": step * number}
-        toward, delay = np.zeros((LENGTHS, 3)), (np.arange(LENGTHS) + 0.5) * LENGTH_STEP_M / SPEED_OF_LIGHT
-    elif one.arrival is not None and one.azimuth_known:
+    if one.arrival is not None and one.azimuth_known:
         ask["arrival"], columns = np.unique(one.arrival, axis=0, return_inverse=True)
         columns = columns.reshape(1, -1)
     elif one.arrival is not None:
-        shifts = 2.0 * np.pi / TURNS * np.arange(TURNS)
+        turns = 2.0 * np.pi / TURNS * np.arange(TURNS)
         zenith, row = np.unique(one.arrival[:, 0], return_inverse=True)
-        turn = np.round(one.arrival[:, 1] / shifts[1]).astype(int)
+        turn = np.round(one.arrival[:, 1] / turns[1]).astype(int)
         columns = TURNS * row.reshape(-1) + (turn + np.arange(TURNS)[:, None]) % TURNS
-        ask["arrival"] = np.column_stack([np.repeat(zenith, TURNS), np.tile(shifts, len(zenith))])
+        ask["arrival"] = np.column_stack([np.repeat(zenith, TURNS), np.tile(turns, len(zenith))])
     count = int(columns.max()) + 1
     ask |= {
         "transmitters": one.transmitters[0],
@@ -236,8 +214,8 @@ def _table(one: Readings, maps: dict[bytes, FieldMap], chains: Sequence[str], cl
         "floor": 0.5,
     }
     asked = replace(one, **ask, chain=None, std_db=0.0, azimuth_known=True)
-    weights, parts = path_weights(asked, np.arange(count), toward, toward, delay), []
+    weights, parts = path_weights(asked, np.arange(count), toward, toward, np.zeros(PIXELS)), []
     for source in np.unique(one.transmitters, axis=0):
         rows = np.flatnonzero((one.transmitters == source).all(axis=1))
-        parts.append((rows, maps[source.tobytes()].weighed(weights, of)))
-    return one.power, np.asarray(one.floor), chain, parts, columns, shifts
+        parts.append((rows, maps[source.tobytes()].weighed(weights)))
+    return one.power, np.asarray(one.floor), chain, parts, columns, turns

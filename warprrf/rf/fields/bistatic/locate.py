@@ -19,7 +19,6 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 from threadpoolctl import threadpool_limits
 
-from warprrf.checks import check_number
 from warprrf.device import Progress
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import Measured
@@ -37,7 +36,7 @@ STEPS = 4, 3  # most Gauss-Newton steps, first with single mirrors, then with al
 LONGEST_M, SHORTEST_M = 0.35, 3e-3  # steps: none is longer, and shorter ones are the last
 FIRST_DIFFERENCE_M, DIFFERENCE_M = 0.1, 0.04
 """First and least: half of the last step between. Over shorter ones the noise of few rays looks like slopes."""
-TURN_RAD, TAPS = 0.005, 0.02  # differences of azimuths and of delays, in taps
+TURN_RAD = 0.005  # difference of azimuths
 SUB_PIXELS = (
     1,
     2,
@@ -78,9 +77,9 @@ def as_data(field: Any, measured: Any) -> list[Measured]:
                 f"measured: got {of:g} GHz, expected {told:g}; field.at_frequency(hz) is of another carrier"
             )
         if isinstance(one, Readings):
-            if one.departure is not None or (one.arrival is not None and one.delay_s is not None):
+            if one.departure is not None or one.delay_s is not None:
                 raise ValueError(
-                    "measured: got readings by departure, or by arrival and delay, expected by one of arrival, delay"
+                    "measured: got readings by departure or by delay, expected by arrival, or power alone"
                 )
         elif len(one) != 1:
             raise ValueError(
@@ -121,27 +120,20 @@ class Found:
 class Question:
     """What was read at one place, which is sought in a field.
 
-    Unknowns are its position [m], a shift of each table that has one (azimuths' zero [rad], a clock [s]), and ln of each
-    measuring chain's gain.
+    Unknowns are its position [m], the azimuths' zero of each table that does not know it [rad], and ln of each measuring
+    chain's gain.
 
     Args:
         field: a bistatic field.
         data: see :func:`as_data`.
-        clock_s: how far off clocks may be at most [s]; 0 where delays are absolute.
     """
 
-    def __init__(self, field: Any, data: Sequence[Measured], clock_s: float) -> None:
-        self.field, self.data, self.clock_s = field, data, clock_s
+    def __init__(self, field: Any, data: Sequence[Measured]) -> None:
+        self.field, self.data = field, data
         self.places = places_of(data, None, field.device)
         self.transmitters = list(np.unique([place.transmitter for place in self.places], axis=0))
         self.chains = sorted({place.chain for place in self.places} - {""})
-        tables = {k: one for k, one in enumerate(data) if isinstance(one, Readings)}
-        self.turned = [k for k, one in tables.items() if not one.azimuth_known]
-        self.shifted = self.turned + [
-            k for k, one in tables.items() if one.delay_s is not None and clock_s > 0
-        ]
-        # Half a metre off, taps of delay have nothing in common: the search often ends where it started.
-        self.reliable = all(one.delay_s is None for one in tables.values())
+        self.turned = [k for k, one in enumerate(data) if isinstance(one, Readings) and not one.azimuth_known]
         self.spectra = all(isinstance(one, SpectrumDataset) for one in data)
         self.weights = [self._weight(one) for one in data]
         self._tracers: dict[Any, Tracer] = {}
@@ -160,14 +152,13 @@ class Question:
     def starts(self, maps: dict[bytes, FieldMap]) -> np.ndarray:
         """Unknowns at the places of a lattice that suit best and lie apart, shape ``(S, U)``."""
         places = next(iter(maps.values())).places
-        cost, gains, shift = np.zeros(len(places)), np.zeros((len(places), len(self.chains))), []
+        cost, gains, turn = np.zeros(len(places)), np.zeros((len(places), len(self.chains))), []
         for k, one in enumerate(self.data):
-            least, own, gain = best_on_map(one, maps, self.chains, self.clock_s)
+            least, own, gain = best_on_map(one, maps, self.chains)
             cost, gains = cost + least, gains + gain
-            shift += [own] if k in self.shifted else []
-        order = np.argsort(np.argsort(self.shifted))  # as unknowns have them
-        shifts = np.stack(shift, axis=1)[:, order] if shift else gains[:, :0]
-        every, chosen = np.concatenate([places, shifts, gains / NEPER], axis=1), list[int]()
+            turn += [own] if k in self.turned else []
+        turns = np.stack(turn, axis=1) if turn else gains[:, :0]
+        every, chosen = np.concatenate([places, turns, gains / NEPER], axis=1), list[int]()
         for p in np.argsort(cost, kind="stable"):
             if all(np.linalg.norm(places[p] - places[q]) > 1.2 * SPACING_M for q in chosen):
                 chosen.append(int(p))
@@ -176,13 +167,10 @@ class Question:
         return every[chosen]
 
     def moved(self, unknown: np.ndarray) -> list[Measured]:
-        """The data with azimuths and clocks put right."""
+        """The data with azimuths put right."""
         found: list[Any] = list(self.data)
-        for k, by in zip(self.shifted, unknown[3:], strict=False):
-            if k in self.turned:
-                found[k] = replace(found[k], arrival=found[k].arrival + [0.0, by], azimuth_known=True)
-            else:
-                found[k] = replace(found[k], delay_s=found[k].delay_s - by)
+        for k, by in zip(self.turned, unknown[3:], strict=False):
+            found[k] = replace(found[k], arrival=found[k].arrival + [0.0, by], azimuth_known=True)
         return found
 
     def errors(self, unknown: np.ndarray, step_m: float, *, quick: bool) -> Found:
@@ -190,24 +178,20 @@ class Question:
         rays and single mirrors."""
         points = unknown[:3] + step_m * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
         kinds, further, seen = kinds_of(self.moved(unknown)), {}, dict[Any, Any]()
-        for j, k in enumerate(self.shifted):
-            step = TURN_RAD if k in self.turned else TAPS / self.data[k].bandwidth_hz  # type: ignore[union-attr]
-            further[k] = (
-                3 + j,
-                step,
-                kinds_of(self.moved(unknown + step * (np.arange(len(unknown)) == 3 + j)))[k],
-            )
+        for j, k in enumerate(self.turned):
+            other = unknown + TURN_RAD * (np.arange(len(unknown)) == 3 + j)
+            further[k] = 3 + j, kinds_of(self.moved(other))[k]
         errors, rises = [], []
         for place in self.places:
             key = place.transmitter.tobytes(), place.shape, place.beam_sigma_rad
             if key not in seen:
                 seen[key] = self._views(place, points, quick)
             views, *under = seen[key]
-            chain = 3 + len(self.shifted) + self.chains.index(place.chain) if place.chain else None
+            chain = 3 + len(self.turned) + self.chains.index(place.chain) if place.chain else None
             gain = 1.0 if chain is None else float(np.exp(unknown[chain]))
-            column, step, shifted = further.get(place.data, (0, 1.0, None))
+            column, turned = further.get(place.data, (0, None))
             asked = [(kinds[place.data], *one) for one in zip(points, views, strict=True)]
-            asked += [] if shifted is None else [(shifted, points[0], views[0])]
+            asked += [] if turned is None else [(turned, points[0], views[0])]
             observed = [kind.observe(replace(place, receiver=point), view) for kind, point, view in asked]
             powers = [gain * o.predicted(*under) for o in observed]
             target, weight = observed[0].target, self.weights[place.data]
@@ -216,8 +200,8 @@ class Question:
             rise = np.zeros((len(error), len(unknown)))
             # Of both sides: the noise of one alone would hang together with that of the errors, and pull the place aside.
             rise[:, :3] = (np.stack(others[:3], axis=1) - np.stack(others[3:6], axis=1)) / (2.0 * step_m)
-            if shifted is not None:
-                rise[:, column] = (others[6] - error) / step
+            if turned is not None:
+                rise[:, column] = (others[6] - error) / TURN_RAD
             if chain is not None:
                 rise[:, chain] = target.slope(powers[0]) * powers[0] / NOISE_DB
             if weight is not None:
@@ -283,10 +267,10 @@ class Question:
 
 
 def locate(
-    field: Any, measured: Any, clock_s: float, store: str | os.PathLike[str] | None, progress: Progress | None
+    field: Any, measured: Any, store: str | os.PathLike[str] | None, progress: Progress | None
 ) -> Location:
     """See :meth:`RadioField.locate`; ``field`` is a bistatic one."""
-    question = Question(field, as_data(field, measured), check_number("clock_s", clock_s, 0.0, 1e-3))
+    question = Question(field, as_data(field, measured))
     sources = question.transmitters
     maps = field._maps.get(np.stack(sources).tobytes(), lambda: maps_of(field, sources, store, progress))
     with threadpool_limits(1, user_api="blas"):  # matrices are small
@@ -326,12 +310,12 @@ def search(question: Question, maps: dict[bytes, FieldMap]) -> Location:
     )
     likelihood /= likelihood.sum()
     covariance, misfit = question.covariance(best, threshold), float(np.sqrt(spread))
-    close = question.reliable and float(np.sqrt(np.trace(covariance))) < SPACING_M
-    after = zip(question.shifted, best.unknown[3:].tolist(), strict=False)
-    gains = (NEPER * best.unknown[3 + len(question.shifted) :]).tolist()
+    close = float(np.sqrt(np.trace(covariance))) < SPACING_M
+    after = zip(question.turned, best.unknown[3:].tolist(), strict=False)
+    gains = (NEPER * best.unknown[3 + len(question.turned) :]).tolist()
     return Location(
         position=best.unknown[:3], covariance=covariance, candidates=np.stack([one.unknown[:3] for one in order]),
         likelihoods=likelihood, known=bool(likelihood[0] > SURE and close and misfit < EXPLAINED), misfit=misfit,
         gains_db=dict(zip(question.chains, gains, strict=True)),
-        shifts={question.data[k].name: by for k, by in after},  # type: ignore[union-attr]
+        azimuth_zeros={question.data[k].name: by for k, by in after},  # type: ignore[union-attr]
     )  # fmt: skip
