@@ -47,6 +47,10 @@ NAMES = {
         "benchmarks.suggest",
         "receivers that the field suggests beside random ones, from none to ten",
     ),
+    "locate": (
+        "benchmarks.locate",
+        "receivers located from a spectrum or a horn's pointings, beside the nearest measurement",
+    ),
     "times": ("benchmarks.times", "what each verb takes in the lobby or in a city: seconds and memory"),
     "measured": (
         "benchmarks.measured.command",

@@ -23,7 +23,7 @@ from warprrf.rf.spectra.spectrum import pixel_directions
 SCENE = ROOT / "data" / "lobby" / "scene.xml"
 SPECTRA = ROOT / "data" / "lobby" / "spectra.nc"
 COMMANDS = (
-    "reconstruct", "sample", "simulate", "fit", "suggest", "relevance", "render", "evaluate", "map", "twin", "view",
+    "reconstruct", "sample", "simulate", "fit", "suggest", "locate", "relevance", "render", "evaluate", "map", "twin", "view",
 )  # fmt: skip
 
 

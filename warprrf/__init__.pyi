@@ -17,6 +17,9 @@ from warprrf.rf.paths.trace import trace_paths as trace_paths
 # what each effect is worth in a scene, and the smallest model within a tolerance
 from warprrf.rf.relevance.search import relevance as relevance
 
+# which of many places transmitters should stand at, by a field's radio maps
+from warprrf.rf.maps.placing import place as place
+
 # errors of predicted spectra at held-out receivers
 from warprrf.rf.spectra.metrics import evaluate as evaluate
 

@@ -19,6 +19,7 @@ from warprrf.cli.output import INTERRUPTED, Output
 from warprrf.cli.steps import (
     add_evaluate,
     add_fit,
+    add_locate,
     add_reconstruct,
     add_relevance,
     add_sample,
@@ -95,6 +96,7 @@ def _parser() -> argparse.ArgumentParser:
             add_simulate,
             add_fit,
             add_suggest,
+            add_locate,
             add_relevance,
             add_render,
             add_evaluate,

@@ -38,7 +38,7 @@ from warprrf.cli.inputs import (
 )
 from warprrf.cli.output import Output
 from warprrf.cli.tables import table
-from warprrf.files import write_json, write_text
+from warprrf.files import plain, write_json, write_text
 from warprrf.geometry.photos.config import LENSES, ReconstructionConfig
 from warprrf.rf.tracing.model import SETS
 
@@ -414,6 +414,57 @@ def _suggest(args: argparse.Namespace, out: Output) -> None:
     if args.out:
         write_text(args.out, f"x,y,z{',azimuth,elevation' * (chosen.shape[1] == 5)}\n{rows}\n")
     out.result(rows, files=[args.out] if args.out else [], places=chosen)
+
+
+def add_locate(add: Add) -> None:
+    """Define `locate`."""
+    loc = add("locate", _locate)
+    loc.add_argument("field", help="a bistatic field's file (.safetensors)")
+    loc.add_argument(
+        "measurements", nargs="+", help="of one receiver: files of spectra (.nc, .npz), tables of received power (.csv)"
+    )  # fmt: skip
+    loc.add_argument(
+        "--receiver", type=int, metavar="K", help="which one of the spectra, from 0 (the only one)"
+    )
+    loc.add_argument(
+        "--map", metavar="FILE", help="NetCDF file that keeps the field's map for the next question"
+    )
+    add_measured_options(loc)
+    add_out(loc, "JSON file of what was found", required=False)
+
+
+def _locate(args: argparse.Namespace, out: Output) -> None:
+    """Where a receiver is, by what it read.
+
+    Where the files say that it stood is not looked at. Gains of the chains that a table names are found too, and with
+    `--azimuth unknown` the zero that its azimuths count from.
+
+    examples:
+      warprrf locate field.safetensors spectra.nc --receiver 3
+      warprrf locate field.safetensors horn.csv --noise-floor-db -150 --receive-pattern 10 --azimuth unknown
+    """
+    field = wr.RadioField.load(existing(args.field), device=args.device)
+    if args.frequency is None:
+        args.frequency = field.frequency_hz
+    measured = []
+    for one in read_measured(args.measurements, args, others=True):
+        if isinstance(one, Path):
+            ds = load_spectra(one)
+            if args.receiver is None and len(ds) != 1:
+                raise ValueError(f"--receiver: {one} has {len(ds)} receivers, expected the number of one")
+            one = ds.subset([args.receiver or 0])
+        measured.append(one)
+    found = field.locate(measured, store=args.map, progress=out)
+    result = {
+        name: getattr(found, name)
+        for name in ("position", "covariance", "candidates", "likelihoods", "known", "misfit")
+    }
+    result |= {"gains_db": dict(found.gains_db), "azimuth_zeros": dict(found.azimuth_zeros)}
+    if args.out:
+        write_json(args.out, plain(result))
+    said = "known" if found.known else "not known: see candidates"
+    text = f"{' '.join(f'{x:.3f}' for x in found.position)} m, give or take {found.std_m:.3f} m ({said})"
+    out.result(text, files=[args.out] if args.out else [], **result)
 
 
 def add_evaluate(add: Add) -> None:

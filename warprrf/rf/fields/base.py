@@ -39,6 +39,7 @@ from warprrf.rf.channel.response import frequency_response
 from warprrf.rf.em.absorption import Air, Gas
 from warprrf.rf.em.waves import CARRIERS_HZ, SPEED_OF_LIGHT
 from warprrf.rf.fields.batches import Batch
+from warprrf.rf.fields.location import Location
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
 from warprrf.rf.paths.path_set import PATH_VARIABLES, Paths, arrays_of, ends_and_attributes
@@ -456,6 +457,38 @@ class RadioField(ABC):
             first = candidates[field.suggest(candidates, 3)]
         """
         raise ValueError(f"field: got one of model {self.model!r}, expected 'bistatic' to suggest places")
+
+    def locate(
+        self,
+        measured: Measured | Spectrum | Sequence[Measured],
+        *,
+        store: str | os.PathLike[str] | None = None,
+        progress: Progress | None = None,
+    ) -> Location:
+        """Where a receiver is, by what it read.
+
+        The first question makes a map of what the field gives everywhere in the air, under each transmitter: a minute or so
+        in a room, kept with the field.
+
+        Args:
+            measured: the spectrum of one receiver; or its readings under transmitters of known places: of a horn's pointings,
+                or power alone; or an array's spectrum; or a list of them. Where they say the receiver stood is
+                not looked at. Gains of measuring chains (``chain``), and azimuths with ``azimuth_known=False``, are found too.
+            store: a NetCDF-4 file that keeps the map, for another process.
+            progress: called as ``progress("map", done, total)``.
+
+        Returns:
+            Position and its covariance, other candidates, and whether the place is known.
+
+        Raises:
+            TypeError, ValueError: naming the argument; for another model than ``bistatic``.
+
+        Example::
+
+            found = field.locate(field.spectrum([7, 4, 1.5]))
+            found.position, found.std_m, found.known
+        """
+        raise ValueError(f"field: got one of model {self.model!r}, expected 'bistatic' to find receivers")
 
     def check_positions(
         self, receivers: ArrayLike, transmitter: ArrayLike | None = None, *, name: str = "receivers"

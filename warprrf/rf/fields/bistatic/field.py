@@ -16,7 +16,7 @@ function of both directions and of the path's lengths, the field holds for a tra
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -46,6 +46,7 @@ from warprrf.rf.fields.base import Data, Measured, RadioField, with_settings
 from warprrf.rf.fields.bistatic import edited, files
 from warprrf.rf.fields.bistatic.fit import fit
 from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
+from warprrf.rf.fields.bistatic.locate import locate
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, read
 from warprrf.rf.fields.bistatic.needs import assumed
 from warprrf.rf.fields.bistatic.observations import (
@@ -64,6 +65,7 @@ from warprrf.rf.fields.bistatic.suggest import SHAPE as SUGGEST_SHAPE
 from warprrf.rf.fields.bistatic.suggest import Pointings, Sensitivity, Unknowns, suggest
 from warprrf.rf.fields.bistatic.training import TrainingViews
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
+from warprrf.rf.fields.location import Location
 from warprrf.rf.maps.links import LinkOptions, Links
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.antenna import Pattern
@@ -125,6 +127,7 @@ class BistaticField(RadioField):
     report: dict[str, Any] = field(default_factory=dict, repr=False)
     device: DeviceLike = field(default=None, repr=False)
     _evaluated: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
+    _maps: Cache = field(init=False, repr=False, default_factory=lambda: Cache(2))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -546,6 +549,16 @@ class BistaticField(RadioField):
         return suggest(
             sensitivity, unknowns, places, n, measured=self.fitted_on, pointings=pointings, progress=progress
         )
+
+    def locate(
+        self,
+        measured: Measured | Spectrum | Sequence[Measured],
+        *,
+        store: str | os.PathLike[str] | None = None,
+        progress: Progress | None = None,
+    ) -> Location:
+        """Where a receiver is; see :meth:`RadioField.locate`, and :mod:`warprrf.rf.fields.bistatic.locate` for how."""
+        return locate(self, measured, store, progress)
 
     def gain_std_db(self, progress: Progress | None = None) -> np.ndarray:
         """How far the gain of what each element of the surface scatters is known after spectra at ``fitted_on``: standard

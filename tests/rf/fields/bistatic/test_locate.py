@@ -1,0 +1,76 @@
+"""Where a receiver is: found again from what the field itself, and another engine, say is read there."""
+
+from dataclasses import replace
+
+import furnished
+import numpy as np
+import pytest
+from furnished import RECEIVERS
+
+import warprrf as wr
+from warprrf.rf.fields.bistatic.locate import as_data
+
+UNSEEN = np.array([[3.9, 2.0, 1.4], [1.7, 3.1, 1.2]])
+OTHERS = np.array([[4.4, 0.6, 2.3], [0.7, 3.5, 2.4], [4.5, 3.6, 2.5]])
+TURN = np.radians(137.0)
+
+
+@pytest.fixture(scope="module")
+def field(scene):
+    return wr.RadioField.fit(scene, furnished.spectra(scene), effects="single", quick=True)
+
+
+@pytest.fixture(scope="module")
+def horn(field):
+    """A horn's readings at the second place, as the field has them; its rotator's zero and its gain are not told."""
+    angles = np.array(
+        [(np.pi / 2 - up, around) for up in (-0.4, 0.0, 0.4) for around in np.arange(-3.0, 3.2, 0.25)]
+    )
+    pattern = wr.horn(np.radians(12.0))
+    paths = field.paths(UNSEEN[1])
+    like = wr.Readings(
+        field.transmitter, UNSEEN[1], np.ones(len(angles)), field.frequency_hz, 1e-14, arrival=angles + [0.0, TURN],
+        receive_pattern=pattern, chain=["horn"] * len(angles), azimuth_known=False, name="scan",
+    )  # fmt: skip
+    toward = np.stack(
+        [
+            np.sin(angles[:, 0]) * np.cos(angles[:, 1]),
+            np.sin(angles[:, 0]) * np.sin(angles[:, 1]),
+            np.cos(angles[:, 0]),
+        ],
+        1,
+    )
+    gain = pattern.gain_off_boresight(np.arccos(np.clip(toward @ paths.arrival.T, -1.0, 1.0)))
+    power = 0.02 * gain @ paths.power
+    return replace(like, arrival=angles - [0.0, TURN], power=power, floor=1e-3 * power.max())
+
+
+def test_a_receiver_is_found_from_another_engine_s_spectrum(scene, field):
+    ds = furnished.spectra(scene, UNSEEN)
+    for k, true in enumerate(UNSEEN):
+        found = field.locate(ds.subset([k]))
+        assert np.linalg.norm(found.position - true) < 0.05
+        assert found.known and found.likelihoods[0] > 0.95 and found.std_m < 0.2
+
+
+def test_what_is_said_of_the_place_does_not_count(scene, field):
+    one = furnished.spectra(scene, UNSEEN[:1])
+    elsewhere = replace(one, receivers=RECEIVERS[:1])
+    np.testing.assert_array_equal(field.locate(one).position, field.locate(elsewhere).position)
+
+
+def test_a_horn_of_unknown_gain_and_azimuth_finds_all_three(field, horn):
+    found = field.locate(horn)
+    assert np.linalg.norm(found.position - UNSEEN[1]) < 0.15
+    assert found.gains_db["horn"] == pytest.approx(10.0 * np.log10(0.02), abs=0.5)
+    assert abs(np.angle(np.exp(1j * (found.azimuth_zeros["scan"] - TURN)))) < np.radians(2.0)
+
+
+def test_what_cannot_be_located_is_refused(scene, field, horn):
+    ds = furnished.spectra(scene, UNSEEN)
+    for what, text in (
+        (ds, "spectra of 2 receivers"), (replace(ds.subset([0]), frequency_hz=140e9), "at_frequency"),
+        (replace(horn, departure=horn.arrival, transmit_pattern=horn.receive_pattern), "by departure"), (3, "int"),
+    ):  # fmt: skip
+        with pytest.raises((TypeError, ValueError), match=text):
+            as_data(field, what)

@@ -1,0 +1,321 @@
+"""Where a receiver is, by what it read: a field asked backwards.
+
+First everywhere: what was read is compared with what the field gives on a lattice (:mod:`warprrf.rf.fields.bistatic.field_map`).
+From the best places on by Gauss-Newton steps (Levenberg 1944, Marquardt 1963): slopes are differences of answers traced anew some
+centimetres away, because much of them are edges of shadows, which no derivative at fixed visibility knows.
+
+Errors count in units of their standard deviation: those of readings as in a fit, those of a spectrum's pixels as the field
+states them (:mod:`warprrf.rf.fields.bistatic.uncertainty`); large ones count linearly (Huber 1964).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+from threadpoolctl import threadpool_limits
+
+from warprrf.device import Progress
+from warprrf.rf.em.waves import NEPER
+from warprrf.rf.fields.base import Measured
+from warprrf.rf.fields.bistatic.field_map import SPACING_M, FieldMap, best_on_map, maps_of
+from warprrf.rf.fields.bistatic.observations import NOISE_DB, Place, as_list, huber, kinds_of, places_of
+from warprrf.rf.fields.bistatic.uncertainty import bins
+from warprrf.rf.fields.location import Location
+from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.readings import Readings
+from warprrf.rf.spectra.spectrum import Spectrum
+from warprrf.rf.tracing.tracer import Tracer
+
+STARTS = 2  # places of the lattice that are searched from; in a lobby the best one is within it of the truth
+STEPS = 4, 3  # most Gauss-Newton steps, first with single mirrors, then with all effects
+LONGEST_M, SHORTEST_M = 0.35, 3e-3  # steps: none is longer, and shorter ones are the last
+FIRST_DIFFERENCE_M, DIFFERENCE_M = 0.1, 0.04
+"""First and least: half of the last step between. Over shorter ones the noise of few rays looks like slopes."""
+TURN_RAD = 0.005  # difference of azimuths
+SUB_PIXELS = (
+    1,
+    2,
+)  # square root of the rays a pixel, first and to the end: the noise of few rays moves the least loss
+SMOOTH = 3  # pixels of a spectrum that slopes are means over, along each axis: noise of slopes would pass for curvature
+HUBER = 3.0  # standard deviations
+LEAST_STD_DB = 0.3  # of a pixel: no field is so exact that tenths of a decibel tell places apart
+BLOCKS = (
+    12  # along each axis of a spectrum, whose errors hang together: what one edge in the wrong place spoils
+)
+FOLLOWED = 1.4  # times the least loss: candidates are followed below
+SAME_M = 0.1  # candidates nearer than this are one
+SURE, EXPLAINED = 0.95, 4.0  # likelihood and misfit of a place that is known
+
+
+def as_data(field: Any, measured: Any) -> list[Measured]:
+    """``measured`` as data sets of one place that nobody knows: receivers stand a metre beside their transmitters.
+
+    Raises:
+        TypeError, ValueError: naming ``measured``.
+    """
+    if isinstance(measured, Spectrum):
+        if measured.path_gain.ndim != 2:
+            raise ValueError(
+                f"measured: got {len(measured.path_gain)} spectra, expected that of one receiver"
+            )
+        own = {name: getattr(field, name) for name in ("transmitter", "frequency_hz", "beam_sigma_rad")}
+        own = {name: measured.attributes.get(name, value) for name, value in own.items()}
+        measured = SpectrumDataset.from_spectra(
+            receivers=field.transmitter[None] + 1.0, path_gain=measured.path_gain[None],
+            floor=measured.floor or field.floor, **own,
+        )  # fmt: skip
+    found = []
+    for one in as_list(measured):
+        of, told = one.frequency_hz / 1e9, field.frequency_hz / 1e9
+        if abs(of / told - 1.0) > 1e-3:
+            raise ValueError(
+                f"measured: got {of:g} GHz, expected {told:g}; field.at_frequency(hz) is of another carrier"
+            )
+        if isinstance(one, Readings):
+            if one.departure is not None or one.delay_s is not None:
+                raise ValueError(
+                    "measured: got readings by departure or by delay, expected by arrival, or power alone"
+                )
+        elif len(one) != 1:
+            raise ValueError(
+                f"measured: got spectra of {len(one)} receivers, expected that of one: ds.subset([k])"
+            )
+        sources = one.transmitter[None] if isinstance(one, SpectrumDataset) else one.transmitters
+        found.append(replace(one, receivers=sources + [1.0, 0.0, 0.0]))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Unknowns (U,) and what they leave: errors in standard deviations ``(N,)`` and their slopes ``(N, U)``."""
+
+    unknown: np.ndarray
+    error: np.ndarray
+    rise: np.ndarray
+
+    @property
+    def threshold(self) -> float:
+        """Errors above it count linearly. It goes with all of them: far from the place most are large, and all slopes count."""
+        return HUBER * max(1.0, float(np.sqrt(np.mean(self.error**2))))
+
+    def loss(self, threshold: float) -> float:
+        """Sum of squares, those above ``threshold`` counted linearly."""
+        return float(huber(self.error, threshold)[0].sum())
+
+    def normal(self, threshold: float) -> tuple[np.ndarray, np.ndarray]:
+        """Curvature ``(U, U)`` and gradient ``(U,)`` of half the loss."""
+        weighed = self.rise * huber(self.error, threshold)[1][:, None]
+        return weighed.T @ self.rise, weighed.T @ self.error
+
+    def near(self, others: Sequence[Found]) -> bool:
+        """Whether it is the same place as one of ``others``."""
+        return any(np.linalg.norm(self.unknown[:3] - other.unknown[:3]) < SAME_M for other in others)
+
+
+class Question:
+    """What was read at one place, which is sought in a field.
+
+    Unknowns are its position [m], the azimuths' zero of each table that does not know it [rad], and ln of each measuring
+    chain's gain.
+
+    Args:
+        field: a bistatic field.
+        data: see :func:`as_data`.
+    """
+
+    def __init__(self, field: Any, data: Sequence[Measured]) -> None:
+        self.field, self.data = field, data
+        self.places = places_of(data, None, field.device)
+        self.transmitters = list(np.unique([place.transmitter for place in self.places], axis=0))
+        self.chains = sorted({place.chain for place in self.places} - {""})
+        self.turned = [k for k, one in enumerate(data) if isinstance(one, Readings) and not one.azimuth_known]
+        self.spectra = all(isinstance(one, SpectrumDataset) for one in data)
+        self.weights = [self._weight(one) for one in data]
+        self._tracers: dict[Any, Tracer] = {}
+
+    def _weight(self, one: Measured) -> np.ndarray | None:
+        """By what errors of a spectrum's pixels are multiplied before they count as those of readings do."""
+        if not isinstance(one, SpectrumDataset):
+            return None
+        db = NEPER * np.log1p(np.nan_to_num(one.path_gain[0].astype(float)) / one.floor)
+        known = self.field.errors
+        return (
+            NOISE_DB
+            / (np.maximum(known.table[bins(db)], LEAST_STD_DB) if known else np.full(db.shape, NOISE_DB))
+        ).ravel()
+
+    def starts(self, maps: dict[bytes, FieldMap]) -> np.ndarray:
+        """Unknowns at the places of a lattice that suit best and lie apart, shape ``(S, U)``."""
+        places = next(iter(maps.values())).places
+        cost, gains, turn = np.zeros(len(places)), np.zeros((len(places), len(self.chains))), []
+        for k, one in enumerate(self.data):
+            least, own, gain = best_on_map(one, maps, self.chains)
+            cost, gains = cost + least, gains + gain
+            turn += [own] if k in self.turned else []
+        turns = np.stack(turn, axis=1) if turn else gains[:, :0]
+        every, chosen = np.concatenate([places, turns, gains / NEPER], axis=1), list[int]()
+        for p in np.argsort(cost, kind="stable"):
+            if all(np.linalg.norm(places[p] - places[q]) > 1.2 * SPACING_M for q in chosen):
+                chosen.append(int(p))
+            if len(chosen) == STARTS:
+                break
+        return every[chosen]
+
+    def moved(self, unknown: np.ndarray) -> list[Measured]:
+        """The data with azimuths put right."""
+        found: list[Any] = list(self.data)
+        for k, by in zip(self.turned, unknown[3:], strict=False):
+            found[k] = replace(found[k], arrival=found[k].arrival + [0.0, by], azimuth_known=True)
+        return found
+
+    def errors(self, unknown: np.ndarray, step_m: float, *, quick: bool) -> Found:
+        """What ``unknown`` (U,) leaves; slopes are differences over ``step_m`` to either side. ``quick``: with few
+        rays and single mirrors."""
+        points = unknown[:3] + step_m * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+        kinds, further, seen = kinds_of(self.moved(unknown)), {}, dict[Any, Any]()
+        for j, k in enumerate(self.turned):
+            other = unknown + TURN_RAD * (np.arange(len(unknown)) == 3 + j)
+            further[k] = 3 + j, kinds_of(self.moved(other))[k]
+        errors, rises = [], []
+        for place in self.places:
+            key = place.transmitter.tobytes(), place.shape, place.beam_sigma_rad
+            if key not in seen:
+                seen[key] = self._views(place, points, quick)
+            views, *under = seen[key]
+            chain = 3 + len(self.turned) + self.chains.index(place.chain) if place.chain else None
+            gain = 1.0 if chain is None else float(np.exp(unknown[chain]))
+            column, turned = further.get(place.data, (0, None))
+            asked = [(kinds[place.data], *one) for one in zip(points, views, strict=True)]
+            asked += [] if turned is None else [(turned, points[0], views[0])]
+            observed = [kind.observe(replace(place, receiver=point), view) for kind, point, view in asked]
+            powers = [gain * o.predicted(*under) for o in observed]
+            target, weight = observed[0].target, self.weights[place.data]
+            target = target if weight is None else target.trusted(weight)
+            error, *others = (target.error(power) / NOISE_DB for power in powers)
+            rise = np.zeros((len(error), len(unknown)))
+            # Of both sides: the noise of one alone would hang together with that of the errors, and pull the place aside.
+            rise[:, :3] = (np.stack(others[:3], axis=1) - np.stack(others[3:6], axis=1)) / (2.0 * step_m)
+            if turned is not None:
+                rise[:, column] = (others[6] - error) / TURN_RAD
+            if chain is not None:
+                rise[:, chain] = target.slope(powers[0]) * powers[0] / NOISE_DB
+            if weight is not None:
+                image = rise.reshape(*place.shape, -1)
+                rise = uniform_filter(
+                    image, (SMOOTH, SMOOTH, 1), mode=("nearest", "wrap", "nearest")
+                ).reshape(rise.shape)
+            errors.append(error)
+            rises.append(rise)
+        return Found(unknown, np.concatenate(errors), np.concatenate(rises))
+
+    def _views(self, place: Place, points: np.ndarray, quick: bool) -> tuple[Any, ...]:
+        """What is seen at ``points`` under a place's transmitter, the model, and its evaluation there."""
+        f = self.field
+        tracer, model = f.tracer(place.transmitter), f.state
+        if quick:
+            model = replace(model, effects=replace(model.effects, mirrors=min(model.effects.mirrors, 1)))
+        few = self._tracers.setdefault(
+            (place.seen_from, quick), tracer.on_grid(place.shape, SUB_PIXELS[not quick])
+        )
+        few.beam_sigma_rad = place.beam_sigma_rad
+        paths = few.paths(points, model.effects)
+        views = [
+            few.view(point, model.effects, paths=paths.of(np.array([k]))) for k, point in enumerate(points)
+        ]
+        return views, model, f.materials_of(tracer)
+
+    def descend(self, unknown: np.ndarray, *, quick: bool) -> Found:
+        """From ``unknown`` (U,) to where errors are least."""
+        damping, difference = 1e-3, FIRST_DIFFERENCE_M if quick else 2.0 * DIFFERENCE_M
+        now = self.errors(unknown, difference, quick=quick)
+        for _ in range(STEPS[0 if quick else 1]):
+            threshold = now.threshold
+            curvature, gradient = now.normal(threshold)
+            diagonal = np.diag(curvature) + 1e-9 * np.trace(curvature)
+            step = -np.linalg.solve(curvature + damping * np.diag(diagonal), gradient)
+            step *= min(1.0, LONGEST_M / max(float(np.linalg.norm(step[:3])), 1e-12))
+            while not self.field.mesh.visible(now.unknown[None, :3], (now.unknown + 1.1 * step)[None, :3])[0]:
+                step *= 0.5  # not through walls
+            length = float(np.linalg.norm(step[:3]))
+            difference = float(np.clip(0.5 * length, DIFFERENCE_M, difference))
+            other = self.errors(now.unknown + step, difference, quick=quick)
+            better = other.loss(threshold) < now.loss(threshold)
+            now, damping = (other, 0.2 * damping) if better else (now, max(1.0, 4.0 * damping))
+            if length < SHORTEST_M * (3.0 if quick else 1.0):
+                break
+        return now
+
+    def covariance(self, best: Found, threshold: float) -> np.ndarray:
+        """Of the position's error [m^2], shape ``(3, 3)``, by what errors turn out to be."""
+        curvature = best.normal(threshold)[0]
+        inverse, count = np.linalg.pinv(curvature), len(best.error)
+        if not self.spectra:
+            return np.asarray(inverse * max(1.0, best.loss(threshold) / max(count - len(curvature), 1)))[
+                :3, :3
+            ]
+        shape = self.places[0].shape  # blocks of pixels are independent (Liang and Zeger 1986)
+        row, column = np.indices(shape) * BLOCKS // np.array(shape)[:, None, None]
+        block = np.resize(BLOCKS * row + column, count)
+        score = best.rise * (huber(best.error, threshold)[1] * best.error)[:, None]
+        sums = np.stack([np.bincount(block, one) for one in score.T], axis=1)
+        return np.asarray(inverse @ (sums.T @ sums) @ inverse)[:3, :3]
+
+
+def locate(
+    field: Any, measured: Any, store: str | os.PathLike[str] | None, progress: Progress | None
+) -> Location:
+    """See :meth:`RadioField.locate`; ``field`` is a bistatic one."""
+    question = Question(field, as_data(field, measured))
+    sources = question.transmitters
+    maps = field._maps.get(np.stack(sources).tobytes(), lambda: maps_of(field, sources, store, progress))
+    with threadpool_limits(1, user_api="blas"):  # matrices are small
+        return search(question, maps)
+
+
+def search(question: Question, maps: dict[bytes, FieldMap]) -> Location:
+    """From the lattice's best places to the candidates, and what is known of the likeliest."""
+    first = [question.descend(start, quick=True) for start in question.starts(maps)]
+    threshold = min(one.threshold for one in first)
+    first.sort(key=lambda one: one.loss(threshold))
+    least, found, rest = first[0].loss(threshold), list[Found](), list[Found]()
+    for one in first:
+        if one.loss(threshold) >= FOLLOWED * least:
+            rest.append(one)
+        elif not one.near(first[: first.index(one)]):
+            found.append(question.descend(one.unknown, quick=False))
+    best = min(found, key=lambda one: one.loss(threshold))
+    ahead = {id(one): least - best.loss(threshold) for one in rest}  # what all effects would bring them too
+    spread = best.loss(threshold) / max(len(best.error) - len(best.unknown), 1)
+    pixels = max(
+        [
+            1.0,
+            *(
+                one.beam_sigma_rad**2 * one.path_gain.size
+                for one in question.data
+                if isinstance(one, SpectrumDataset)
+            ),
+        ]
+    )
+    loss = {id(one): one.loss(threshold) - ahead.get(id(one), 0.0) for one in found + rest}
+    order = sorted(found + rest, key=lambda one: loss[id(one)])
+    order = [one for k, one in enumerate(order) if not one.near(order[:k])]
+    # Pixels within a beam have one error.
+    likelihood = np.exp(
+        [-0.5 * (loss[id(one)] - loss[id(best)]) / (pixels * max(spread, 1.0)) for one in order]
+    )
+    likelihood /= likelihood.sum()
+    covariance, misfit = question.covariance(best, threshold), float(np.sqrt(spread))
+    close = float(np.sqrt(np.trace(covariance))) < SPACING_M
+    after = zip(question.turned, best.unknown[3:].tolist(), strict=False)
+    gains = (NEPER * best.unknown[3 + len(question.turned) :]).tolist()
+    return Location(
+        position=best.unknown[:3], covariance=covariance, candidates=np.stack([one.unknown[:3] for one in order]),
+        likelihoods=likelihood, known=bool(likelihood[0] > SURE and close and misfit < EXPLAINED), misfit=misfit,
+        gains_db=dict(zip(question.chains, gains, strict=True)),
+        azimuth_zeros={question.data[k].name: by for k, by in after},  # type: ignore[union-attr]
+    )  # fmt: skip
