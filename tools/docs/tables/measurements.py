@@ -32,6 +32,28 @@ def _suggest() -> str:
     return markdown(("spectra of", "draws", "PSNR [dB]", "spread", *wanted), lines)
 
 
+@entry("locate")
+def _locate() -> str:
+    head = (
+        "located from",
+        "receivers",
+        "median [cm]",
+        "90th percentile",
+        "blocked: median",
+        "90th percentile",
+    )
+    further = ("beyond 30 cm", "within 95 % ellipsoid", "core seconds each", "nearest measurement [cm]")
+    keys = ("median_cm", "p90_cm", "blocked_median_cm", "blocked_p90_cm")
+    lines = [
+        [
+            r["measured"], str(r["test"]), *(show(r[key], "{:.1f}") for key in keys), f"{r['wrong']:.0%}",
+            f"{r['covered']:.0%}", show(r["cpu_s"]), show(r["nearest_cm"], "{:.0f}"),
+        ]
+        for r in read("locate")["rows"]
+    ]  # fmt: skip
+    return markdown((*head, *further), lines)
+
+
 @entry("flat")
 def _flat() -> str:
     found = read("measured_flat")
