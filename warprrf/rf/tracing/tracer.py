@@ -42,7 +42,7 @@ LIFT_M = 0.02  # rays that start on a surface start so far off it
 THROUGH_MIRRORS = 3  # rays of a pixel that look for light by way of mirrors
 INTO_MIRRORS = 2  # square root of the rays of a pixel that go on at mirrors: what these show is seen a second time already
 UNMODELLED = {("MTS", "M"), ("MTS", "T")}
-"""Ways of light and of sight that are not traced together: they bring nothing that was worth their time."""
+"""Ways of light and of sight that are not traced together."""
 SPECULAR = "specular"
 """Name of the table of line of sight and mirrors."""
 _TRACED = Cache(6)  # a lobby's take up to 90 MB each; the bound is the process's, not a surface's

@@ -71,7 +71,7 @@ MOST_RAYS = 500_000_000
 """Spectra with more rays than this are refused: what rays meet is kept during a fit."""
 RAY_BYTES = 40  # kept of each ray
 MOST_KEPT = 15_000_000
-"""Rays up to which records of them are kept, 200 bytes each; of more they are traced whenever they are asked for."""
+"""Rays up to which records of them are kept, some 200 bytes for each; of more they are traced whenever they are asked for."""
 
 
 @dataclass(frozen=True)
