@@ -11,7 +11,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -23,16 +23,13 @@ from warprrf.rf.tracing.edits import Called, Room, edited
 from warprrf.rf.tracing.model import ARRAYS, MOST_NEPERS, Parameters
 from warprrf.rf.tracing.surface import Surface
 
-if TYPE_CHECKING:
-    from warprrf.rf.fields.bistatic.field import BistaticField
-
 LOST = 0.02, 0.01
 """Share of a material's area, and area [m^2], whose loss is worth a warning."""
 MOST_EXCESS = 1e6  # of epsilon_r - 1, of a conductor
 
 
-def with_geometry(field: BistaticField, geometry: GeometryLike) -> dict[str, Any]:
-    """The parts of ``field`` that are others in ``geometry``, by name."""
+def with_geometry(field: Any, geometry: GeometryLike) -> dict[str, Any]:
+    """The parts of a bistatic ``field`` that are others in ``geometry``, by name."""
     old, room = field.surface, Room.of(field.surface, geometry)
     known = {m.name: m for m in getattr(geometry, "materials", ()) if isinstance(m, Material)}
     names = [m.name for m in room.materials[old.groups :]]
@@ -54,9 +51,9 @@ def with_geometry(field: BistaticField, geometry: GeometryLike) -> dict[str, Any
 
 
 def with_objects(
-    field: BistaticField, objects: Mapping[str, Mesh | None], materials: Mapping[str, Material | str]
+    field: Any, objects: Mapping[str, Mesh | None], materials: Mapping[str, Material | str]
 ) -> dict[str, Any]:
-    """The parts of ``field`` that are others with ``objects``, by name."""
+    """The parts of a bistatic ``field`` that are others with ``objects``, by name."""
     s, new, kept = field.surface, dict[str, Material](), np.ones(len(field.mesh.faces), bool)
     there = {name: mesh for name, mesh in objects.items() if mesh is not None}
     if unknown := sorted(set(materials) - set(there)):
@@ -103,7 +100,7 @@ def _group(s: Surface, name: str, material: Material | str | None, new: dict[str
     return s.groups + list(new).index(title)
 
 
-def _parts(field: BistaticField, room: Room, materials: Sequence[Material | None]) -> dict[str, Any]:
+def _parts(field: Any, room: Room, materials: Sequence[Material | None]) -> dict[str, Any]:
     """The parts of ``field`` that are others in ``room``, whose new groups are of ``materials``; None where nobody knows."""
     frequency_hz, p, laws = field.frequency_hz, field.parameters, np.full((len(materials), 4), np.nan)
     for k, material in enumerate(materials):
