@@ -25,6 +25,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from warprrf.cache import cached_property
 from warprrf.checks import check_array, check_number, check_positive, checked
@@ -330,14 +331,7 @@ def samples_of(antenna: Antenna) -> np.ndarray:
 
 def rotation_matrix(orientation: ArrayLike) -> np.ndarray:
     """Rotation from local to world axes of yaw, pitch and roll [rad]; 3GPP TR 38.901, eq. (7.1-4)."""
-    (ca, cb, cg), (sa, sb, sg) = np.cos(orientation), np.sin(orientation)
-    return np.array(
-        [
-            [ca * cb, ca * sb * sg - sa * cg, ca * sb * cg + sa * sg],
-            [sa * cb, sa * sb * sg + ca * cg, sa * sb * cg - ca * sg],
-            [-sb, cb * sg, cb * cg],
-        ]
-    )
+    return Rotation.from_euler("ZYX", orientation).as_matrix()
 
 
 def check_rotation(orientation: ArrayLike) -> np.ndarray:

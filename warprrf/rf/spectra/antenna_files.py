@@ -2,9 +2,10 @@
 
 A line is a keyword and its value. ``GAIN`` is in dBd (over a half-wave dipole, 2.15 dBi), or in dBi where that stands behind it.
 ``HORIZONTAL n`` and ``VERTICAL n`` are followed by n lines of an angle [degrees] and a loss below the maximum [dB, positive].
-Azimuths count from boresight clockwise as a compass does, elevations from the horizon down: 90 is the ground, 270 the sky.
+Azimuths are taken to count from boresight clockwise as a compass does, elevations from the horizon down: 90 is the ground, 270
+the sky. No source says so outright; most antennas are symmetric in azimuth.
 Sources: "Description of Planet antenna database" (MSI); Radio Mobile's and CPAN's RF::Antenna::Planet::MSI::Format descriptions of
-the format, which agree.
+the format.
 """
 
 from __future__ import annotations

@@ -16,7 +16,9 @@ from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import gauss_newton as newton
 from warprrf.rf.fields.bistatic import training
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.measured import WeighedPaths
+from warprrf.rf.fields.bistatic.gauss_newton import Problem
+from warprrf.rf.fields.bistatic.measured import SpectrumPixels, WeighedPaths
+from warprrf.rf.fields.bistatic.merging import _mirror_changes
 from warprrf.rf.fields.bistatic.observations import Columns
 from warprrf.rf.fields.bistatic.training import trace
 from warprrf.rf.spectra.beam import BeamOperator
@@ -24,6 +26,7 @@ from warprrf.rf.spectra.lookups import nearest
 from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.spectrum import spread, sub_pixel_directions, to_db
 from warprrf.rf.tracing.model import SETS, Effects, Parameters
+from warprrf.rf.tracing.records import Materials
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import SPECULAR
 
@@ -213,6 +216,23 @@ def test_a_fit_finds_whether_readings_have_what_slabs_let_through(most):
     }
     field = RadioField.fit(scene, replace(bare, **arrays))
     assert field.effects.transmissions == most
+
+
+def test_what_readings_would_change_by_is_known_of_slabs_too():
+    """If glass became another material, whose slab it stays, its mirror paths and what it lets through change at once."""
+    scene, carrier_hz = glazed(), 140e9
+    effects = replace(SETS["single"], transmissions=3, residual=False)
+    field = BistaticField.prior(scene, spectra(scene, RECEIVERS, frequency_hz=carrier_hz), effects=effects)
+    view = field.view(RECEIVERS[3])
+    assert (view.paths.slabs > 0).any()
+    p = replace(field.parameters, log_excess=np.log([1.5, 6.0]), log_through=np.array([-0.7, -0.2]))
+    o = observation(view, SpectrumPixels(field._beam), field.floor)
+    problem = Problem.of([o], effects, np.arange(2), p)
+    changed = _mirror_changes(o, problem, problem.materials(p, 1.0), np.arange(2))
+    before, after = (Materials(p, view.tracer.slabs, np.array(material)) for material in ([0, 1], [0, 0]))
+    powers = [view.records[SPECULAR].powers(own) for own in (after, before)]
+    expected = (powers[0] - powers[1])[view.kept_paths(effects)] @ o.path[view.kept_paths(effects)]
+    np.testing.assert_allclose(changed[1][0], expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
 
 
 def test_what_glass_lets_through_is_found_at_any_carrier_or_said_to_be_left_out():
