@@ -13,6 +13,7 @@ from warprrf.rf.em.fresnel import fresnel_curves, slab_transmission
 from warprrf.rf.em.materials import itu_material
 from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
+from warprrf.rf.fields.bistatic import fit as fitting
 from warprrf.rf.fields.bistatic import gauss_newton as newton
 from warprrf.rf.fields.bistatic import training
 from warprrf.rf.fields.bistatic.field import BistaticField
@@ -68,6 +69,32 @@ def test_a_fit_to_many_keeps_no_records_and_is_the_same(scene, data, field, monk
     assert np.array_equal(again.residual, field.residual)
     for name in ("log_weight", "log_excess", "log_mirror"):
         assert np.array_equal(getattr(again.parameters, name), getattr(field.parameters, name))
+
+
+def test_some_of_many_receivers_decide_and_all_are_learned_from(scene, data, field, monkeypatch):
+    """Whether records are kept or traced again changes no bit; places that decide nothing are traced for what was chosen."""
+    monkeypatch.setattr(training, "HELD_OUT", 0.4)
+    monkeypatch.setattr(training, "MOST_TO_CHOOSE", 2)
+    monkeypatch.setattr(training, "MOST_READINGS", 1500)
+    seen, found = [], []
+    for most in (training.MOST_KEPT, 0):
+        monkeypatch.setattr(training, "MOST_KEPT", most)
+        monkeypatch.setattr(fitting, "MOST_KEPT", most)
+        traced = []
+        monkeypatch.setattr(
+            fitting, "trace", lambda *a, k=traced, **o: k.append((o, trace(*a, **o))) or k[-1][1]
+        )
+        found.append(RadioField.fit(scene, data))
+        seen.append(traced)
+    kept, again = found
+    for (decide, few), (rest, others) in seen:
+        assert (len(few.views), len(others.views)) == (8, 2)
+        assert decide["effects"] is None and rest["effects"] == replace(kept.effects, residual=True)
+    assert {SPECULAR} == set(seen[1][1][1].views[0].records) < set(seen[0][1][1].views[0].records)
+    assert np.array_equal(kept.residual, again.residual)
+    assert kept.report["receivers"] == len(kept.fitted_on) == 10
+    alone = RadioField.fit(scene, data.subset(decide["only"]))
+    assert psnr(kept, data.subset(rest["only"])) > psnr(alone, data.subset(rest["only"])) + 0.5
 
 
 def test_ten_times_better_than_the_nearest_measurement(field, data):
