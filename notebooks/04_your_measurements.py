@@ -74,7 +74,7 @@ def measure(chosen, seed=0):
     up = 90 - (np.arange(rows) + 0.5) * 180 / rows
     around = -180 + (np.arange(columns) + 0.5) * 360 / columns
     pixels = unit(around[None, :], up[:, None]).reshape(-1, 3)
-    weight = HORN(np.arccos(np.clip(unit(AZIMUTH, ELEVATION) @ pixels.T, -1, 1)))
+    weight = HORN.gain_off_boresight(np.arccos(np.clip(unit(AZIMUTH, ELEVATION) @ pixels.T, -1, 1)))
     tables = []
     for k in chosen:
         power = 10 * np.log10(weight @ places.path_gain[k].ravel().astype(float))

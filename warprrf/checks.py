@@ -479,7 +479,7 @@ def _as_object(kind: type, value: object) -> object:
 def one_line(self: Any) -> str:
     """The ``__repr__`` of a dataclass of arrays: shapes of all but short ones, other values as they are, None left out."""
     parts = []
-    for field in fields(self):
+    for field in (one for one in fields(self) if not one.name.startswith("_")):
         value = getattr(self, field.name)
         if hasattr(value, "shape") and (np.size(value) > 3 or np.ndim(value) > 1 or len(repr(value)) > 40):
             parts.append(f"{field.name} {tuple(value.shape)}")

@@ -46,6 +46,7 @@ REFUSED = (
     "interop.load_sionna_scene",
     "reconstruct",
     "HarmonicField.suggest",
+    "HarmonicField.locate",
 )
 """What is refused without any change: it asks for objects or files of other programs, for photos of a place, or a
 bistatic field."""

@@ -360,7 +360,9 @@ FORMATS: dict[str, Format] = {
         f"{name} field": Format(_copy(f"{name}.safetensors"), _field, "tensors", "sealed", ("transmitter",))
         for name in ("bistatic", "harmonic", "rf3dgs")
     },
-    "field without checksum": Format(_made("old.safetensors", without_checksum), _field, "", "whole", ("transmitter",)),
+    "field without checksum": Format(
+        _made("old.safetensors", without_checksum), _field, "", "whole", ("transmitter", "receivers")
+    ),
     "unfinished store": Format(_copy("store.nc.unfinished", "bistatic.safetensors"), _resumed, "", "sealed"),
     "paths": Format(_copy("paths.nc"), _paths, "netcdf", "sealed", unknown=(".jones",)),
     "reconstruction": Format(

@@ -243,7 +243,6 @@ def _table(place: Place, edits: tuple[Edit, ...]) -> str:
 
 
 PICKLED: dict[str, Callable[[Place], Any]] = {
-    "horn": lambda place: wr.horn(0.2),
     "idw": lambda place: wr.lookups.idw(place.train),
     "constant": lambda place: wr.lookups.constant(place.train),
     "mean": lambda place: wr.lookups.mean(place.train),
@@ -252,11 +251,8 @@ PICKLED: dict[str, Callable[[Place], Any]] = {
 
 def _pickles(place: Place, edits: tuple[Edit, ...]) -> str:
     """What a pickle brings back is the same."""
-    name = edits[0][0]
-    held = (CLASSES | PICKLED)[name](place)
+    held = (CLASSES | PICKLED)[edits[0][0]](place)
     again = pickle.loads(pickle.dumps(held))
-    if name == "horn":
-        return differs(leaves(again(TOWARDS)), leaves(held(TOWARDS)))
     return differs(leaves(again), leaves(held)) if type(again) is type(held) else f"a {type(again).__name__}"
 
 

@@ -143,6 +143,7 @@ MADE: dict[str, Callable[[Place], Any]] = {
     "mesh": lambda p: p.scene.mesh,
     "spectra": lambda p: wr.SpectrumDataset.load(p.folder / "spectra.nc"),
     "train": lambda p: p.spectra.split(8)[0],
+    "measured": lambda p: p.train.subset([0]),
     "test": lambda p: p.spectra.split(8)[1].subset([0, 1]),
     "receivers": lambda p: np.array(p.spectra.receivers[:3]),
     "gaussians": lambda p: discs_on_mesh(p.mesh, 200),

@@ -365,7 +365,7 @@ def test_a_fit_goes_on_after_steps_that_were_cut_short(field, monkeypatch):
     unlit = np.zeros((count, 1), np.float32), np.arange(count), np.zeros((len(view.paths), count), np.float32)
     o = observation(view, WeighedPaths(nowhere, *unlit), 1.0, target)
     problem = newton.Problem([o], [columns], Effects(True, 0, 0), np.zeros(1, int), energy=1e6)
-    for name, loose in {"WEIGHT": 1e3, "EXCESS": 1e-3, "MIRROR": 1e3}.items():
+    for name, loose in {"WEIGHT_STD": 1e3, "EXCESS_STD": 1e-3, "MIRROR_STD": 1e3}.items():
         monkeypatch.setattr(newton, name, loose)
     found = newton.gauss_newton(problem, replace(true, log_weight=true.log_weight - 9.0), 40)
     (now,) = problem.errors_db(found.parameters)
