@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,18 +18,11 @@ from scipy.linalg.blas import ssyrk
 
 from warprrf.cache import cached_property
 from warprrf.rf.em.waves import NEPER
-from warprrf.rf.fields.bistatic.observations import (
-    NOISE_DB,
-    OWN_GAIN,
-    Columns,
-    Observation,
-    columns_of,
-    huber,
-)
+from warprrf.rf.fields.bistatic.batch import Batch
+from warprrf.rf.fields.bistatic.observations import NOISE_DB, Columns, Observation, columns_of, huber
 from warprrf.rf.tracing.model import ROUGHNESS, Effects, Layout, Model, Parameters
-from warprrf.rf.tracing.records import Materials, Records
+from warprrf.rf.tracing.records import Materials
 from warprrf.rf.tracing.render import materials_of
-from warprrf.rf.tracing.tracer import SPECULAR
 
 WEIGHT_STD, EXCESS_STD, MIRROR_STD = 2.0, 0.8, 1.5
 """Standard deviations a priori of lobe weights, permittivity less one and mirrored share from where a fit starts [nepers]."""
@@ -44,6 +36,7 @@ GAIN_STD, CHAIN_STD = 1.0, 10.0
 CARRIER_STD = 1.0
 """That of the power of the carrier that roughness goes with, from Ament's 2."""
 LONGEST = 1.5  # change of a logarithm in one step
+SINGLE_SUM = 1024  # readings that are summed in single precision
 TOLERANCE = 1e-3  # relative fall of the objective that ends a fit
 
 
@@ -94,93 +87,47 @@ class Problem:
         return cls(observations, columns, effects, material, **settings)
 
     @cached_property
-    def by_materials(self) -> list[Columns]:
-        """Columns of materials instead of groups."""
-        return [c.by_materials(self.material) for c in self.columns]
+    def batches(self) -> list[Batch]:
+        """All observations, as few tables as may be."""
+        return Batch.several(self.observations, self.columns, self.effects, self.material)
 
-    @cached_property
-    def direct(self) -> tuple[Records, list[slice]]:
-        """Line of sight and mirrors of all observations, and which are of each: one launch serves all."""
-        tables = [o.view.records[SPECULAR] for o in self.observations]
-        ends = np.cumsum([0, *map(len, tables)])
-        return Records.joined(tables), [slice(*own) for own in pairwise(ends)]
-
-    def materials(self, p: Parameters, ratio: float) -> Materials:
-        """Parameters ``p`` at ``ratio`` times their carrier, as kernels take them."""
-        tracer = next(o.view.tracer for o in self.observations if o.ratio == ratio)
-        return Materials(p.at_ratio(ratio), tracer.slabs, self.material, device=tracer.grid.device)
-
-    def evaluated(self, p: Parameters) -> Iterator[tuple[Observation, Columns, Materials, np.ndarray]]:
-        """Observations with the columns of their materials, the parameters ``p`` at their carriers as kernels take them,
-        and predictions without the gains of chains, in units of each floor."""
-        if not self.observations:
-            return
-        known: dict[float, tuple[Materials, np.ndarray]] = {}
-        for o, columns, own in zip(self.observations, self.by_materials, self.direct[1], strict=True):
-            if o.ratio not in known:
-                materials = self.materials(p, o.ratio)
-                known[o.ratio] = materials, self.direct[0].powers(materials)
-            materials, direct = known[o.ratio]
-            here = materials.parameters
-            yield (
-                o,
-                columns,
-                materials,
-                here.gain * (columns.power(here) + o.direct(self.effects, materials, direct[own])),
-            )
+    def evaluated(self, p: Parameters) -> Iterator[tuple[Batch, Materials, np.ndarray]]:
+        """Batches with the parameters ``p`` of materials at their carriers as kernels take them, and predictions without the
+        gains of chains, in units of each floor."""
+        for batch in self.batches:
+            tracer = batch.observations[0].view.tracer
+            here = p.at_ratio(batch.ratio)
+            materials = Materials(here, tracer.slabs, self.material, device=tracer.grid.device)
+            yield batch, materials, batch.power(materials)
 
     def errors_db(self, p: Parameters) -> Iterator[np.ndarray]:
-        """Predictions less what was read, as it counts [dB]."""
-        for o, _, _, power in self.evaluated(p):
-            yield o.target.error(o.gain(p, power) * power)
+        """Of each batch predictions less what was read, as it counts [dB]."""
+        for batch, _, power in self.evaluated(p):
+            yield batch.target.error(batch.gain(p, power) * power)
 
     def linearised(
         self, p: Parameters, layout: Layout
     ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """:meth:`errors_db` ``(N,)``, derivatives ``(C, N)`` float32, and the places of those parameters ``(C,)``."""
-        if not self.observations:
-            return
-        rise: dict[float, np.ndarray] = {}
-        specular, own = self.direct
-        side = self.observations[0].view.tracer.surface.side_group
-        whole, every = layout.columns(self.material[specular.groups(side)])
-        for rows, (o, columns, materials, power) in zip(own, self.evaluated(p), strict=True):
-            if o.ratio not in rise:
-                rise[o.ratio] = specular.slopes(materials, whole, len(every))
-            place, index = layout.columns(self.material[o.view.records[SPECULAR].groups(side)])
-            slopes = np.ascontiguousarray(rise[o.ratio][rows][:, np.searchsorted(every, index)])
-            table, index = _joined(
-                columns.slopes(materials.parameters, layout),
-                (o.direct_slopes(self.effects, materials, place, slopes), index),
-            )
-            table *= np.float32(materials.parameters.gain)
+        for batch, materials, power in self.evaluated(p):
+            table, index = batch.slopes(materials, layout)
             if layout.gain:
                 table = np.concatenate([table, power[None].astype(np.float32)])
                 index = np.append(index, layout.common_gain)
-            if o.ratio != 1.0:
-                slopes = layout.slopes_at_ratio(p, o.ratio)[index]
+            if batch.ratio != 1.0:
+                slopes = layout.slopes_at_ratio(p, batch.ratio)[index]
                 index = np.unique(slopes.indices)
                 table = np.asarray(slopes[:, index].T @ table)
-            gain = o.gain(p, power)
-            if o.chain == OWN_GAIN:  # what changes all alike changes nothing
-                known = np.ones(len(power)) if o.target.trust is None else (o.target.trust > 0).astype(float)
-                alike = table @ known / max(float(known @ power), 1e-300)
-                table = table - alike[:, None] * power
-            if o.chain != -1:
-                power, table = gain * power, np.float32(gain) * table.astype(np.float32)
-            if o.chain >= 0:
-                table = np.concatenate([table, power[None].astype(np.float32)])
-                index = np.append(index, layout.first_chain + o.chain)
-            yield o.target.error(power), (table * o.target.slope(power)).astype(np.float32), index
-
-
-def _joined(*parts: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of tables (C, N) added by their places (C,)."""
-    index = np.unique(np.concatenate([places for _, places in parts]))
-    table = np.zeros((len(index), parts[0][0].shape[1]), np.float32)
-    for rows, places in parts:
-        table[np.searchsorted(index, places)] += rows
-    return table, index
+            gain = batch.gain(p, power)
+            table = batch.without_gain(table, power)
+            power = gain * power
+            known = np.unique(batch.chain[batch.chain >= 0])
+            chain = np.repeat(batch.chain, batch.counts)
+            of_chains = np.where(chain == known[:, None], power, 0.0)
+            table = np.concatenate([table * gain.astype(np.float32), of_chains.astype(np.float32)])
+            index = np.append(index, layout.first_chain + known)
+            table *= batch.target.slope(power).astype(np.float32)
+            yield batch.target.error(power), table.astype(np.float32, copy=False), index
 
 
 @dataclass(frozen=True)
@@ -271,8 +218,8 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
     def total(x: np.ndarray) -> float:
         p = layout.unpack(x, start)
         prior = priors(p, start, layout, problem.energy, problem.known_through)[0]
-        own = zip(problem.observations, problem.errors_db(p), strict=True)
-        return weight * sum(float(huber(e, o.huber_db)[0].sum()) for o, e in own) + float((prior**2).sum())
+        own = (batch.fit_loss(batch.gain(p, power) * power) for batch, _, power in problem.evaluated(p))
+        return weight * sum(float(loss.sum()) for loss in own) + float((prior**2).sum())
 
     current = total(vector)
     for _ in range(steps):
@@ -307,12 +254,13 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
 def _normal_equations(problem: Problem, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Newton matrix and gradient of the data term."""
     hessian, gradient = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
-    for o, (error, table, index) in zip(problem.observations, problem.linearised(p, layout), strict=True):
-        if len(index) == 0:  # nothing that it sees is lit
-            continue
-        root = np.sqrt(huber(error, o.huber_db)[1]) / NOISE_DB
+    for batch, (error, table, index) in zip(problem.batches, problem.linearised(p, layout), strict=True):
+        root = np.sqrt(huber(error, batch.huber_db)[1]) / NOISE_DB
         table *= root.astype(np.float32)
-        hessian[np.ix_(index, index)] += ssyrk(1.0, table.T, trans=1)  # its upper triangle
+        square = np.zeros((len(index), len(index)))
+        for first in range(0, table.shape[1], SINGLE_SUM):  # their upper triangles
+            square += ssyrk(1.0, table[:, first : first + SINGLE_SUM].T, trans=1) if len(index) else 0.0
+        hessian[np.ix_(index, index)] += square
         gradient[index] += table @ (root * error).astype(np.float32)
     return np.triu(hessian) + np.triu(hessian, 1).T, gradient
 
@@ -320,10 +268,10 @@ def _normal_equations(problem: Problem, p: Parameters, layout: Layout) -> tuple[
 def _first_gain(problem: Problem, start: Parameters, chain: int) -> float:
     """ln of the gain that makes the chain's readings agree with what ``start`` predicts, in the median of their power."""
     ratio = [np.zeros(0)]
-    for o, _, _, expected in problem.evaluated(start):
-        read = np.expm1(o.target.db / NEPER)
-        known = (read > 0) & (expected > 0) & (True if o.target.censored is None else ~o.target.censored)
-        if o.chain == chain:
-            ratio.append(np.log(read[known] / expected[known]))
+    for batch, _, expected in problem.evaluated(start):
+        read, censored = np.expm1(batch.target.db / NEPER), batch.target.censored
+        known = (read > 0) & (expected > 0) & (True if censored is None else ~censored)
+        known &= np.repeat(batch.chain, batch.counts) == chain
+        ratio.append(np.log(read[known] / expected[known]))
     every = np.concatenate(ratio)
     return float(np.median(every)) if len(every) else 0.0

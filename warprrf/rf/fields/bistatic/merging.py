@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from warprrf.rf.em.fresnel import fresnel_curves
+from warprrf.rf.fields.bistatic.batch import Batch
 from warprrf.rf.fields.bistatic.gauss_newton import Problem
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, Observation, huber
-from warprrf.rf.tracing.model import Parameters
+from warprrf.rf.tracing.model import Effects, Parameters
 from warprrf.rf.tracing.records import Materials
 from warprrf.rf.tracing.tracer import SPECULAR
 
@@ -107,42 +108,45 @@ def _costs(problem: Problem, p: Parameters, unit_of: np.ndarray, owner: np.ndarr
         unit_of: unit of each group: its material, or itself.
         owner: material of each unit now.
     """
-    curves, common, count = fresnel_curves(), p, len(p.log_excess)
+    curves, count = fresnel_curves(), len(p.log_excess)
     alpha = curves.at(curves.coordinates, p.log_excess)[0]
     out = np.zeros((len(owner), count))
-    for (o, _, materials, power), c in zip(problem.evaluated(common), problem.columns, strict=True):
-        p = materials.parameters
-        mix = (p.weight[:, :, None] * alpha[:, None, :]).reshape(count, -1).astype(np.float32)
-        share = p.scattered_share.astype(np.float32)
-        gain = o.gain(p, power)
-        power, gain = gain * power, gain * p.gain
-        loss = huber(o.target.error(power), o.huber_db)[0].sum()
-        mirrors = _mirror_changes(o, problem, materials, unit_of)
-        for unit in np.unique(
-            np.concatenate([unit_of[c.groups], unit_of[c.senders], np.array(list(mirrors), int)])
-        ):
+    for batch, materials, power in problem.evaluated(p):
+        here, c = materials.parameters, batch.columns
+        mix = (here.weight[:, :, None] * alpha[:, None, :]).reshape(count, -1).astype(np.float32)
+        share = here.scattered_share.astype(np.float32)
+        gain = batch.gain(here, power)
+        power, gain = gain * power, gain * here.gain
+        loss = batch.fit_loss(power)
+        mirrors = _mirror_changes(batch, materials, unit_of)
+        met = np.array(list(mirrors), int)
+        for unit in np.unique(np.concatenate([unit_of[c.groups], unit_of[c.senders], met])):
             change = mirrors.get(int(unit), np.zeros((count, len(power)), np.float32)).copy()
             for a in np.flatnonzero(unit_of[c.groups] == unit):
                 change += (mix - mix[owner[unit]]) @ c.single[a].reshape(-1, len(power))
             for a in np.flatnonzero(unit_of[c.senders] == unit):
                 change += (share - share[owner[unit]])[:, None] * c.further[a]
-            error = o.target.error(np.maximum(power + gain * change, 0.0))
-            rise = huber(error, o.huber_db)[0].sum(axis=1) - loss
+            own = np.flatnonzero(change.any(axis=0))
+            new = np.maximum(power[own] + gain[own] * change[:, own], 0.0)
+            rise = (
+                huber(batch.target.part(own).error(new), batch.huber_db[own])[0].sum(axis=1) - loss[own].sum()
+            )
             out[unit] += rise / NOISE_DB**2
     return out
 
 
-def _mirror_changes(
-    o: Observation, problem: Problem, materials: Materials, unit_of: np.ndarray
-) -> dict[int, np.ndarray]:
+def _mirror_changes(batch: Batch, materials: Materials, unit_of: np.ndarray) -> dict[int, np.ndarray]:
     """By unit the change of readings, shape ``(materials, N)``, by paths that meet it if it became each material."""
-    p, specular, found = materials.parameters, o.view.records[SPECULAR], {}
-    specular = specular.take(np.flatnonzero(o.view.kept_paths(problem.effects)))
+    p, found, specular = materials.parameters, dict[int, np.ndarray](), batch.specular
     meets, count = specular.index >= 0, len(p.log_excess)
     group = np.maximum(specular.index, 0)
     unit = np.where(meets, unit_of[group], -1)
+    if batch.phases_count:
+        for one in np.unique(unit[meets]):
+            heard = [_heard(o, batch.effects, materials, unit_of == one) for o in batch.observations]
+            found[int(one)] = np.concatenate(heard, axis=1)
+        return found
     now = np.where(meets, materials.material[group], -1).astype(np.int32)
-    path = o.path[o.view.kept_paths(problem.effects)]
     # Each group as if it were made of each material, as a slab of its own.
     slabs = np.repeat(materials.slabs[0], count), np.repeat(materials.slabs[1], count)
     every = Materials(p, slabs, np.tile(np.arange(count), len(unit_of)), device=materials.device)
@@ -152,25 +156,22 @@ def _mirror_changes(
 
     before = replace(specular, index=index_of(slice(None), now)).powers(every)
     for one in np.unique(unit[meets]):
-        if o.measured.together is not None:
-            found[int(one)] = _heard(o, problem, now, unit == one, p)
-            continue
         own = np.flatnonzero((unit == one).any(axis=1))
         trial = np.where(unit[own] == one, np.arange(count, dtype=np.int32)[:, None, None], now[own])
         several = specular.take(np.tile(own, count))
         several = replace(several, index=index_of(np.tile(own, count), trial.reshape(-1, now.shape[1])))
-        new = several.powers(every).reshape(count, -1)
-        found[int(one)] = (new - before[own]).astype(np.float32) @ path[own]
+        change = several.powers(every).reshape(count, -1) - before[own]
+        found[int(one)] = (batch.path[own].T @ change.T.astype(np.float32)).T
     return found
 
 
-def _heard(o: Observation, problem: Problem, now: np.ndarray, own: np.ndarray, p: Parameters) -> np.ndarray:
-    """The same where phases count: of all paths, ``own`` (L, K) of whose mirrors change."""
-    kept = o.view.kept_paths(problem.effects)
-    together, specular = o.measured.together, o.view.records[SPECULAR].take(np.flatnonzero(kept))
-    if together is None:
-        raise TypeError("measured: got one that hears powers alone, expected phases")
-    together = together.subset(kept)
+def _heard(o: Observation, effects: Effects, materials: Materials, changes: np.ndarray) -> np.ndarray:
+    """The same of one observation where phases count: of all paths, where groups ``changes`` (G,) become each material."""
+    kept, p = o.view.kept_paths(effects), materials.parameters
+    specular, together = o.view.records[SPECULAR].take(np.flatnonzero(kept)), o.together.subset(kept)
+    group = np.maximum(specular.index, 0)
+    now = np.where(specular.index >= 0, materials.material[group], -1).astype(np.int32)
+    own = (specular.index >= 0) & changes[group]
     heard = [
         together.received(together.amplitudes(replace(specular, index=index), p)[0]) / o.floor
         for index in (now, *(np.where(own, material, now) for material in range(len(p.log_excess))))

@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from warprrf.rf.fields.bistatic.measured import (
     ArrayImage,
     Measurement,
     SpectrumPixels,
+    Superposition,
     WeighedPaths,
     pixel_means,
     read,
@@ -136,6 +138,19 @@ class Target:
     db: np.ndarray
     trust: np.ndarray | None = None
     censored: np.ndarray | None = None
+
+    @classmethod
+    def joined(cls, parts: Sequence[Target]) -> Target:
+        """Readings of several one after another."""
+        db, trust, censored = (
+            None
+            if all(getattr(t, name) is None for t in parts)
+            else np.concatenate(
+                [np.full(len(t.db), nothing) if (own := getattr(t, name)) is None else own for t in parts]
+            )
+            for name, nothing in (("db", 0.0), ("trust", 1.0), ("censored", False))
+        )
+        return cls(np.zeros(0) if db is None else db, trust, censored)
 
     def part(self, index: np.ndarray) -> Target:
         """Some of the readings."""
@@ -267,15 +282,41 @@ class Observation:
             self.measured.of_bins(table.astype(np.float32), quick=True).T, 0.0
         ) / np.float32(self.floor)
 
-    def direct(self, effects: Effects, materials: Materials, power: np.ndarray) -> np.ndarray:
-        """Readings of line of sight and mirrors of ``power`` (L,) in units of the floor, shape ``(N,)``."""
-        kept, together = self.view.kept_paths(effects), self.measured.together
-        if together is None:
-            return np.where(kept, power, 0.0).astype(np.float32) @ self.path
-        amplitude = together.amplitudes(
-            self.view.records[SPECULAR], materials.parameters, materials.material
-        )[0]
-        return together.received(np.where(kept, amplitude, 0.0)) / self.floor
+    @property
+    def together(self) -> Superposition:
+        """How line of sight and mirrors add up by their phases.
+
+        Raises:
+            TypeError: where their powers add.
+        """
+        if self.measured.together is None:
+            raise TypeError("measured: got readings of which powers add, expected some of which phases count")
+        return self.measured.together
+
+    def heard(self, effects: Effects, materials: Materials) -> np.ndarray:
+        """Readings of line of sight and mirrors whose phases count, in units of the floor, shape ``(N,)``."""
+        return self.together.received(self._amplitudes(effects, materials)[0]) / self.floor
+
+    def heard_slopes(
+        self, effects: Effects, materials: Materials, place: np.ndarray, count: int
+    ) -> np.ndarray:
+        """Derivatives of :meth:`heard` to ``count`` parameters ``(count, N)`` float32; those of material m stand from
+        ``place[m]`` on."""
+        specular, p = self.view.records[SPECULAR], materials.parameters
+        amplitude, slope = self._amplitudes(effects, materials)
+        rise = np.zeros((len(amplitude), count), np.float32)
+        for path, mirror in zip(*np.nonzero(specular.index >= 0), strict=True):
+            at = place[materials.material[specular.index[path, mirror]]] + len(p.lobes)
+            rise[path, at + EXCESS_COLUMN] += slope[path, mirror]
+            share = MIRRORED_COLUMN if specular.kind[path, mirror] == MIRROR else THROUGH_COLUMN
+            rise[path, at + share] += 0.5 * amplitude[path]
+        return np.asarray(rise.T @ (self.together.slopes(amplitude) / self.floor).astype(np.float32))
+
+    def _amplitudes(self, effects: Effects, materials: Materials) -> tuple[np.ndarray, np.ndarray]:
+        """Of line of sight and mirrors, and their slopes, see :meth:`Superposition.amplitudes`; 0 where one does not count."""
+        specular, kept = self.view.records[SPECULAR], self.view.kept_paths(effects)
+        amplitude, slope = self.together.amplitudes(specular, materials.parameters, materials.material)
+        return amplitude * kept, slope * kept[:, None]
 
     def slopes(self, effects: Effects, materials: Materials, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of readings to the parameters of materials ``(C, N)`` float32, and their places ``(C,)``."""
@@ -283,32 +324,12 @@ class Observation:
         side, specular = self.view.tracer.surface.side_group, tables.pop(SPECULAR)
         groups = [records.groups(side) for records in (specular, *tables.values())]
         place, index = layout.columns(materials.material[np.concatenate(groups)])
-        rise = specular.slopes(materials, place, len(index))
+        rise = specular.slopes(materials, place, len(index)) * self.view.kept_paths(effects)[:, None]
         sums = np.zeros((count, len(index)), np.float32)
         for records in tables.values():
             records.add_slopes(materials, Bins.of(own[records.ray], count), place, sums)
         scattered = np.asarray(self.measured.of_bins(sums, quick=True)).T / np.float32(self.floor)
-        return self.direct_slopes(effects, materials, place, rise) + scattered, index
-
-    def direct_slopes(
-        self, effects: Effects, materials: Materials, place: np.ndarray, rise: np.ndarray
-    ) -> np.ndarray:
-        """Derivatives of what is read of line of sight and mirrors ``(C, N)`` float32, of whose powers they are ``rise``
-        (L, C); those to the parameters of material m stand from ``place[m]`` on."""
-        kept, specular, p = self.view.kept_paths(effects), self.view.records[SPECULAR], materials.parameters
-        columns = self.path
-        if (together := self.measured.together) is not None:
-            amplitude, slope = together.amplitudes(specular, p, materials.material)
-            rise, columns = (
-                np.zeros_like(rise),
-                together.slopes(np.where(kept, amplitude, 0.0)) / self.floor,
-            )
-            for path, mirror in zip(*np.nonzero(specular.index >= 0), strict=True):
-                at = place[materials.material[specular.index[path, mirror]]] + len(p.lobes)
-                rise[path, at + EXCESS_COLUMN] += slope[path, mirror]
-                share = MIRRORED_COLUMN if specular.kind[path, mirror] == MIRROR else THROUGH_COLUMN
-                rise[path, at + share] += 0.5 * amplitude[path]
-        return np.asarray((rise * kept[:, None]).T.astype(np.float32) @ columns)
+        return rise.T.astype(np.float32) @ self.path + scattered, index
 
     @cached_property
     def ray_bins(self) -> tuple[np.ndarray, int]:
@@ -341,6 +362,20 @@ class Columns:
     senders: np.ndarray
     further: np.ndarray
 
+    @classmethod
+    def joined(cls, parts: Sequence[Columns]) -> Columns:
+        """Readings of several observations one after another."""
+        groups, senders = (
+            np.unique(np.concatenate([getattr(c, name) for c in parts])) for name in ("groups", "senders")
+        )
+        ends = np.cumsum([0, *(c.single.shape[-1] for c in parts)])
+        single = np.zeros((len(groups), *parts[0].single.shape[1:3], ends[-1]), np.float32)
+        further = np.zeros((len(senders), ends[-1]), np.float32)
+        for c, (first, last) in zip(parts, pairwise(ends), strict=True):
+            single[np.searchsorted(groups, c.groups), ..., first:last] = c.single
+            further[np.searchsorted(senders, c.senders), first:last] = c.further
+        return cls(groups, single, senders, further)
+
     def by_materials(self, material: np.ndarray) -> Columns:
         """Those of materials; ``material`` (G,) is that of each group."""
         return Columns(
@@ -365,13 +400,10 @@ class Columns:
         found = np.zeros((len(seen), layout.stride, self.single.shape[-1]), np.float32)
         alpha, rise = curves.at(curves.coordinates, p.log_excess)
         for g, columns in zip(self.groups, self.single, strict=True):
-            row = found[np.searchsorted(seen, g)]
-            row[: layout.lobes] += (
-                p.weight[g] * np.einsum("c,lcn->nl", alpha[g].astype(np.float32), columns)
-            ).T
-            row[layout.lobes + EXCESS_COLUMN] += p.weight[g] @ np.einsum(
-                "c,lcn->ln", rise[g].astype(np.float32), columns
-            )
+            row, weight = found[np.searchsorted(seen, g)], p.weight[g].astype(np.float32)
+            value, slope = np.moveaxis(np.stack([alpha[g], rise[g]]).astype(np.float32) @ columns, 1, 0)
+            row[: layout.lobes] += weight[:, None] * value
+            row[layout.lobes + EXCESS_COLUMN] += weight @ slope
         even, steeper = curves.even(p.log_excess)
         for g, column in zip(self.senders, self.further, strict=True):
             row = found[np.searchsorted(seen, g)]
@@ -558,7 +590,7 @@ class _Arrays(Kind):
             SETS["single"],
         )
         scattered = columns_of(bare, single, materials).power(start)
-        total = scattered + bare.direct(single, materials, view.records[SPECULAR].powers(materials))
+        total = scattered + bare.heard(single, materials)
         gain = bare.gain(start, total)
         std_db = (
             NEPER

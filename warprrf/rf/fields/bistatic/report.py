@@ -84,13 +84,15 @@ def side_lobes(t: Training, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
         one.problem(choice.effects, choice.material, places, p) for one in (t, replace(t, parts=parts))
     )
     linear = whole.linearised(p, layout_of(replace(whole, observations=list(t.parts.values())), p))
-    for (error, table, index), (o, _, _, power), (*_, own) in zip(
+    for (error, table, index), (batch, _, power), (*_, main_lobe) in zip(
         linear, whole.evaluated(p), main.evaluated(p), strict=True
     ):
-        gain, weight = o.gain(p, power), huber(error, o.huber_db)[1] / NOISE_DB**2
-        side = o.target.slope(gain * power) * gain * np.maximum(power - own, 0.0)
-        pull[o.chain, index] += table @ (weight * side)
-        size[o.chain] += weight @ table[-1] ** 2  # its own gain's column stands last
+        gain, weight = batch.gain(p, power), huber(error, batch.huber_db)[1] / NOISE_DB**2
+        side = batch.target.slope(gain * power) * gain * np.maximum(power - main_lobe, 0.0)
+        for chain in np.unique(batch.chain):
+            here = np.repeat(batch.chain == chain, batch.counts)
+            pull[chain, index] += table[:, here] @ (weight * side)[here]
+            size[chain] += weight[here] @ table[index == first + chain][0, here] ** 2
     own = np.arange(len(t.chains))
     share = pull[own, first + own] / np.maximum(size, 1e-300)
     moved = SIDE_LOBES_DB * np.abs((covariance[first:] * pull).sum(axis=1))

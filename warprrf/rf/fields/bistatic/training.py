@@ -441,7 +441,7 @@ class Training:
         """The same of the readings chosen of ``places``."""
         problem = self.problem(choice.effects, choice.material, places, choice.parameters)
         p = choice.parameters
-        losses = [o.losses(o.gain(p, x) * x) for o, _, _, x in problem.evaluated(p)]
+        losses = [batch.losses(batch.gain(p, x) * x) for batch, _, x in problem.evaluated(p)]
         return float(np.mean(np.concatenate(losses)))
 
     def unexplained(self, model: Model) -> Unexplained:
