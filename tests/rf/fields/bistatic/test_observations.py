@@ -15,10 +15,12 @@ from radio_scenes import as_fits_predict, observation
 from warprrf.rf.channel.array_spectra import UP, hemisphere
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.fields.bistatic import batch as batch_module
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.gauss_newton import Problem
+from warprrf.rf.fields.bistatic.gauss_newton import Problem, _normal_equations
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, WeighedPaths, read
-from warprrf.rf.fields.bistatic.observations import OWN_GAIN, observe, places_of
+from warprrf.rf.fields.bistatic.merging import _costs
+from warprrf.rf.fields.bistatic.observations import OWN_GAIN, Target, observe, places_of
 from warprrf.rf.spectra.antenna import horn
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.readings import Readings, path_weights
@@ -209,3 +211,51 @@ def test_what_was_traced_for_old_transmitters_and_dropped_fields_goes(field):
         again.spectrum(RX, [x, 0.9, 2.2])
         del again  # no reference cycle: nothing waits for the garbage collector
         assert sum(t() is not None for t in traced) <= 6
+
+
+@pytest.mark.parametrize(
+    "kinds",
+    [
+        [
+            (pixels, {}),
+            (delay_profile, {"chain": 0}),
+            (pixels, {"chain": OWN_GAIN}),
+            (delay_profile, {"chain": 1}),
+        ],
+        [(array_image, {"chain": OWN_GAIN}), (array_image, {})],
+        [(pixels, {"ratio": 0.6}), (pixels, {}), (array_image, {})],
+    ],
+    ids=["chains", "phases", "carriers"],
+)
+def test_many_places_are_fitted_to_as_each_alone(scene, kinds, monkeypatch):
+    """Objective, slopes and what merging asks of observations together are the sums of what each has, however they are put
+    into tables, with trust, censored readings and gains of their own."""
+    rng = np.random.default_rng(8)
+    field = BistaticField.prior(scene, spectra(scene, RX[None]), effects=SINGLE)
+    groups, lobes = field.parameters.log_weight.shape
+    observations = []
+    for k, (measured, how) in enumerate(kinds):
+        view = field.view(RECEIVERS[k])
+        o = observation(view, measured(view), field.floor, **how)
+        count = len(o.target.db)
+        target = Target(rng.uniform(0.0, 40.0, count), rng.uniform(0.1, 2.0, count) if k % 2 else None)
+        target = replace(target, censored=rng.random(count) < 0.3) if k == 0 else target
+        observations.append(replace(o, target=target, huber_db=3.0 + k))
+    chains = 1 + max(o.chain for o in observations)
+    p = replace(field.parameters, log_gains=rng.normal(0.0, 0.3, max(chains, 0)), log_gain=0.1)
+    p = replace(p, log_weight=p.log_weight + rng.normal(0.0, 0.5, p.log_weight.shape))
+    layout = Layout(groups, lobes, gain=True, roughness=True, chains=max(chains, 0))
+    material = np.arange(groups)
+
+    def asked(some):
+        problem = Problem.of(some, SINGLE, material, p, chains=max(chains, 0), gain_offset=True)
+        losses = [batch.fit_loss(batch.gain(p, x) * x).sum() for batch, _, x in problem.evaluated(p)]
+        return sum(losses), *_normal_equations(problem, p, layout), _costs(problem, p, material, material)
+
+    alone = [sum(parts) for parts in zip(*(asked([o]) for o in observations), strict=True)]
+    together = asked(observations)
+    monkeypatch.setattr(batch_module, "MOST_NUMBERS", 1)
+    for found in (together, asked(observations)):
+        for mine, theirs in zip(found, alone, strict=True):
+            np.testing.assert_allclose(mine, theirs, rtol=1e-4, atol=1e-5 * np.abs(theirs).max())
+    assert np.abs(together[0] - asked(observations[1:])[0]) > 1.0

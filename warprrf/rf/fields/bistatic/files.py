@@ -59,6 +59,7 @@ def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict
         for name in every:
             check_type(what, name, str)
     errors = {n.removeprefix("errors/"): t for n, t in tensors.items() if n.startswith("errors/")}
+    errors.pop("outlier_db", None)  # older files know one, which nothing reads
     parameters: dict[str, Any] = {name: tensors[f"parameters/{name}"] for name in _PARAMETERS}
     parameters |= {name: header[name] for name in _SINGLE}
     arrays: dict[str, Any] = {name: tensors[f"surface/{name}"] for name in _SURFACE}

@@ -6,8 +6,7 @@ spectra that were held out, as a function of what can be known beforehand: how s
 far above the floor, and how far the receiver is from the nearest one that was learned from.
 
 Such errors are not Gaussian: most pixels are right to a fraction of a decibel, and a few, where an edge is missing, are
-wrong by many. The standard deviation is that of the former; a share of ``OUTLIERS`` is taken to be of the latter kind
-(a contaminated normal distribution, Tukey 1960), whose deviation ``outlier_db`` is learned too.
+wrong by many. The standard deviation is that of the former.
 """
 
 from __future__ import annotations
@@ -22,14 +21,12 @@ STEEPNESS_DB = (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, 3.5, 6.0, 10.0, 20.0)  # lower en
 LEVEL_DB = (0.0, 0.02, 0.3, 3.0, 12.0, 30.0)
 ENOUGH = 60  # errors in a bin
 LEAST_DB = 0.01
-OUTLIERS = 0.05
 ARRAYS = {
     "table": Expected(f"{len(LEVEL_DB)} {len(STEEPNESS_DB)}", 0.0, 1e4),
     "growth": Expected("", 0.0, 1.0),
     "middle_m": lengths("", 0.0),
     "receivers": lengths("R 3"),
     "covariance": Expected("C C", -1e12, 1e12),
-    "outlier_db": Expected("", 0.0, 1e4),
 }
 """What the arrays of an :class:`ErrorModel` must be: R receivers, C parameters of materials."""
 
@@ -44,7 +41,6 @@ class ErrorModel:
         middle_m: distance at which the table holds.
         receivers: training receivers [m], shape ``(R, 3)``.
         covariance: of the group parameters, shape ``(C, C)``.
-        outlier_db: standard deviation of outliers [dB].
 
     Raises:
         TypeError, ValueError: for arrays of other shapes, or out of range.
@@ -55,7 +51,6 @@ class ErrorModel:
     middle_m: np.ndarray
     receivers: np.ndarray
     covariance: np.ndarray
-    outlier_db: np.ndarray
 
     def __post_init__(self) -> None:
         check_arrays(vars(self), ARRAYS)
@@ -127,11 +122,9 @@ def learn_errors(
     growth, middle = 0.0, float(np.mean(gaps))
     if len(gaps) >= 4 and np.ptp(gaps) > 0.1:
         growth = float(np.clip(np.polyfit(gaps - middle, np.log(np.maximum(typical, 1e-3)), 1)[0], 0.0, 0.3))
-    far = error[error > 3.0 * np.sqrt(np.mean(error**2))]
-    outlier = np.sqrt(np.mean(far**2)) if len(far) else 3.0 * overall
     return ErrorModel(
-        np.maximum(table, LEAST_DB), np.array(growth), np.array(middle), receivers, covariance, np.array(outlier)
-    )  # fmt: skip
+        np.maximum(table, LEAST_DB), np.array(growth), np.array(middle), receivers, covariance
+    )
 
 
 def _scale(error: np.ndarray) -> float:
