@@ -254,8 +254,8 @@ def test_what_readings_would_change_by_is_known_of_slabs_too():
     assert (view.paths.slabs > 0).any()
     p = replace(field.parameters, log_excess=np.log([1.5, 6.0]), log_through=np.array([-0.7, -0.2]))
     o = observation(view, SpectrumPixels(field._beam), field.floor)
-    problem = Problem.of([o], effects, np.arange(2), p)
-    changed = _mirror_changes(o, problem, problem.materials(p, 1.0), np.arange(2))
+    ((batch, materials, _),) = Problem.of([o], effects, np.arange(2), p).evaluated(p)
+    changed = _mirror_changes(batch, materials, np.arange(2))
     before, after = (Materials(p, view.tracer.slabs, np.array(material)) for material in ([0, 1], [0, 0]))
     powers = [view.records[SPECULAR].powers(own) for own in (after, before)]
     expected = (powers[0] - powers[1])[view.kept_paths(effects)] @ o.path[view.kept_paths(effects)]
