@@ -199,7 +199,7 @@ class Tracer:
         self.frequency_hz = frequency_hz
         self.wavelength_m = SPEED_OF_LIGHT / frequency_hz
         self._first_grid = grid
-        self.kept = Cache(8)
+        self.kept = Cache(12)  # all kinds under two bounds of slabs and of bounces
 
     @classmethod
     def of(

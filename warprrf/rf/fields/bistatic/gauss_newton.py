@@ -122,10 +122,12 @@ class Problem:
             table = batch.without_gain(table, power)
             power = gain * power
             known = np.unique(batch.chain[batch.chain >= 0])
-            chain = np.repeat(batch.chain, batch.counts)
-            of_chains = np.where(chain == known[:, None], power, 0.0)
-            table = np.concatenate([table * gain.astype(np.float32), of_chains.astype(np.float32)])
-            index = np.append(index, layout.first_chain + known)
+            if (batch.chain != -1).any():
+                table = table * gain.astype(np.float32)
+            if len(known):
+                of_chains = np.where(np.repeat(batch.chain, batch.counts) == known[:, None], power, 0.0)
+                table = np.concatenate([table, of_chains.astype(np.float32)])
+                index = np.append(index, layout.first_chain + known)
             table *= batch.target.slope(power).astype(np.float32)
             yield batch.target.error(power), table.astype(np.float32, copy=False), index
 
