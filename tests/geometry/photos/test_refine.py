@@ -62,7 +62,7 @@ def test_refinement_learns_the_photos_and_densifies(problem):
 
 def test_a_run_continued_from_a_checkpoint_equals_one_never_stopped(problem, tmp_path):
     start, photos, cameras = problem
-    whole = refine(start, PosedPhotos(photos, cameras), config=CONFIG)
+    whole = refine(start, PosedPhotos(photos, cameras), config=CONFIG, device="cpu")
 
     class Killed(Exception):
         pass
