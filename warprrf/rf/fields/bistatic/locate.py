@@ -26,6 +26,7 @@ from warprrf.rf.fields.bistatic.field_map import SPACING_M, FieldMap, best_on_ma
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, Place, as_list, huber, kinds_of, places_of
 from warprrf.rf.fields.bistatic.uncertainty import bins
 from warprrf.rf.fields.location import Location
+from warprrf.rf.positions import beside, rise
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.spectra.spectrum import Spectrum
@@ -176,7 +177,7 @@ class Question:
     def errors(self, unknown: np.ndarray, step_m: float, *, quick: bool) -> Found:
         """What ``unknown`` (U,) leaves; slopes are differences over ``step_m`` to either side. ``quick``: with few
         rays and single mirrors."""
-        points = unknown[:3] + step_m * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+        points = np.concatenate([unknown[None, :3], beside(unknown[:3], step_m)])
         kinds, further, seen = kinds_of(self.moved(unknown)), {}, dict[Any, Any]()
         for j, k in enumerate(self.turned):
             other = unknown + TURN_RAD * (np.arange(len(unknown)) == 3 + j)
@@ -197,20 +198,20 @@ class Question:
             target, weight = observed[0].target, self.weights[place.data]
             target = target if weight is None else target.trusted(weight)
             error, *others = (target.error(power) / NOISE_DB for power in powers)
-            rise = np.zeros((len(error), len(unknown)))
+            slopes = np.zeros((len(error), len(unknown)))
             # Of both sides: the noise of one alone would hang together with that of the errors, and pull the place aside.
-            rise[:, :3] = (np.stack(others[:3], axis=1) - np.stack(others[3:6], axis=1)) / (2.0 * step_m)
+            slopes[:, :3] = rise(others[:6], step_m)
             if turned is not None:
-                rise[:, column] = (others[6] - error) / TURN_RAD
+                slopes[:, column] = (others[6] - error) / TURN_RAD
             if chain is not None:
-                rise[:, chain] = target.slope(powers[0]) * powers[0] / NOISE_DB
+                slopes[:, chain] = target.slope(powers[0]) * powers[0] / NOISE_DB
             if weight is not None:
-                image = rise.reshape(*place.shape, -1)
-                rise = uniform_filter(
+                image = slopes.reshape(*place.shape, -1)
+                slopes = uniform_filter(
                     image, (SMOOTH, SMOOTH, 1), mode=("nearest", "wrap", "nearest")
-                ).reshape(rise.shape)
+                ).reshape(slopes.shape)
             errors.append(error)
-            rises.append(rise)
+            rises.append(slopes)
         return Found(unknown, np.concatenate(errors), np.concatenate(rises))
 
     def _views(self, place: Place, points: np.ndarray, quick: bool) -> tuple[Any, ...]:

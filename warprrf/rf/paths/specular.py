@@ -1,0 +1,232 @@
+"""Line of sight, mirror paths and paths through slabs as a function: what each meets is held fixed, all else may vary.
+
+Gains, Jones matrices, delays, angles and vertices of :func:`~warprrf.trace_paths` come from the kernel that is here
+(:mod:`warprrf.kernels.radio.specular`), and their derivatives from its adjoint, on Warp's tape or in torch. Which paths there are, what
+they meet and what blocks them is traced once and not differentiated: of a total or a spectrum over positions much is edges of shadows,
+which no derivative at fixed visibility knows. Those slopes are differences of answers traced anew:
+:func:`~warprrf.rf.positions.retraced_slope` and :meth:`RadioField.slope`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warprrf import device as _device
+from warprrf.checks import check_array
+from warprrf.kernels.radio import specular as kernels
+from warprrf.rf.em.fresnel import SurfaceTable
+from warprrf.rf.em.materials import VACUUM_PERMITTIVITY
+from warprrf.rf.paths.mirror_paths import MirrorPaths
+
+POSITIONS = ("transmitter", "receivers", "transmitter_orientation", "receiver_orientation")
+MATERIALS = ("relative_permittivity", "conductivity", "thickness_m", "roughness_m", "scattering")
+
+
+@dataclass(frozen=True, eq=False)
+class PathValues:
+    """What arrives over L paths: arrays of NumPy, of Warp or of torch, as what was given.
+
+    Attributes:
+        gain: complex gain between isotropic antennas, exp(-j 2 pi f tau) included, shape ``(L,)``; see :class:`Paths`.
+        jones: polarised complex gain ``(L, 2, 2)``, received over transmitted, along the zenith and azimuth unit vectors of each
+            antenna's own axes. Of a bare mesh, which says nothing of polarisation, that of mirrors without a sign.
+        tau: delay [s], shape ``(L,)``.
+        theta_r, phi_r: zenith and azimuth of arrival in the receiving antenna's axes [rad], shape ``(L,)``.
+        theta_t, phi_t: of departure in the transmitting antenna's [rad], shape ``(L,)``.
+        vertices: interaction points from the transmitter on [m], shape ``(L, depth, 3)``; NaN past the last.
+
+    Warp's complex numbers are ``vec2d`` (real, imaginary) and its points ``vec3d``.
+    """
+
+    gain: Any
+    jones: Any
+    tau: Any
+    theta_r: Any
+    phi_r: Any
+    theta_t: Any
+    phi_t: Any
+    vertices: Any
+
+
+OUTPUTS = tuple(f.name for f in fields(PathValues))
+
+
+class SpecularPaths:
+    """Paths whose mirrors and slabs are held fixed; :func:`~warprrf.trace_specular` makes them.
+
+    Attributes:
+        receiver: index of the receiver of each path, shape ``(L,)``; rows come in the order of :func:`~warprrf.trace_paths`, so that
+            they are ``paths.gain[paths.valid]`` of several receivers.
+        parameters: what :meth:`evaluate` takes and its values as traced: ``transmitter`` [m] ``(1, 3)``, ``receivers`` [m] ``(R, 3)``,
+            ``transmitter_orientation`` and ``receiver_orientation``, yaw, pitch and roll [rad] ``(1, 3)``; of the scene's M materials
+            ``relative_permittivity``, ``conductivity`` [S/m], ``thickness_m`` [m], ``roughness_m`` [m] and ``scattering`` at the
+            carrier, each ``(M,)``. Where a material's scattering comes from its roughness its ``scattering`` is 0, and the other way
+            round. A solid's thickness is that of the mesh.
+        frequency_hz: carrier [Hz].
+        device: where paths are computed.
+    """
+
+    def __init__(
+        self,
+        found: MirrorPaths,
+        offset: np.ndarray,
+        material: np.ndarray,
+        parameters: Mapping[str, np.ndarray],
+        frequency_hz: float,
+        device: _device.DeviceLike,
+    ) -> None:
+        self.receiver, self.frequency_hz = found.receiver, frequency_hz
+        self.parameters = {name: np.array(value, float) for name, value in parameters.items()}
+        self.device, self._shape = _device.resolve(device), found.patch.shape
+        mirrors = found.patch >= 0
+        columns = {
+            "receiver": (found.receiver, wp.int32),
+            "count": ((mirrors | (found.slab >= 0)).sum(axis=1), wp.int32),
+            "mirrors": (mirrors, wp.int32),
+            "normal": (found.normal, wp.vec3d),
+            "plane_offset": (offset, wp.float64),
+            "material": (material, wp.int32),
+            "solid_m": (found.thickness_m, wp.float64),
+        }
+        self._sequences = kernels.Sequences()
+        self._sequences.frequency_hz = frequency_hz
+        for name, (array, dtype) in columns.items():
+            setattr(self._sequences, name, wp.array(array, dtype=dtype, device=self.device))
+
+    def __len__(self) -> int:
+        return self._shape[0]
+
+    def evaluate(self, **parameters: Any) -> PathValues:
+        """What arrives, with some of :attr:`parameters` in place of those traced.
+
+        Of arrays of NumPy, or none: arrays of NumPy. Of arrays of Warp, float64 or ``vec3d``: Warp's, recorded on the tape that
+        runs. Of torch's tensors: tensors that autograd differentiates once (``pip install "warprrf[baselines]"``). Both on
+        :attr:`device`.
+
+        Args:
+            parameters: by the names of :attr:`parameters`, in their shapes. Positions and orientations of one end may be ``(3,)``, and
+                ``receiver_orientation`` one for each receiver, ``(R, 3)``.
+
+        Raises:
+            TypeError: for another name, or arrays of Warp and of torch at once.
+            ValueError: for another shape, number type or device, and NumPy's arrays that are not finite.
+
+        Example::
+
+            held = wr.trace_specular(scene, transmitter=tx, receivers=rx, frequency_hz=60e9, mirror_order=2)
+            at = torch.tensor(rx, dtype=torch.float64, requires_grad=True)
+            held.evaluate(receivers=at).gain.abs().square().sum().backward()
+            at.grad  # of the summed power [1/m], shape as rx
+        """
+        if unknown := sorted(set(parameters) - set(self.parameters)):
+            raise TypeError(
+                f"{', '.join(unknown)}: not a parameter of paths, expected some of {', '.join(self.parameters)}"
+            )
+        kinds = {k: type(v).__module__.split(".")[0] for k, v in parameters.items()}
+        if {"torch", "warp"} <= set(kinds.values()):
+            raise TypeError(f"{', '.join(kinds)}: got arrays of Warp and of torch, expected those of one")
+        if "torch" in kinds.values():
+            _device.require("torch", extra="baselines")
+            from warprrf.rf.paths.torch_functions import evaluate
+
+            return evaluate(self, parameters)
+        given, taped = {}, "warp" in kinds.values()
+        for name, value in parameters.items():
+            if kinds[name] == "warp":
+                given[name] = self._checked(name, value)
+            else:
+                given[name] = self.on_device(name, check_array(name, value, finite=name != "thickness_m"))
+        values = PathValues(*self.launch(given, taped))
+        return values if taped else _of_numpy(values)
+
+    def on_device(self, name: str, value: np.ndarray) -> wp.array:
+        """A parameter as the kernel takes it; ValueError for another shape."""
+        vectors = name in POSITIONS
+        value = value[None] if vectors and value.ndim == 1 else value
+        self.check_shape(name, value.shape)
+        return wp.array(value, dtype=wp.vec3d if vectors else wp.float64, device=self.device)
+
+    def check_shape(self, name: str, shape: tuple[int, ...]) -> None:
+        """Raises ValueError if no parameter ``name`` has that shape."""
+        wanted = [self.parameters[name].shape]
+        if name == "receiver_orientation":
+            wanted.append(self.parameters["receivers"].shape)
+        if tuple(shape) not in wanted:
+            raise ValueError(
+                f"{name}: got shape {tuple(shape)}, expected {' or '.join(map(str, dict.fromkeys(wanted)))}"
+            )
+
+    def _checked(self, name: str, value: Any) -> wp.array:
+        """A Warp array as given."""
+        dtype = wp.vec3d if name in POSITIONS else wp.float64
+        if not isinstance(value, wp.array) or value.dtype != dtype or value.device != self.device:
+            raise ValueError(
+                f"{name}: got {value!r:.60}, expected a Warp array of {dtype.__name__} on {self.device}"
+            )
+        self.check_shape(name, (*value.shape, 3) if dtype is wp.vec3d else value.shape)
+        return value
+
+    def launch(self, given: Mapping[str, wp.array], taped: bool) -> list[wp.array]:
+        """Answers, as :class:`PathValues` has them, of parameters some of which are ``given``: recorded on the tape that runs if
+        ``taped``, else on all cores."""
+        (count, depth), where = self._shape, self.device
+        inputs = [
+            given[name] if name in given else self.on_device(name, value)
+            for name, value in self.parameters.items()
+        ]
+        shapes = {
+            **{name: ((count, depth + 1), wp.vec3d) for name in ("image", "way", "met")},
+            "wave": ((count, depth + 1, 4), wp.vec3d),
+            "turned": ((count, depth + 1), wp.vec2d),
+            "detour": ((count, depth + 1), wp.float64),
+            "gain": (count, wp.vec2d),
+            "jones": ((count, 2, 2), wp.vec2d),
+            **{name: (count, wp.float64) for name in OUTPUTS[2:-1]},
+        }
+        arrays = [
+            wp.empty(shape, dtype=dtype, device=where, requires_grad=taped)
+            for shape, dtype in shapes.values()
+        ]
+        arrays.append(
+            wp.full((count, depth), wp.vec3d(np.nan), dtype=wp.vec3d, device=where, requires_grad=taped)
+        )
+        if taped:
+            wp.launch(kernels.follow_paths, count, [0, self._sequences, *inputs, *arrays], device=where)
+        else:
+            _device.launch(
+                kernels.follow_paths, count, [self._sequences, *inputs, *arrays], device=where, grain=64
+            )
+        return arrays[-len(OUTPUTS) :]
+
+
+def _of_numpy(values: PathValues) -> PathValues:
+    arrays = {name: getattr(values, name).numpy() for name in OUTPUTS}
+    for name in ("gain", "jones"):
+        arrays[name] = np.ascontiguousarray(arrays[name]).view(np.complex128)[..., 0]
+    return PathValues(**arrays)
+
+
+def parameters_of(
+    materials: Any, table: SurfaceTable | None, frequency_hz: float
+) -> dict[str, np.ndarray]:
+    """Materials' parameters as the kernel takes them; none for a bare mesh."""
+    if table is None:
+        return dict.fromkeys(MATERIALS, np.zeros(0))
+    rough = np.array(
+        [
+            m.roughness_m if getattr(m, "scattering", 0.0) is None else 0.0
+            for m in materials
+        ]
+    )
+    return {
+        "relative_permittivity": table.permittivity.real,
+        "conductivity": -table.permittivity.imag * (2.0 * np.pi * frequency_hz * VACUUM_PERMITTIVITY),
+        "thickness_m": table.thickness_m,
+        "roughness_m": rough,
+        "scattering": np.where(rough > 0.0, 0.0, table.scattering),
+    }
