@@ -93,7 +93,7 @@ def beside(points: np.ndarray, step_m: float) -> np.ndarray:
     return np.asarray(points[..., None, :] + step_m * np.concatenate([np.eye(3), -np.eye(3)]))
 
 
-def rise(answers: Any, step_m: float) -> np.ndarray:
+def quotients(answers: Any, step_m: float) -> np.ndarray:
     """Slopes along x, y and z on a last axis [1/m], of answers at the six places of :func:`beside`, first axis."""
     found = np.moveaxis(np.asarray(answers), 0, -1)
     return np.asarray((found[..., :3] - found[..., 3:]) / (2.0 * step_m))
@@ -131,7 +131,7 @@ def retraced_slope(
     if found.ndim == 0 or len(found) != len(places):
         raise ValueError(f"answer: got shape {found.shape} for {len(places)} positions, expected a row for each")
     found = found.reshape(*at.shape[:-1], 6, *found.shape[1:])
-    return rise(np.moveaxis(found, at.ndim - 1, 0), step)
+    return quotients(np.moveaxis(found, at.ndim - 1, 0), step)
 
 
 def check_positions(

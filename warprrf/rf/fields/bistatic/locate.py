@@ -26,7 +26,7 @@ from warprrf.rf.fields.bistatic.field_map import SPACING_M, FieldMap, best_on_ma
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, Place, as_list, huber, kinds_of, places_of
 from warprrf.rf.fields.bistatic.uncertainty import bins
 from warprrf.rf.fields.location import Location
-from warprrf.rf.positions import beside, rise
+from warprrf.rf.positions import beside, quotients
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.spectra.spectrum import Spectrum
@@ -198,20 +198,20 @@ class Question:
             target, weight = observed[0].target, self.weights[place.data]
             target = target if weight is None else target.trusted(weight)
             error, *others = (target.error(power) / NOISE_DB for power in powers)
-            slopes = np.zeros((len(error), len(unknown)))
+            rise = np.zeros((len(error), len(unknown)))
             # Of both sides: the noise of one alone would hang together with that of the errors, and pull the place aside.
-            slopes[:, :3] = rise(others[:6], step_m)
+            rise[:, :3] = quotients(others[:6], step_m)
             if turned is not None:
-                slopes[:, column] = (others[6] - error) / TURN_RAD
+                rise[:, column] = (others[6] - error) / TURN_RAD
             if chain is not None:
-                slopes[:, chain] = target.slope(powers[0]) * powers[0] / NOISE_DB
+                rise[:, chain] = target.slope(powers[0]) * powers[0] / NOISE_DB
             if weight is not None:
-                image = slopes.reshape(*place.shape, -1)
-                slopes = uniform_filter(
+                image = rise.reshape(*place.shape, -1)
+                rise = uniform_filter(
                     image, (SMOOTH, SMOOTH, 1), mode=("nearest", "wrap", "nearest")
-                ).reshape(slopes.shape)
+                ).reshape(rise.shape)
             errors.append(error)
-            rises.append(slopes)
+            rises.append(rise)
         return Found(unknown, np.concatenate(errors), np.concatenate(rises))
 
     def _views(self, place: Place, points: np.ndarray, quick: bool) -> tuple[Any, ...]:
