@@ -1,6 +1,6 @@
 """Gradients of the rasteriser's whole path (parameters, image, loss), of rays through Gaussians, of path records by
-their materials and of specular paths by ends, orientations and materials, in float64: Warp's tape against finite differences on many random scenes, with the cutoffs of photos; what
-lies at a cutoff; second backward calls."""
+their materials, and of specular paths by ends, orientations and materials, in float64: Warp's tape against finite differences
+on many random scenes, with the cutoffs of photos; what lies at a cutoff; second backward calls."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from rays_by_definition import blended, met
 from scipy.spatial.transform import Rotation
 
 from warprrf import device
+from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussian_rays import GaussianRays
 from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
-from warprrf.geometry.mesh import Mesh
 from warprrf.kernels.radio import records
 from warprrf.rf.em.materials import Material
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -85,14 +85,18 @@ def loss_of_powers(
 
 
 @wp.kernel
-def loss_of_numbers(values: wp.array(dtype=Any), weight: wp.array(dtype=Any), loss: wp.array(dtype=wp.float64)):
+def loss_of_numbers(
+    values: wp.array(dtype=Any), weight: wp.array(dtype=Any), loss: wp.array(dtype=wp.float64)
+):
     """Weighted sum."""
     i = wp.tid()
     wp.atomic_add(loss, 0, weight[i] * values[i])
 
 
 @wp.kernel
-def loss_of_vectors(values: wp.array(dtype=Any), weight: wp.array(dtype=Any), loss: wp.array(dtype=wp.float64)):
+def loss_of_vectors(
+    values: wp.array(dtype=Any), weight: wp.array(dtype=Any), loss: wp.array(dtype=wp.float64)
+):
     """Weighted sum of components; vectors of weight 0 may be NaN."""
     i = wp.tid()
     if wp.length_sq(weight[i]) > wp.float64(0.0):
@@ -111,7 +115,9 @@ class WholePath:
         )
         self.draw(seed, np.random.default_rng(seed))
 
-    def record(self, values: dict[str, np.ndarray], *only: Any) -> tuple[wp.Tape, wp.array, dict[str, wp.array]]:
+    def record(
+        self, values: dict[str, np.ndarray], *only: Any
+    ) -> tuple[wp.Tape, wp.array, dict[str, wp.array]]:
         arrays = self.arrays(values)
         loss = wp.zeros(1, dtype=wp.float64, requires_grad=True)
         with wp.Tape() as tape:
@@ -288,7 +294,9 @@ class SpecularPaths(WholePath):
         half = rng.uniform(1.5, 4.0, 3)
         sheet = box_mesh([0.3, -half[1], -half[2]], [0.301, rng.uniform(-0.5, 1.0), half[2]])
         sheet = sheet[0], sheet[1][(sheet[0][sheet[1]][:, :, 0] == 0.3).all(axis=1)]
-        solid = box_mesh([-0.5, rng.uniform(-1.0, 0.5), -half[2]], [-0.5 + rng.uniform(0.01, 0.2), half[1], half[2]])
+        solid = box_mesh(
+            [-0.5, rng.uniform(-1.0, 0.5), -half[2]], [-0.5 + rng.uniform(0.01, 0.2), half[1], half[2]]
+        )
         mesh, part = joined(box_mesh(-half, half, inward=True), sheet, solid)
         turn = Rotation.random(None, rng).as_matrix()
         lossy = rng.uniform(0.01, 0.1, 3) * self.frequency_hz * 4.0 / 18e9
@@ -303,16 +311,21 @@ class SpecularPaths(WholePath):
             receivers=ends[1:] @ turn.T, frequency_hz=self.frequency_hz, mirror_order=2, transmissions=2,
         )  # fmt: skip
         wavelength_m = SPEED_OF_LIGHT / self.frequency_hz
-        self.held, self.values = held, {
-            **held.parameters,
-            "transmitter_orientation": rng.normal(size=(1, 3)),
-            "receiver_orientation": rng.normal(size=(2 if seed % 2 else 1, 3)),
-            "thickness_m": rng.uniform(0.2, 3.0, 3) * wavelength_m,
-            "roughness_m": rng.uniform(0.02, 0.1, 3) * wavelength_m,
-            "scattering": rng.uniform(0.1, 0.8, 3),
-        }
+        self.held, self.values = (
+            held,
+            {
+                **held.parameters,
+                "transmitter_orientation": rng.normal(size=(1, 3)),
+                "receiver_orientation": rng.normal(size=(2 if seed % 2 else 1, 3)),
+                "thickness_m": rng.uniform(0.2, 3.0, 3) * wavelength_m,
+                "roughness_m": rng.uniform(0.02, 0.1, 3) * wavelength_m,
+                "scattering": rng.uniform(0.1, 0.8, 3),
+            },
+        )
         known = {name: getattr(held.evaluate(**self.values), name) for name in OUTPUTS}
-        self.weights = {name: rng.normal(size=numbers(v).shape) * np.isfinite(numbers(v)) for name, v in known.items()}
+        self.weights = {
+            name: rng.normal(size=numbers(v).shape) * np.isfinite(numbers(v)) for name, v in known.items()
+        }
         # gains of 1e-4 and delays of 1e-8 count as much as angles
         self.scales = {name: np.nanmax(np.abs(value)) for name, value in known.items()}
 
@@ -332,7 +345,7 @@ class SpecularPaths(WholePath):
     def errors(self):
         """Per input: worst deviation of a derivative of what is made of any output, relative to the largest of that output."""
         worst = {}
-        for (name, output), (found, expected) in self.slopes().items():
+        for (name, _), (found, expected) in self.slopes().items():
             if np.abs(expected).max() > 1e-6:  # not of what does not hang on it
                 off = np.abs(found - expected).max() / np.abs(expected).max()
                 worst[name] = max(worst.get(name, 0.0), float(off))
@@ -350,8 +363,12 @@ class SpecularPaths(WholePath):
             for at in np.ndindex(value.shape):
                 size = 1.0 if name in POSITIONS[2:] else 10.0 / k if name in POSITIONS else value[at]
                 step = (1e-2 if name == "conductivity" else 1e-4) * size  # delays hardly hang on it
-                move = step * (np.arange(value.size).reshape(value.shape) == np.ravel_multi_index(at, value.shape))
-                sides = [self.held.evaluate(**{**self.values, name: value + m * move}) for m in (1, -1, 2, -2)]
+                move = step * (
+                    np.arange(value.size).reshape(value.shape) == np.ravel_multi_index(at, value.shape)
+                )
+                sides = [
+                    self.held.evaluate(**{**self.values, name: value + m * move}) for m in (1, -1, 2, -2)
+                ]
                 for output in OUTPUTS:
                     up, down, far_up, far_down = (numbers(getattr(side, output)) for side in sides)
                     near, far = up - down, far_up - far_down

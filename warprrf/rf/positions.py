@@ -129,7 +129,9 @@ def retraced_slope(
     places = beside(at, step).reshape(-1, 3)
     found = np.asarray(answer(places))
     if found.ndim == 0 or len(found) != len(places):
-        raise ValueError(f"answer: got shape {found.shape} for {len(places)} positions, expected a row for each")
+        raise ValueError(
+            f"answer: got shape {found.shape} for {len(places)} positions, expected a row for each"
+        )
     found = found.reshape(*at.shape[:-1], 6, *found.shape[1:])
     return quotients(np.moveaxis(found, at.ndim - 1, 0), step)
 

@@ -18,7 +18,9 @@ real = wp.float64
 SPEED_OF_LIGHT = wp.constant(real(299_792_458.0))
 VACUUM_PERMITTIVITY = wp.constant(real(8.8541878128e-12))  # [F/m]
 TURN = wp.constant(real(6.283185307179586))
-PARALLEL = wp.constant(real(1e-6))  # sine of incidence below which a mirror has no plane of incidence of its own
+PARALLEL = wp.constant(
+    real(1e-6)
+)  # sine of incidence below which a mirror has no plane of incidence of its own
 
 
 @wp.struct

@@ -1,30 +1,37 @@
 """Line of sight, mirror paths and paths through slabs as a function: what each meets is held fixed, all else may vary.
 
 Gains, Jones matrices, delays, angles and vertices of :func:`~warprrf.trace_paths` come from the kernel that is here
-(:mod:`warprrf.kernels.radio.specular`), and their derivatives from its adjoint, on Warp's tape or in torch. Which paths there are, what
-they meet and what blocks them is traced once and not differentiated: of a total or a spectrum over positions much is edges of shadows,
-which no derivative at fixed visibility knows. Those slopes are differences of answers traced anew:
-:func:`~warprrf.rf.positions.retraced_slope` and :meth:`RadioField.slope`.
+(:mod:`warprrf.kernels.radio.specular`), and their derivatives from its adjoint, on Warp's tape or in torch. Which paths there
+are, what they meet and what blocks them is traced once and not differentiated: of a total or a spectrum over positions much is
+edges of shadows, which no derivative at fixed visibility knows. Totals and spectra by positions are given by differences of
+what is traced anew: :func:`~warprrf.rf.positions.retraced_slope` and :meth:`RadioField.slope`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warprrf import device as _device
-from warprrf.checks import check_array
+from warprrf.checks import LARGEST, LARGEST_M, check_array
 from warprrf.kernels.radio import specular as kernels
 from warprrf.rf.em.fresnel import SurfaceTable
-from warprrf.rf.em.materials import VACUUM_PERMITTIVITY
+from warprrf.rf.em.materials import ROUGHEST_M, VACUUM_PERMITTIVITY
 from warprrf.rf.paths.mirror_paths import MirrorPaths
 
 POSITIONS = ("transmitter", "receivers", "transmitter_orientation", "receiver_orientation")
 MATERIALS = ("relative_permittivity", "conductivity", "thickness_m", "roughness_m", "scattering")
+TYPES = {name: wp.vec3d if name in POSITIONS else wp.float64 for name in POSITIONS + MATERIALS}
+RANGES = {
+    **dict.fromkeys(POSITIONS, (-LARGEST_M, LARGEST_M)), "relative_permittivity": (1.0, LARGEST), "conductivity": (0.0, LARGEST),
+    "thickness_m": (1e-9, np.inf), "roughness_m": (0.0, ROUGHEST_M), "scattering": (0.0, 1.0),
+}  # fmt: skip
+"""What parameters may be, as far as it is looked at."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,16 +64,16 @@ OUTPUTS = tuple(f.name for f in fields(PathValues))
 
 
 class SpecularPaths:
-    """Paths whose mirrors and slabs are held fixed; :func:`~warprrf.trace_specular` makes them.
+    """Paths whose mirrors and slabs are held fixed, L of them; :func:`~warprrf.trace_specular` makes them.
 
     Attributes:
-        receiver: index of the receiver of each path, shape ``(L,)``; rows come in the order of :func:`~warprrf.trace_paths`, so that
-            they are ``paths.gain[paths.valid]`` of several receivers.
-        parameters: what :meth:`evaluate` takes and its values as traced: ``transmitter`` [m] ``(1, 3)``, ``receivers`` [m] ``(R, 3)``,
-            ``transmitter_orientation`` and ``receiver_orientation``, yaw, pitch and roll [rad] ``(1, 3)``; of the scene's M materials
-            ``relative_permittivity``, ``conductivity`` [S/m], ``thickness_m`` [m], ``roughness_m`` [m] and ``scattering`` at the
-            carrier, each ``(M,)``. Where a material's scattering comes from its roughness its ``scattering`` is 0, and the other way
-            round. A solid's thickness is that of the mesh.
+        receiver: index of the receiver of each path, shape ``(L,)``. Rows come in the order of :func:`~warprrf.trace_paths`:
+            of several receivers they are its ``paths.gain[paths.valid]``.
+        parameters: what :meth:`evaluate` takes, with the values that were traced: ``transmitter`` [m] ``(1, 3)``, ``receivers`` [m]
+            ``(R, 3)``, ``transmitter_orientation`` and ``receiver_orientation`` [rad] ``(1, 3)``; of the scene's M materials at
+            the carrier ``relative_permittivity``, ``conductivity`` [S/m], ``thickness_m`` [m], ``roughness_m`` [m] and
+            ``scattering``, each ``(M,)``. Where scattering comes from the roughness ``scattering`` is 0, and the other way round.
+            A solid is as thick as it was where it was traced.
         frequency_hz: carrier [Hz].
         device: where paths are computed.
     """
@@ -84,9 +91,10 @@ class SpecularPaths:
         self.parameters = {name: np.array(value, float) for name, value in parameters.items()}
         self.device, self._shape = _device.resolve(device), found.patch.shape
         mirrors = found.patch >= 0
+        self._there = mirrors | (found.slab >= 0)
         columns = {
             "receiver": (found.receiver, wp.int32),
-            "count": ((mirrors | (found.slab >= 0)).sum(axis=1), wp.int32),
+            "count": (self._there.sum(axis=1), wp.int32),
             "mirrors": (mirrors, wp.int32),
             "normal": (found.normal, wp.vec3d),
             "plane_offset": (offset, wp.float64),
@@ -101,20 +109,36 @@ class SpecularPaths:
     def __len__(self) -> int:
         return self._shape[0]
 
-    def evaluate(self, **parameters: Any) -> PathValues:
-        """What arrives, with some of :attr:`parameters` in place of those traced.
+    def evaluate(
+        self,
+        *,
+        transmitter: Any = None,
+        receivers: Any = None,
+        transmitter_orientation: Any = None,
+        receiver_orientation: Any = None,
+        relative_permittivity: Any = None,
+        conductivity: Any = None,
+        thickness_m: Any = None,
+        roughness_m: Any = None,
+        scattering: Any = None,
+    ) -> PathValues:
+        """What arrives, with what is given in place of what was traced (:attr:`parameters`).
 
         Of arrays of NumPy, or none: arrays of NumPy. Of arrays of Warp, float64 or ``vec3d``: Warp's, recorded on the tape that
         runs. Of torch's tensors: tensors that autograd differentiates once (``pip install "warprrf[baselines]"``). Both on
         :attr:`device`.
 
         Args:
-            parameters: by the names of :attr:`parameters`, in their shapes. Positions and orientations of one end may be ``(3,)``, and
-                ``receiver_orientation`` one for each receiver, ``(R, 3)``.
+            transmitter: position [m], ``(3,)`` or ``(1, 3)``.
+            receivers: positions [m], ``(R, 3)``; of one also ``(3,)``.
+            transmitter_orientation: yaw, pitch and roll of the antenna [rad], ``(3,)`` or ``(1, 3)``.
+            receiver_orientation: the same of all receivers, or of each, ``(R, 3)``.
+            relative_permittivity, conductivity, thickness_m, roughness_m, scattering: of each material of the scene, ``(M,)``.
 
         Raises:
-            TypeError: for another name, or arrays of Warp and of torch at once.
-            ValueError: for another shape, number type or device, and NumPy's arrays that are not finite.
+            TypeError: for arrays of Warp and of torch at once.
+            ValueError: naming the argument, for another shape, number type or device, and, of NumPy's arrays and of tensors,
+                for numbers that no antenna or material has.
 
         Example::
 
@@ -123,60 +147,77 @@ class SpecularPaths:
             held.evaluate(receivers=at).gain.abs().square().sum().backward()
             at.grad  # of the summed power [1/m], shape as rx
         """
-        if unknown := sorted(set(parameters) - set(self.parameters)):
-            raise TypeError(
-                f"{', '.join(unknown)}: not a parameter of paths, expected some of {', '.join(self.parameters)}"
-            )
-        kinds = {k: type(v).__module__.split(".")[0] for k, v in parameters.items()}
+        every = locals()
+        given = {name: every[name] for name in (*POSITIONS, *MATERIALS) if every[name] is not None}
+        kinds = {name: type(value).__module__.split(".")[0] for name, value in given.items()}
         if {"torch", "warp"} <= set(kinds.values()):
             raise TypeError(f"{', '.join(kinds)}: got arrays of Warp and of torch, expected those of one")
         if "torch" in kinds.values():
             _device.require("torch", extra="baselines")
             from warprrf.rf.paths.torch_functions import evaluate
 
-            return evaluate(self, parameters)
-        given, taped = {}, "warp" in kinds.values()
-        for name, value in parameters.items():
-            if kinds[name] == "warp":
-                given[name] = self._checked(name, value)
-            else:
-                given[name] = self.on_device(name, check_array(name, value, finite=name != "thickness_m"))
-        values = PathValues(*self.launch(given, taped))
-        return values if taped else _of_numpy(values)
+            for name, value in given.items():
+                self._checked(name, value)
+            return PathValues(*evaluate(partial(self._launch, taped=True), given, TYPES, self.device))
+        taped = "warp" in kinds.values()
+        arrays = {
+            name: self._as_given(name, value) if kinds[name] == "warp" else self._uploaded(name, value)
+            for name, value in given.items()
+        }
+        values = PathValues(*self._launch(arrays, taped))
+        return values if taped else self._of_numpy(values, given)
 
-    def on_device(self, name: str, value: np.ndarray) -> wp.array:
-        """A parameter as the kernel takes it; ValueError for another shape."""
-        vectors = name in POSITIONS
-        value = value[None] if vectors and value.ndim == 1 else value
-        self.check_shape(name, value.shape)
-        return wp.array(value, dtype=wp.vec3d if vectors else wp.float64, device=self.device)
+    def _of_numpy(self, values: PathValues, given: Mapping[str, Any]) -> PathValues:
+        arrays = {name: getattr(values, name).numpy() for name in OUTPUTS}
+        for name in ("gain", "jones"):
+            arrays[name] = np.ascontiguousarray(arrays[name]).view(np.complex128)[..., 0]
+        met = np.isfinite(arrays["vertices"]).all(axis=-1)
+        lost = (met != self._there).any(axis=1) | ~np.isfinite(arrays["tau"])
+        if lost.any():
+            raise ValueError(
+                f"{' or '.join(name for name in given if name in POSITIONS[:2])}: got places that {int(lost.sum())} of "
+                f"{len(self)} paths do not reach over what they met, expected ones near those that were traced"
+            )
+        return PathValues(**arrays)
 
-    def check_shape(self, name: str, shape: tuple[int, ...]) -> None:
-        """Raises ValueError if no parameter ``name`` has that shape."""
+    def _checked(self, name: str, value: Any) -> np.ndarray:
+        """A parameter in its own shape; ValueError for another, or numbers that it cannot be."""
+        array = check_array(name, value, finite=name != "thickness_m")
+        array = array[None] if name in POSITIONS and array.ndim == 1 else array
+        self._check_shape(name, array.shape)
+        low, high = RANGES[name]
+        if array.size and not (array.min() >= low and array.max() <= high):
+            raise ValueError(f"{name}: got {array.min():g} to {array.max():g}, expected {low:g} to {high:g}")
+        return array
+
+    def _check_shape(self, name: str, shape: tuple[int, ...]) -> None:
         wanted = [self.parameters[name].shape]
         if name == "receiver_orientation":
             wanted.append(self.parameters["receivers"].shape)
         if tuple(shape) not in wanted:
-            raise ValueError(
-                f"{name}: got shape {tuple(shape)}, expected {' or '.join(map(str, dict.fromkeys(wanted)))}"
-            )
+            told = " or ".join(map(str, dict.fromkeys(wanted)))
+            raise ValueError(f"{name}: got shape {tuple(shape)}, expected {told}")
 
-    def _checked(self, name: str, value: Any) -> wp.array:
-        """A Warp array as given."""
-        dtype = wp.vec3d if name in POSITIONS else wp.float64
+    def _uploaded(self, name: str, value: Any) -> wp.array:
+        """A parameter as the kernel takes it."""
+        return wp.array(self._checked(name, value), dtype=TYPES[name], device=self.device)
+
+    def _as_given(self, name: str, value: Any) -> wp.array:
+        """A Warp array, which is differentiated."""
+        dtype = TYPES[name]
         if not isinstance(value, wp.array) or value.dtype != dtype or value.device != self.device:
             raise ValueError(
                 f"{name}: got {value!r:.60}, expected a Warp array of {dtype.__name__} on {self.device}"
             )
-        self.check_shape(name, (*value.shape, 3) if dtype is wp.vec3d else value.shape)
+        self._check_shape(name, (*value.shape, 3) if dtype is wp.vec3d else value.shape)
         return value
 
-    def launch(self, given: Mapping[str, wp.array], taped: bool) -> list[wp.array]:
+    def _launch(self, given: Mapping[str, wp.array], taped: bool) -> list[wp.array]:
         """Answers, as :class:`PathValues` has them, of parameters some of which are ``given``: recorded on the tape that runs if
         ``taped``, else on all cores."""
         (count, depth), where = self._shape, self.device
         inputs = [
-            given[name] if name in given else self.on_device(name, value)
+            given[name] if name in given else wp.array(value, dtype=TYPES[name], device=where)
             for name, value in self.parameters.items()
         ]
         shapes = {
@@ -204,25 +245,11 @@ class SpecularPaths:
         return arrays[-len(OUTPUTS) :]
 
 
-def _of_numpy(values: PathValues) -> PathValues:
-    arrays = {name: getattr(values, name).numpy() for name in OUTPUTS}
-    for name in ("gain", "jones"):
-        arrays[name] = np.ascontiguousarray(arrays[name]).view(np.complex128)[..., 0]
-    return PathValues(**arrays)
-
-
-def parameters_of(
-    materials: Any, table: SurfaceTable | None, frequency_hz: float
-) -> dict[str, np.ndarray]:
+def parameters_of(materials: Any, table: SurfaceTable | None, frequency_hz: float) -> dict[str, np.ndarray]:
     """Materials' parameters as the kernel takes them; none for a bare mesh."""
     if table is None:
         return dict.fromkeys(MATERIALS, np.zeros(0))
-    rough = np.array(
-        [
-            m.roughness_m if getattr(m, "scattering", 0.0) is None else 0.0
-            for m in materials
-        ]
-    )
+    rough = np.array([m.roughness_m if getattr(m, "scattering", 0.0) is None else 0.0 for m in materials])
     return {
         "relative_permittivity": table.permittivity.real,
         "conductivity": -table.permittivity.imag * (2.0 * np.pi * frequency_hz * VACUUM_PERMITTIVITY),
