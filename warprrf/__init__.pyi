@@ -14,9 +14,6 @@ from warprrf.rf.simulate import sample_receivers as sample_receivers
 # line of sight and mirror reflections by the image method
 from warprrf.rf.paths.trace import trace_paths as trace_paths
 
-# the same paths as a function of ends, orientations and materials, which Warp and torch differentiate
-from warprrf.rf.paths.trace import trace_specular as trace_specular
-
 # what each effect is worth in a scene, and the smallest model within a tolerance
 from warprrf.rf.relevance.search import relevance as relevance
 
@@ -72,9 +69,6 @@ from warprrf.rf.tracing.model import Effects as Effects
 # propagation paths, and the channels, taps and spreads that follow
 from warprrf.rf.paths.path_set import Paths as Paths
 
-# what `trace_specular` returns: gains, delays and angles over mirrors and slabs that are held fixed
-from warprrf.rf.paths.specular import SpecularPaths as SpecularPaths
-
 # an antenna by name, from numbers on a grid of angles, or from a file: gain, or field in two polarisations
 from warprrf.rf.spectra.antenna import Antenna as Antenna
 
@@ -93,6 +87,9 @@ from warprrf.rf import channel as channel
 
 # Fresnel coefficients, materials, absorption by the air
 from warprrf.rf import em as em
+
+# derivatives of paths, slopes of what is traced anew
+from warprrf.rf import paths as paths
 
 # Sionna RT, DeepMIMO, digital twins
 from warprrf.rf import interop as interop

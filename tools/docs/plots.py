@@ -18,7 +18,6 @@ from tables.paper import PLACES, paper  # noqa: E402
 
 import warprrf as wr  # noqa: E402
 from warprrf.rf.em.diffraction import EdgeRays, diffraction_matrices  # noqa: E402
-from warprrf.rf.positions import retraced_slope  # noqa: E402
 
 STYLE = {
     "svg.fonttype": "none", "svg.hashsalt": "warprrf", "font.family": "sans-serif", "font.size": 9, "axes.grid": True,
@@ -209,7 +208,7 @@ def _slopes() -> Any:
         return 10.0 * np.log10(wr.trace_paths(scene, receivers=at, **asked).power.sum(axis=1))
 
     held, at = (
-        wr.trace_specular(scene, receivers=walk, **asked),
+        wr.paths.trace_specular(scene, receivers=walk, **asked),
         wp.array(walk, dtype=wp.vec3d, requires_grad=True),
     )
     with wp.Tape() as tape:
@@ -217,7 +216,7 @@ def _slopes() -> Any:
     tape.backward(grads={gain: wp.array(2.0 * gain.numpy(), dtype=wp.vec2d)})  # of the sum of |gain|^2
     total = total_db(walk)
     frozen = 10.0 / np.log(10.0) * at.grad.numpy()[:, 1] / 10.0 ** (total / 10.0)
-    retraced = retraced_slope(total_db, walk)[:, 1]
+    retraced = wr.paths.retraced_slope(total_db, walk)[:, 1]
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.2))
     summed = total[0] + np.cumsum(frozen) * 0.02
     for line, style, label in ((total, "-", "traced"), (summed, "--", "first total, plus frozen slopes")):

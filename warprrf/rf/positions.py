@@ -105,7 +105,7 @@ def retraced_slope(
 ) -> np.ndarray:
     """Slopes of what is traced anew on either side of each place: central differences.
 
-    Of totals and spectra much is edges of shadows, which derivatives of paths (:func:`warprrf.trace_specular`) do not know.
+    Of totals and spectra much is edges of shadows, which derivatives of paths (:func:`warprrf.paths.trace_specular`) do not know.
 
     Args:
         answer: of positions ``(N, 3)`` [m] to numbers ``(N, ...)``; called once.
@@ -123,7 +123,7 @@ def retraced_slope(
         def total_db(at):
             return 10 * np.log10(wr.trace_paths(scene, transmitter=tx, receivers=at, frequency_hz=f).power.sum(axis=1))
 
-        retraced_slope(total_db, [3.0, 2.0, 1.5])  # [dB/m], shape (3,)
+        wr.paths.retraced_slope(total_db, [3.0, 2.0, 1.5])  # [dB/m], shape (3,)
     """
     at, step = check_receivers("points", points), check_positive("step_m", step_m)
     places = beside(at, step).reshape(-1, 3)

@@ -47,13 +47,13 @@ def near(values, paths):
 
 def test_values_are_those_of_traced_paths_in_their_order():
     held, paths = (
-        wr.trace_specular(room(), receivers=RX, **ASKED),
+        wr.paths.trace_specular(room(), receivers=RX, **ASKED),
         wr.trace_paths(room(), receivers=RX, **ASKED),
     )
     assert len(held) == paths.valid.sum() > 50
     same(held.evaluate(), paths)
     np.testing.assert_array_equal(held.receiver, np.nonzero(paths.valid)[0])
-    alone = wr.trace_specular(room(), receivers=RX[0], **ASKED).evaluate()
+    alone = wr.paths.trace_specular(room(), receivers=RX[0], **ASKED).evaluate()
     np.testing.assert_array_equal(alone.gain, wr.trace_paths(room(), receivers=RX[0], **ASKED).gain)
     with wp.Tape():
         taped = held.evaluate(receivers=wp.array(RX, dtype=wp.vec3d, requires_grad=True))
@@ -61,7 +61,7 @@ def test_values_are_those_of_traced_paths_in_their_order():
 
 
 def test_ends_may_move_as_far_as_paths_stay_the_same():
-    held = wr.trace_specular(room(), receivers=RX, **ASKED)
+    held = wr.paths.trace_specular(room(), receivers=RX, **ASKED)
     near(held.evaluate(receivers=RX + 0.004), wr.trace_paths(room(), receivers=RX + 0.004, **ASKED))
     moved = wr.trace_paths(room(), receivers=RX, **(ASKED | {"transmitter": TX - 0.004}))
     near(held.evaluate(transmitter=TX - 0.004), moved)
@@ -70,7 +70,7 @@ def test_ends_may_move_as_far_as_paths_stay_the_same():
 @pytest.mark.parametrize("name", MATERIALS)
 def test_materials_may_change(name):
     """A scene of the other material is traced to the same."""
-    held = wr.trace_specular(room(), receivers=RX, **ASKED)
+    held = wr.paths.trace_specular(room(), receivers=RX, **ASKED)
     other = held.parameters[name] * 1.1
     known = {n: (other if n == name else v) for n, v in held.parameters.items() if n in MATERIALS}
     wall, glass = (
@@ -87,7 +87,7 @@ def test_materials_may_change(name):
 def test_jones_matrices_of_turned_antennas_give_the_channel_between_them():
     """F_r^T J F_t in the antennas' own axes is the response of `Paths.cfr` to the same antennas turned."""
     turns = np.array([0.4, -0.7, 1.1]), np.array([-2.0, 0.5, 0.3])
-    held = wr.trace_specular(room(), receivers=RX[0], **ASKED)
+    held = wr.paths.trace_specular(room(), receivers=RX[0], **ASKED)
     v = held.evaluate(transmitter_orientation=turns[0], receiver_orientation=turns[1])
     sent, heard = (
         np.sqrt(1.5) * np.sin(zenith) for zenith in (v.theta_t, v.theta_r)
@@ -102,7 +102,7 @@ def test_jones_matrices_of_turned_antennas_give_the_channel_between_them():
 
 def test_each_receiver_may_be_turned_by_itself():
     held, turns = (
-        wr.trace_specular(room(), receivers=RX, **ASKED),
+        wr.paths.trace_specular(room(), receivers=RX, **ASKED),
         np.array([[0.1, 0.2, 0.3], [1, 2, 3], [0, 0, 0]]),
     )
     both = held.evaluate(receiver_orientation=turns)
@@ -112,7 +112,7 @@ def test_each_receiver_may_be_turned_by_itself():
 
 
 def test_torch_differentiates_as_the_tape_does():
-    held, rng = wr.trace_specular(room(), receivers=RX, **ASKED), np.random.default_rng(0)
+    held, rng = wr.paths.trace_specular(room(), receivers=RX, **ASKED), np.random.default_rng(0)
     weight = rng.normal(size=len(held))
     given = {name: held.parameters[name] for name in held.parameters}
     arrays = {
@@ -145,7 +145,7 @@ def test_torch_differentiates_as_the_tape_does():
 
 
 def test_torch_refuses_second_derivatives_and_takes_single_precision():
-    held = wr.trace_specular(room(), receivers=RX[0], **ASKED)
+    held = wr.paths.trace_specular(room(), receivers=RX[0], **ASKED)
     at = torch.tensor(RX[0], dtype=torch.float32, requires_grad=True)
     tau = held.evaluate(receivers=at).tau.square().sum()
     slope = torch.autograd.grad(tau, at, create_graph=True)[0]
@@ -158,7 +158,7 @@ def test_torch_refuses_second_derivatives_and_takes_single_precision():
 def test_slopes_of_paths_that_meet_mirrors_head_on_are_numbers(ends):
     """From above each other, where the azimuth is none, and to walls straight ahead."""
     tx, rx = map(np.array, ends)
-    held = wr.trace_specular(room(), **(ASKED | {"transmitter": tx}), receivers=rx)
+    held = wr.paths.trace_specular(room(), **(ASKED | {"transmitter": tx}), receivers=rx)
     at, start = torch.tensor(rx, requires_grad=True), torch.tensor(tx, requires_grad=True)
     found = held.evaluate(receivers=at, transmitter=start)
     found.gain.abs().square().sum().backward()
@@ -173,7 +173,7 @@ def test_slopes_of_paths_that_meet_mirrors_head_on_are_numbers(ends):
 
 
 def test_a_bare_mesh_has_ends_and_no_materials():
-    held = wr.trace_specular(room().mesh, receivers=RX, transmitter=TX, frequency_hz=F)
+    held = wr.paths.trace_specular(room().mesh, receivers=RX, transmitter=TX, frequency_hz=F)
     same_but_jones = wr.trace_paths(room().mesh, receivers=RX, transmitter=TX, frequency_hz=F)
     np.testing.assert_array_equal(held.evaluate().gain, same_but_jones.gain[same_but_jones.valid])
     with pytest.raises(ValueError, match=r"scattering: got shape \(2,\), expected \(0,\)"):
@@ -181,7 +181,7 @@ def test_a_bare_mesh_has_ends_and_no_materials():
 
 
 def test_no_paths_are_no_numbers():
-    held = wr.trace_specular(
+    held = wr.paths.trace_specular(
         room(), transmitter=TX, receivers=[2.2, -0.7, 1.2], frequency_hz=F, mirror_order=0
     )
     assert len(held) == 0 and held.evaluate().gain.shape == (0,)
@@ -205,17 +205,17 @@ def test_no_paths_are_no_numbers():
     ],
 )
 def test_what_is_no_parameter_is_refused(name, value, words):
-    held = wr.trace_specular(room(), receivers=RX, **ASKED)
+    held = wr.paths.trace_specular(room(), receivers=RX, **ASKED)
     with pytest.raises(ValueError, match=words):
         held.evaluate(**{name: value})
 
 
 def test_warp_and_torch_do_not_mix_and_there_is_one_transmitter():
-    held = wr.trace_specular(room(), receivers=RX, **ASKED)
+    held = wr.paths.trace_specular(room(), receivers=RX, **ASKED)
     with pytest.raises(TypeError, match="receivers, scattering: got arrays of Warp and of torch"):
         held.evaluate(receivers=torch.tensor(RX), scattering=wp.zeros(2, dtype=wp.float64, device="cpu"))
     with pytest.raises(ValueError, match=r"transmitter: got shape \(3, 3\)"):
-        wr.trace_specular(room(), receivers=RX, **(ASKED | {"transmitter": RX}))
+        wr.paths.trace_specular(room(), receivers=RX, **(ASKED | {"transmitter": RX}))
 
 
 def test_retraced_slopes_see_the_edge_of_a_shadow_that_frozen_ones_do_not():
@@ -232,9 +232,12 @@ def test_retraced_slopes_see_the_edge_of_a_shadow_that_frozen_ones_do_not():
     retraced = retraced_slope(total_db, [away, edge])
     at = torch.tensor(np.array([away, edge - [0, 1e-3, 0]]), requires_grad=True)
     power = (
-        wr.trace_specular(scene, receivers=at.detach(), **asked).evaluate(receivers=at).gain.abs().square()
+        wr.paths.trace_specular(scene, receivers=at.detach(), **asked)
+        .evaluate(receivers=at)
+        .gain.abs()
+        .square()
     )
-    held = wr.trace_specular(scene, receivers=at.detach(), **asked)
+    held = wr.paths.trace_specular(scene, receivers=at.detach(), **asked)
     total = torch.zeros(2, dtype=torch.float64).index_add(0, torch.as_tensor(held.receiver), power)
     (10 * total.log10()).sum().backward()
     np.testing.assert_allclose(retraced[0], at.grad[0], rtol=1e-3, atol=1e-4)

@@ -4,7 +4,7 @@ Gains, Jones matrices, delays, angles and vertices of :func:`~warprrf.trace_path
 (:mod:`warprrf.kernels.radio.specular`), and their derivatives from its adjoint, on Warp's tape or in torch. Which paths there
 are, what they meet and what blocks them is traced once and not differentiated: of a total or a spectrum over positions much is
 edges of shadows, which no derivative at fixed visibility knows. Totals and spectra by positions are given by differences of
-what is traced anew: :func:`~warprrf.rf.positions.retraced_slope` and :meth:`RadioField.slope`.
+what is traced anew: :func:`~warprrf.paths.retraced_slope` and :meth:`RadioField.slope`.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ OUTPUTS = tuple(f.name for f in fields(PathValues))
 
 
 class SpecularPaths:
-    """Paths whose mirrors and slabs are held fixed, L of them; :func:`~warprrf.trace_specular` makes them.
+    """Paths whose mirrors and slabs are held fixed, L of them; :func:`~warprrf.paths.trace_specular` makes them.
 
     Attributes:
         receiver: index of the receiver of each path, shape ``(L,)``. Rows come in the order of :func:`~warprrf.trace_paths`:
@@ -142,7 +142,7 @@ class SpecularPaths:
 
         Example::
 
-            held = wr.trace_specular(scene, transmitter=tx, receivers=rx, frequency_hz=60e9, mirror_order=2)
+            held = wr.paths.trace_specular(scene, transmitter=tx, receivers=rx, frequency_hz=60e9, mirror_order=2)
             at = torch.tensor(rx, dtype=torch.float64, requires_grad=True)
             held.evaluate(receivers=at).gain.abs().square().sum().backward()
             at.grad  # of the summed power [1/m], shape as rx

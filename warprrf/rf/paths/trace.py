@@ -112,8 +112,8 @@ def trace_specular(
     progress: Progress | None = None,
     device: DeviceLike = None,
 ) -> SpecularPaths:
-    """The paths of :func:`trace_paths`, edges and gas apart, as a function of both ends, their antennas' orientations, and materials,
-    which Warp's tape and torch differentiate.
+    """The paths of :func:`~warprrf.trace_paths`, edges and gas apart, as a function of both ends, of their antennas' orientations and of
+    materials, which Warp's tape and torch differentiate.
 
     Which paths there are and what each meets is held fixed: only near where they were traced do they stay those that there are.
 
@@ -130,7 +130,7 @@ def trace_specular(
 
     Example::
 
-        held = wr.trace_specular(scene, transmitter=tx, receivers=rx, frequency_hz=60e9, mirror_order=2)
+        held = wr.paths.trace_specular(scene, transmitter=tx, receivers=rx, frequency_hz=60e9, mirror_order=2)
         eta = wp.array(held.parameters["relative_permittivity"], dtype=wp.float64, requires_grad=True)
         with wp.Tape() as tape:
             values = held.evaluate(relative_permittivity=eta)
