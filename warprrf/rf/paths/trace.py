@@ -112,8 +112,8 @@ def trace_specular(
     progress: Progress | None = None,
     device: DeviceLike = None,
 ) -> SpecularPaths:
-    """The paths of :func:`~warprrf.trace_paths`, edges and gas apart, as a function of both ends, of their antennas' orientations and of
-    materials, which Warp's tape and torch differentiate.
+    """The paths of :func:`~warprrf.trace_paths`, edges and gas apart, as a function of both ends, of their antennas' orientations
+    and of materials, which Warp's tape and torch differentiate.
 
     Which paths there are and what each meets is held fixed: only near where they were traced do they stay those that there are.
 
