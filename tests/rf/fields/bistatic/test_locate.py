@@ -74,3 +74,25 @@ def test_what_cannot_be_located_is_refused(scene, field, horn):
     ):  # fmt: skip
         with pytest.raises((TypeError, ValueError), match=text):
             as_data(field, what)
+
+
+@pytest.mark.parametrize("quantity", ["total", "spectrum"])
+def test_slopes_of_a_field_are_differences_of_spectra_traced_beside(field, quantity):
+    found = field.slope(UNSEEN, quantity=quantity, step_m=0.02)
+    for k, place in enumerate(UNSEEN):
+        for axis, step in enumerate(0.02 * np.eye(3)):
+            sides = [field.spectrum(place + way * step).path_gain.astype(float) for way in (1, -1)]
+            up, down = (g if quantity == "spectrum" else g.sum() for g in sides)
+            expected = 10 * np.log10((up + field.floor) / (down + field.floor)) / 0.04
+            np.testing.assert_allclose(found[k, ..., axis], expected, rtol=1e-3, atol=1e-3)
+    assert np.abs(found).max() > 1.0
+    one = field.slope(UNSEEN[0], quantity=quantity, step_m=0.02)
+    assert one.shape == ((3,) if quantity == "total" else (*field.shape, 3))
+    np.testing.assert_allclose(one, found[0], rtol=1e-5, atol=1e-3)
+
+
+def test_slopes_of_what_no_field_has_are_refused(field):
+    with pytest.raises(ValueError, match="quantity"):
+        field.slope(UNSEEN[0], quantity="delay")
+    with pytest.raises(ValueError, match="step_m"):
+        field.slope(UNSEEN[0], step_m=-0.01)
