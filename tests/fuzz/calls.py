@@ -37,7 +37,7 @@ SERVERS = ("view",)
 """What starts a server for each call: tests/viewer has its refusals."""
 SPREADS = ("channel.angular_spread", "channel.coherence_bandwidth", "channel.delay_spread")
 """What is NaN where there is no power, as their documentation says."""
-ABSTRACT = ("RadioField", "BistaticField", "HarmonicField", "paths.SpecularPaths")
+ABSTRACT = ("RadioField", "BistaticField", "HarmonicField", "paths.SpecularPaths", "paths.PathValues")
 """Classes that nobody makes by calling them."""
 REFUSED = (
     "Paths.from_sionna",
@@ -164,7 +164,6 @@ CLASSES: dict[str, Callable[[Place], Any]] = {
     "SpectrumDataset": lambda p: p.spectra.subset([0, 1, 2]),
     **{f"{kind}Field": lambda p: p.field for kind in ("Radio", "Bistatic")},
     "HarmonicField": lambda p: p.harmonic,
-    "paths.PathValues": lambda p: CLASSES["paths.SpecularPaths"](p).evaluate(),
     "paths.SpecularPaths": lambda p: wr.paths.trace_specular(
         p.scene, transmitter=p.transmitter, receivers=POINTS, frequency_hz=300e9
     ),
