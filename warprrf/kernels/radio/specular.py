@@ -22,6 +22,14 @@ PARALLEL = wp.constant(
     real(1e-6)
 )  # sine of incidence below which a mirror has no plane of incidence of its own
 
+IMAGE = wp.constant(0)  # of the transmitter
+WAY = wp.constant(1)  # direction of each leg
+MET = wp.constant(2)  # where the way back stands
+WAVE = wp.constant(3)  # field, four of them: real and imaginary of either polarisation
+REST = wp.constant(7)  # phase factor of TE (real, imaginary), and detour in slabs [m]
+STATE = 8
+"""Vectors of each interaction that are handed on to the next one."""
+
 
 @wp.struct
 class Sequences:
@@ -180,12 +188,7 @@ def follow_paths(
     thickness_m: wp.array(dtype=real),
     roughness_m: wp.array(dtype=real),
     scattering: wp.array(dtype=real),
-    image: wp.array2d(dtype=wp.vec3d),
-    way: wp.array2d(dtype=wp.vec3d),
-    met: wp.array2d(dtype=wp.vec3d),
-    wave: wp.array3d(dtype=wp.vec3d),
-    turned: wp.array2d(dtype=wp.vec2d),
-    detour: wp.array2d(dtype=real),
+    state: wp.array3d(dtype=wp.vec3d),
     gain: wp.array(dtype=wp.vec2d),
     jones: wp.array3d(dtype=wp.vec2d),
     tau: wp.array(dtype=real),
@@ -195,54 +198,56 @@ def follow_paths(
     phi_t: wp.array(dtype=real),
     vertices: wp.array2d(dtype=wp.vec3d),
 ):
-    """Answers of each path, from ``gain`` on; before them, what loops hand on: images of the transmitter, directions of the legs,
-    points where the way back stands, fields (real and imaginary of either polarisation), phase factors of TE, and detours in slabs.
+    """Answers of each path, from ``gain`` on.
 
     There is one transmitter; one orientation of receivers stands for all. Angles and Jones matrices are those of the antennas'
-    own axes. Of ``vertices`` those past the last interaction are left as they are.
+    own axes. ``vertices`` are NaN past the last interaction. ``state`` (L, K + 1, :data:`STATE`) is what loops hand on.
     """
     i = offset + wp.tid()
     n = paths.count[i]
     r = paths.receiver[i]
     wavelength_m = SPEED_OF_LIGHT / paths.frequency_hz
-    image[i, 0] = transmitter[0]
+    state[i, 0, IMAGE] = transmitter[0]
     for j in range(n):
-        height = wp.dot(paths.normal[i, j], image[i, j]) - paths.plane_offset[i, j]
-        image[i, j + 1] = image[i, j] - real(2 * paths.mirrors[i, j]) * height * paths.normal[i, j]
-    whole = receiver[r] - image[i, n]
+        height = wp.dot(paths.normal[i, j], state[i, j, IMAGE]) - paths.plane_offset[i, j]
+        state[i, j + 1, IMAGE] = (
+            state[i, j, IMAGE] - real(2 * paths.mirrors[i, j]) * height * paths.normal[i, j]
+        )
+    whole = receiver[r] - state[i, n, IMAGE]
     length_m = wp.length(whole)
-    way[i, n] = whole / length_m
-    met[i, n] = receiver[r]
+    state[i, n, WAY] = whole / length_m
+    state[i, n, MET] = receiver[r]
     for back in range(n):
         j = n - 1 - back
         normal = paths.normal[i, j]
-        after = way[i, j + 1]
-        way[i, j] = after - real(2 * paths.mirrors[i, j]) * wp.dot(after, normal) * normal
-        here = met[i, j + 1]
+        after = state[i, j + 1, WAY]
+        state[i, j, WAY] = after - real(2 * paths.mirrors[i, j]) * wp.dot(after, normal) * normal
+        here = state[i, j + 1, MET]
         side = wp.dot(normal, here) - paths.plane_offset[i, j]
-        depth = wp.dot(normal, image[i, j + 1]) - paths.plane_offset[i, j]
-        met[i, j] = here + side / (side - depth) * (image[i, j + 1] - here)
-        vertices[i, j] = met[i, j]
+        depth = wp.dot(normal, state[i, j + 1, IMAGE]) - paths.plane_offset[i, j]
+        state[i, j, MET] = here + side / (side - depth) * (state[i, j + 1, IMAGE] - here)
+        vertices[i, j] = state[i, j, MET]
+    for j in range(n, vertices.shape[1]):
+        vertices[i, j] = wp.vec3d(real(wp.nan), real(wp.nan), real(wp.nan))
 
     turn_t = rotation_of(transmitter_orientation[0])
     turn_r = rotation_of(receiver_orientation[wp.min(r, receiver_orientation.shape[0] - 1)])
-    zenith_t, azimuth_t = angles_of(wp.transpose(turn_t) * way[i, 0])
-    zenith_r, azimuth_r = angles_of(-(wp.transpose(turn_r) * way[i, n]))
+    zenith_t, azimuth_t = angles_of(wp.transpose(turn_t) * state[i, 0, WAY])
+    zenith_r, azimuth_r = angles_of(-(wp.transpose(turn_r) * state[i, n, WAY]))
     theta_t[i] = zenith_t
     phi_t[i] = azimuth_t
     theta_r[i] = zenith_r
     phi_r[i] = azimuth_r
 
     none = wp.vec3d(real(0.0), real(0.0), real(0.0))
-    wave[i, 0, 0] = turn_t * zenith_vector(zenith_t, azimuth_t)
-    wave[i, 0, 1] = none
-    wave[i, 0, 2] = turn_t * azimuth_vector(azimuth_t)
-    wave[i, 0, 3] = none
-    turned[i, 0] = wp.vec2d(real(1.0), real(0.0))
-    detour[i, 0] = real(0.0)
+    state[i, 0, WAVE + 0] = turn_t * zenith_vector(zenith_t, azimuth_t)
+    state[i, 0, WAVE + 1] = none
+    state[i, 0, WAVE + 2] = turn_t * azimuth_vector(azimuth_t)
+    state[i, 0, WAVE + 3] = none
+    state[i, 0, REST] = wp.vec3d(real(1.0), real(0.0), real(0.0))
     for j in range(n):
-        before = way[i, j]
-        after = way[i, j + 1]
+        before = state[i, j, WAY]
+        after = state[i, j + 1, WAY]
         mirrors = paths.mirrors[i, j] == 1
         m = paths.material[i, j]
         te = wp.vec2d(real(1.0), real(0.0))
@@ -270,20 +275,22 @@ def follow_paths(
         p = wp.cross(s, before)
         q = wp.cross(s, after)
         for k in range(2):
-            e = wave[i, j, 2 * k]
-            f = wave[i, j, 2 * k + 1]
+            e = state[i, j, WAVE + 2 * k]
+            f = state[i, j, WAVE + 2 * k + 1]
             along = times(te, wp.vec2d(wp.dot(s, e), wp.dot(s, f)))
             within = times(tm, wp.vec2d(wp.dot(p, e), wp.dot(p, f)))
-            wave[i, j + 1, 2 * k] = along[0] * s + within[0] * q
-            wave[i, j + 1, 2 * k + 1] = along[1] * s + within[1] * q
+            state[i, j + 1, WAVE + 2 * k] = along[0] * s + within[0] * q
+            state[i, j + 1, WAVE + 2 * k + 1] = along[1] * s + within[1] * q
         size = wp.dot(te, te)
         phase = wp.vec2d(real(1.0), real(0.0))
         if size > real(0.0):
             phase = te / wp.sqrt(size)
-        turned[i, j + 1] = times(turned[i, j], phase)
-        detour[i, j + 1] = detour[i, j] + longer
+        rest = state[i, j, REST]
+        turned = times(wp.vec2d(rest[0], rest[1]), phase)
+        state[i, j + 1, REST] = wp.vec3d(turned[0], turned[1], rest[2] + longer)
 
-    delay = (length_m + detour[i, n]) / SPEED_OF_LIGHT
+    rest = state[i, n, REST]
+    delay = (length_m + rest[2]) / SPEED_OF_LIGHT
     tau[i] = delay
     cycles = paths.frequency_hz * delay  # whole turns are dropped: there are 1e4 and more
     friis = wavelength_m / (real(2.0) * TURN * length_m)
@@ -292,8 +299,8 @@ def follow_paths(
     around = turn_r * azimuth_vector(azimuth_r)
     power = real(0.0)
     for k in range(2):
-        e = wave[i, n, 2 * k]
-        f = wave[i, n, 2 * k + 1]
+        e = state[i, n, WAVE + 2 * k]
+        f = state[i, n, WAVE + 2 * k + 1]
         a = wp.vec2d(wp.dot(up, e), wp.dot(up, f))
         b = wp.vec2d(wp.dot(around, e), wp.dot(around, f))
         power += wp.dot(a, a) + wp.dot(b, b)
@@ -302,4 +309,4 @@ def follow_paths(
     amplitude = real(0.0)
     if power > real(0.0):
         amplitude = wp.sqrt(real(0.5) * power)
-    gain[i] = amplitude * times(factor, turned[i, n])
+    gain[i] = amplitude * times(factor, wp.vec2d(rest[0], rest[1]))

@@ -69,11 +69,6 @@ class SpecularPaths:
     Attributes:
         receiver: index of the receiver of each path, shape ``(L,)``. Rows come in the order of :func:`~warprrf.trace_paths`:
             of several receivers they are its ``paths.gain[paths.valid]``.
-        parameters: what :meth:`evaluate` takes, with the values that were traced: ``transmitter`` [m] ``(1, 3)``, ``receivers`` [m]
-            ``(R, 3)``, ``transmitter_orientation`` and ``receiver_orientation`` [rad] ``(1, 3)``; of the scene's M materials at
-            the carrier ``relative_permittivity``, ``conductivity`` [S/m], ``thickness_m`` [m], ``roughness_m`` [m] and
-            ``scattering``, each ``(M,)``. Where scattering comes from the roughness ``scattering`` is 0, and the other way round.
-            A solid is as thick as it was where it was traced.
         frequency_hz: carrier [Hz].
         device: where paths are computed.
     """
@@ -83,13 +78,12 @@ class SpecularPaths:
         found: MirrorPaths,
         offset: np.ndarray,
         material: np.ndarray,
-        parameters: Mapping[str, np.ndarray],
+        traced: Mapping[str, wp.array],
         frequency_hz: float,
-        device: _device.DeviceLike,
+        device: wp.Device,
     ) -> None:
-        self.receiver, self.frequency_hz = found.receiver, frequency_hz
-        self.parameters = {name: np.array(value, float) for name, value in parameters.items()}
-        self.device, self._shape = _device.resolve(device), found.patch.shape
+        self.receiver, self.frequency_hz, self.device = found.receiver, frequency_hz, device
+        self._traced, self._shape = {name: traced[name] for name in TYPES}, found.patch.shape
         mirrors = found.patch >= 0
         self._there = mirrors | (found.slab >= 0)
         columns = {
@@ -105,6 +99,17 @@ class SpecularPaths:
         self._sequences.frequency_hz = frequency_hz
         for name, (array, dtype) in columns.items():
             setattr(self._sequences, name, wp.array(array, dtype=dtype, device=self.device))
+
+    @property
+    def parameters(self) -> dict[str, np.ndarray]:
+        """What :meth:`evaluate` takes, with the values that were traced, by name.
+
+        ``transmitter`` [m] ``(1, 3)``, ``receivers`` [m] ``(R, 3)``, ``transmitter_orientation`` and ``receiver_orientation``
+        [rad] ``(1, 3)``; of the scene's M materials at the carrier ``relative_permittivity``, ``conductivity`` [S/m],
+        ``thickness_m`` [m], ``roughness_m`` [m] and ``scattering``, each ``(M,)``. Where scattering comes from the roughness
+        ``scattering`` is 0, and the other way round. A solid is as thick as it was where it was traced.
+        """
+        return {name: array.numpy().copy() for name, array in self._traced.items()}
 
     def __len__(self) -> int:
         return self._shape[0]
@@ -191,9 +196,8 @@ class SpecularPaths:
         return array
 
     def _check_shape(self, name: str, shape: tuple[int, ...]) -> None:
-        wanted = [self.parameters[name].shape]
-        if name == "receiver_orientation":
-            wanted.append(self.parameters["receivers"].shape)
+        like = [self._traced[name], *([self._traced["receivers"]] if name == "receiver_orientation" else [])]
+        wanted = [(*a.shape, 3) if a.dtype is wp.vec3d else a.shape for a in like]
         if tuple(shape) not in wanted:
             told = " or ".join(map(str, dict.fromkeys(wanted)))
             raise ValueError(f"{name}: got shape {tuple(shape)}, expected {told}")
@@ -215,45 +219,37 @@ class SpecularPaths:
     def _launch(self, given: Mapping[str, wp.array], taped: bool) -> list[wp.array]:
         """Answers, as :class:`PathValues` has them, of parameters some of which are ``given``: recorded on the tape that runs if
         ``taped``, else on all cores."""
-        (count, depth), where = self._shape, self.device
-        inputs = [
-            given[name] if name in given else wp.array(value, dtype=TYPES[name], device=where)
-            for name, value in self.parameters.items()
+        (count, depth), inputs = self._shape, [given.get(name, array) for name, array in self._traced.items()]
+        shapes = [
+            ((count, depth + 1, kernels.STATE), wp.vec3d),
+            (count, wp.vec2d),
+            ((count, 2, 2), wp.vec2d),
+            *[(count, wp.float64)] * 5,
+            ((count, depth), wp.vec3d),
         ]
-        shapes = {
-            **{name: ((count, depth + 1), wp.vec3d) for name in ("image", "way", "met")},
-            "wave": ((count, depth + 1, 4), wp.vec3d),
-            "turned": ((count, depth + 1), wp.vec2d),
-            "detour": ((count, depth + 1), wp.float64),
-            "gain": (count, wp.vec2d),
-            "jones": ((count, 2, 2), wp.vec2d),
-            **{name: (count, wp.float64) for name in OUTPUTS[2:-1]},
-        }
-        arrays = [
-            wp.empty(shape, dtype=dtype, device=where, requires_grad=taped)
-            for shape, dtype in shapes.values()
-        ]
-        arrays.append(
-            wp.full((count, depth), wp.vec3d(np.nan), dtype=wp.vec3d, device=where, requires_grad=taped)
-        )
+        arrays = [wp.empty(shape, dtype=d, device=self.device, requires_grad=taped) for shape, d in shapes]
         if taped:
-            wp.launch(kernels.follow_paths, count, [0, self._sequences, *inputs, *arrays], device=where)
+            wp.launch(kernels.follow_paths, count, [0, self._sequences, *inputs, *arrays], device=self.device)
         else:
             _device.launch(
-                kernels.follow_paths, count, [self._sequences, *inputs, *arrays], device=where, grain=64
+                kernels.follow_paths, count, [self._sequences, *inputs, *arrays], device=self.device, grain=64
             )
-        return arrays[-len(OUTPUTS) :]
+        return arrays[1:]
 
 
-def parameters_of(materials: Any, table: SurfaceTable | None, frequency_hz: float) -> dict[str, np.ndarray]:
-    """Materials' parameters as the kernel takes them; none for a bare mesh."""
-    if table is None:
-        return dict.fromkeys(MATERIALS, np.zeros(0))
-    rough = np.array([m.roughness_m if getattr(m, "scattering", 0.0) is None else 0.0 for m in materials])
-    return {
-        "relative_permittivity": table.permittivity.real,
-        "conductivity": -table.permittivity.imag * (2.0 * np.pi * frequency_hz * VACUUM_PERMITTIVITY),
-        "thickness_m": table.thickness_m,
-        "roughness_m": rough,
-        "scattering": np.where(rough > 0.0, 0.0, table.scattering),
-    }
+def fixed_parameters(
+    materials: Any, table: SurfaceTable | None, frequency_hz: float, device: wp.Device
+) -> dict[str, wp.array]:
+    """Parameters that hang on no place: materials' properties, of which a bare mesh has none, and antennas as they stand."""
+    found = dict.fromkeys(MATERIALS, np.zeros(0))
+    if table is not None:
+        rough = np.array([m.roughness_m if getattr(m, "scattering", 0.0) is None else 0.0 for m in materials])
+        found = {
+            "relative_permittivity": table.permittivity.real,
+            "conductivity": -table.permittivity.imag * (2.0 * np.pi * frequency_hz * VACUUM_PERMITTIVITY),
+            "thickness_m": table.thickness_m,
+            "roughness_m": rough,
+            "scattering": np.where(rough > 0.0, 0.0, table.scattering),
+        }
+    found |= dict.fromkeys(POSITIONS[2:], np.zeros((1, 3)))
+    return {name: wp.array(array, dtype=TYPES[name], device=device) for name, array in found.items()}

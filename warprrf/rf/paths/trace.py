@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_count, checked
@@ -23,7 +24,7 @@ from warprrf.rf.paths.images import MOST_CHAINS, MirrorImages
 from warprrf.rf.paths.mirror_paths import MirrorPaths, exact_paths
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.slabs import Walls
-from warprrf.rf.paths.specular import OUTPUTS, SpecularPaths, parameters_of
+from warprrf.rf.paths.specular import OUTPUTS, SpecularPaths, fixed_parameters
 from warprrf.rf.positions import Ends, check_positions, question_unit, warn_of_unmodelled
 
 
@@ -207,12 +208,11 @@ class MirrorTracer:
         self.frequency_hz = check_frequency(frequency_hz)
         self.table: SurfaceTable | None = None
         self.walls: Walls | None = None
-        self._materials: tuple[Any, ...] = ()
         self._face_material = np.zeros(0, np.int32)
         groups = None
         materials = getattr(mesh_or_scene, "materials", None)
         if materials is not None:
-            self.table, self._materials = surface_table(materials, frequency_hz), tuple(materials)
+            self.table = surface_table(materials, frequency_hz)
             groups = getattr(mesh_or_scene, "face_material", None)
         self.patches = planar_patches(self.mesh, groups)
         if transmissions and self.table is not None and groups is not None:
@@ -225,6 +225,7 @@ class MirrorTracer:
                 self.mesh, eta, thickness, self.wavelength_m, transmissions, clearance, device
             )
         self.images = MirrorImages(self.patches, self.transmitter, max_chains=max_chains, device=device)
+        self._fixed = fixed_parameters(materials, self.table, self.frequency_hz, self.images.device)
         self.edges: EdgeFinder | None = None
         if diffractions:
             self.edges = EdgeFinder(
@@ -308,8 +309,6 @@ class MirrorTracer:
         if self.table is not None:
             material[mirror] = self.patches.group[found.patch[mirror]]
             material[slab] = self._face_material[found.slab[slab]]
-        none = np.zeros((1, 3))
-        ends = {"transmitter": self.transmitter[None], "receivers": points}
-        ends |= {"transmitter_orientation": none, "receiver_orientation": none}
-        own = parameters_of(self._materials, self.table, self.frequency_hz)
-        return SpecularPaths(found, offset, material, ends | own, self.frequency_hz, self.images.device)
+        where, ends = self.images.device, {"transmitter": self.transmitter[None], "receivers": points}
+        traced = {name: wp.array(value, dtype=wp.vec3d, device=where) for name, value in ends.items()}
+        return SpecularPaths(found, offset, material, traced | self._fixed, self.frequency_hz, where)
