@@ -63,17 +63,26 @@ def place(
     places = check_array("candidates", candidates, (None, 3))
     check_count("n", n, 1, len(places))
     check_choice("objective", objective, OBJECTIVES)
-    measure, level = OBJECTIVES[objective], check_number("level_db", level_db)
+    level = check_number("level_db", level_db)
     found = []
     for k, source in enumerate(places):
         found.append(radio_map(field, height, cell, source, MapOptions(**options)).best_beam_snr_db)
         if progress is not None:
             progress("place", k + 1, len(places))
-    snr_db = np.stack(found)
-    snr_db = np.fmax(snr_db, LEAST_DB)[:, ~np.isnan(snr_db).all(axis=0)]  # cells in the air
+    return one_by_one(np.stack(found), n, objective, level)
+
+
+def in_air(snr_db: np.ndarray) -> np.ndarray:
+    """Signal-to-noise ratios of candidates' maps [dB], NaN outside the air, in the cells that lie in it, ``(C, cells)``."""
+    return np.asarray(np.fmax(snr_db, LEAST_DB)[:, ~np.isnan(snr_db).all(axis=0)])
+
+
+def one_by_one(snr_db: np.ndarray, n: int, objective: str, level: float = 0.0) -> np.ndarray:
+    """What :func:`place` chooses by candidates' maps [dB], NaN outside the air, shape ``(C, Y, X)``."""
+    measure, snr_db = OBJECTIVES[objective], in_air(snr_db)
     best, chosen = np.full(snr_db.shape[1], LEAST_DB), list[int]()
     for _ in range(n):
-        left = [k for k in range(len(places)) if k not in chosen]
+        left = [k for k in range(len(snr_db)) if k not in chosen]
         with_each = [measure(np.maximum(best, snr_db[k]), level) for k in left]
         chosen.append(left[int(np.argmax(with_each))])
         best = np.maximum(best, snr_db[chosen[-1]])

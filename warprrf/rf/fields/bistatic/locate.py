@@ -45,10 +45,12 @@ SUB_PIXELS = (
 SMOOTH = 3  # pixels of a spectrum that slopes are means over, along each axis: noise of slopes would pass for curvature
 HUBER = 3.0  # standard deviations
 LEAST_STD_DB = 0.3  # of a pixel: no field is so exact that tenths of a decibel tell places apart
-BLOCKS = (
-    12  # along each axis of a spectrum, whose errors hang together: what one edge in the wrong place spoils
-)
-HOLD, FINAL = 1.0, True
+BLOCKS = 12
+"""Along each axis of a spectrum, whose errors hang together: what one edge in the wrong place spoils."""
+SPREAD = 1.8
+"""Of a spectrum's covariance: blocks are not all that hangs together. By 20 receivers of a lobby, none of them fitted to or tested:
+half of their squared errors, and 95 of 100, were 1.7 and 1.9 times what blocks say."""
+GIVEN_UP = 2.0  # times the least loss of an earlier start: others are left where they leave more
 FOLLOWED = 1.4  # times the least loss: candidates are followed below
 SAME_M = 0.1  # candidates nearer than this are one
 SURE, EXPLAINED = 0.95, 4.0  # likelihood and misfit of a place that is known
@@ -94,7 +96,8 @@ def as_data(field: Any, measured: Any) -> list[Measured]:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Unknowns (U,) and what they leave: errors in standard deviations ``(N,)`` and their slopes ``(N, U)``."""
+    """Unknowns (U,) and what they leave: errors in standard deviations ``(N,)`` and their slopes ``(N, U)``, which were taken at
+    the unknowns ``sloped`` over ``step_m``."""
 
     unknown: np.ndarray
     error: np.ndarray
@@ -220,7 +223,8 @@ class Question:
         rise = np.concatenate(rises)
         if near is not None:
             rise[:, :3] = near.rise[:, :3]
-        return Found(unknown, np.concatenate(errors), rise, unknown if near is None else near.sloped, step_m if near is None else near.step_m)
+        at = (unknown, step_m) if near is None else (near.sloped, near.step_m)
+        return Found(unknown, np.concatenate(errors), rise, *at)
 
     def _gains(self, place: Place, points: np.ndarray, quick: bool) -> list[PathGains]:
         """What is received at each of ``points`` under a place's transmitter, all traced at once."""
@@ -234,8 +238,11 @@ class Question:
         few.beam_sigma_rad = place.beam_sigma_rad
         return path_gains(few.view(points, model.effects), model, f.materials_of(tracer)).apart
 
-    def descend(self, unknown: np.ndarray, *, quick: bool, near: Found | None = None) -> Found:
-        """From ``unknown`` (U,) to where errors are least."""
+    def descend(
+        self, unknown: np.ndarray, *, quick: bool, near: Found | None = None, most: float = np.inf
+    ) -> Found:
+        """From ``unknown`` (U,) to where errors are least; given up where after a step they leave more than ``most``. Slopes
+        are at first those that were found ``near``, and hold as far about their place as they were taken over."""
         damping, difference = 1e-3, FIRST_DIFFERENCE_M if quick else 2.0 * DIFFERENCE_M
         now = self.errors(unknown, difference, quick=quick, near=near)
         for _ in range(STEPS[0 if quick else 1]):
@@ -248,11 +255,11 @@ class Question:
                 step *= 0.5  # not through walls
             length = float(np.linalg.norm(step[:3]))
             difference = float(np.clip(0.5 * length, DIFFERENCE_M, difference))
-            holds = np.linalg.norm((now.unknown + step - now.sloped)[:3]) < HOLD * now.step_m
+            holds = np.linalg.norm((now.unknown + step - now.sloped)[:3]) < now.step_m
             other = self.errors(now.unknown + step, difference, quick=quick, near=now if holds else None)
             better = other.loss(threshold) < now.loss(threshold)
             now, damping = (other, 0.2 * damping) if better else (now, max(1.0, 4.0 * damping))
-            if length < SHORTEST_M * (3.0 if quick else 1.0):
+            if length < SHORTEST_M * (3.0 if quick else 1.0) or now.loss(threshold) > most:
                 break
         return now
 
@@ -269,7 +276,7 @@ class Question:
         block = np.resize(BLOCKS * row + column, count)
         score = best.rise * (huber(best.error, threshold)[1] * best.error)[:, None]
         sums = np.stack([np.bincount(block, one) for one in score.T], axis=1)
-        return np.asarray(inverse @ (sums.T @ sums) @ inverse)[:3, :3]
+        return np.asarray(SPREAD * inverse @ (sums.T @ sums) @ inverse)[:3, :3]
 
 
 def locate(
@@ -285,7 +292,10 @@ def locate(
 
 def search(question: Question, maps: dict[bytes, FieldMap]) -> Location:
     """From the lattice's best places to the candidates, and what is known of the likeliest."""
-    first = [question.descend(start, quick=True) for start in question.starts(maps)]
+    first, most = list[Found](), np.inf
+    for start in question.starts(maps):
+        first.append(question.descend(start, quick=True, most=most))
+        most = min(most, GIVEN_UP * first[-1].loss(first[-1].threshold))
     threshold = min(one.threshold for one in first)
     first.sort(key=lambda one: one.loss(threshold))
     least, found, rest = first[0].loss(threshold), list[Found](), list[Found]()
@@ -293,7 +303,7 @@ def search(question: Question, maps: dict[bytes, FieldMap]) -> Location:
         if one.loss(threshold) >= FOLLOWED * least:
             rest.append(one)
         elif not one.near(first[: first.index(one)]):
-            found.append(question.descend(one.unknown, quick=False, near=one if FINAL else None))
+            found.append(question.descend(one.unknown, quick=False, near=one))
     best = min(found, key=lambda one: one.loss(threshold))
     ahead = {id(one): least - best.loss(threshold) for one in rest}  # what all effects would bring them too
     spread = best.loss(threshold) / max(len(best.error) - len(best.unknown), 1)
