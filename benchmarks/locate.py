@@ -28,8 +28,8 @@ HELP = """\
 A field of the lobby is fitted to 50 of Sionna RT's spectra, on the reconstruction of `make lobby`, or on the true mesh where there
 is none. Test receivers, which no fit has seen, are located: from their spectrum; from a horn's pointings at three elevations, of
 unknown gain and zero of azimuth, with noise; from the powers of six transmitters, which the exact engine gives. Beside it stands
-the place whose measurement is most alike: of Sionna's training receivers, or, for horns and powers, of 400 that the exact engine
-gives; for powers also multilateration, as if all six were in sight. Then transmitters are chosen among 200 places under the
+the place whose measurement is most alike: of Sionna's training receivers, or, for powers, of 400 that the exact engine gives; for
+powers also multilateration, as if all six were in sight. Then transmitters are chosen among 200 places under the
 ceiling, by maps of single bounces in cells of a metre, beside trying all. Each receiver is kept as soon as it is found.
 
 examples:
@@ -84,7 +84,7 @@ class Options(FitOptions):
         "what is done",
         choices=("spectrum", "horn", "powers", "place"),
     )
-    prints: int = option(400, "places with whose readings those of horns and powers are compared")
+    prints: int = option(400, "places with whose powers those of six transmitters are compared")
 
 
 def horn_readings(ds: wr.SpectrumDataset, turn: float = 0.0) -> np.ndarray:
@@ -178,7 +178,7 @@ class Question:
         if part == "spectrum":
             rival = nearest_spectrum(self.test, k, self.pool)
         elif part == "horn":
-            rival = self.prints.receivers[nearest_horn(asked, self.turned)]
+            rival = self.pool.receivers[nearest_horn(asked, self.turned)]
         else:
             off = np.abs(np.log(self.powers["prints"]) - np.log(asked.power)).mean(axis=1)
             rival = self.print_places[int(off.argmin())]
@@ -199,15 +199,10 @@ class Question:
         return np.asarray(places[: self.options.prints])
 
     @cached_property
-    def prints(self) -> wr.SpectrumDataset:
-        """Spectra there, of the exact engine."""
-        return self.simulated(self.test.transmitter, self.print_places, self.test.shape)
-
-    @cached_property
     def turned(self) -> np.ndarray:
-        """What a horn reads there, by turn, shape ``(R, T, N)``."""
+        """What a horn reads at training receivers, by turn, shape ``(R, T, N)``."""
         turns = 2.0 * np.pi / TURNS * np.arange(TURNS)
-        return np.stack([horn_readings(self.prints, turn) for turn in turns], axis=1)
+        return np.stack([horn_readings(self.pool, turn) for turn in turns], axis=1)
 
     @cached_property
     def powers(self) -> dict[str, np.ndarray]:
