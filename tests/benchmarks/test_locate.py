@@ -8,7 +8,9 @@ import warprrf as wr
 from benchmarks.locate import multilaterated, nearest_horn
 from benchmarks.measurements import POINTINGS
 
-SOURCES = np.array([[0.5, 0.5, 2.8], [9.5, 0.7, 2.6], [9.0, 7.5, 2.9], [0.8, 7.0, 2.5], [5.0, 0.4, 2.7], [5.0, 7.6, 2.2]])
+SOURCES = np.array(
+    [[0.5, 0.5, 2.8], [9.5, 0.7, 2.6], [9.0, 7.5, 2.9], [0.8, 7.0, 2.5], [5.0, 0.4, 2.7], [5.0, 7.6, 2.2]]
+)
 BOUNDS = np.array([[0.0, 0.0, 0.0], [10.0, 8.0, 3.0]])
 THERE, CARRIER_HZ = np.array([6.5, 3.0, 1.2]), 60e9
 

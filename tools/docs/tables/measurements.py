@@ -61,7 +61,12 @@ def _locate() -> str:
 def _place() -> str:
     head = "transmitters", "of candidates", "chosen: worst tenth [dB]", "best of all", "core seconds"
     lines = [
-        [str(r["n"]), str(r["candidates"]), *(show(r[k], "{:.2f}") for k in ("chosen", "best")), show(r["cpu_s"], "{:.0f}")]
+        [
+            str(r["n"]),
+            str(r["candidates"]),
+            *(show(r[k], "{:.2f}") for k in ("chosen", "best")),
+            show(r["cpu_s"], "{:.0f}"),
+        ]
         for r in read("locate")["place"]
     ]
     return markdown(head, lines)
