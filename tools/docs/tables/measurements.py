@@ -59,12 +59,12 @@ def _locate() -> str:
 
 @entry("place")
 def _place() -> str:
-    head = "transmitters", "of candidates", "chosen: worst tenth [dB]", "best of all", "core seconds"
+    head = "transmitters", "of candidates", "chosen: worst tenth [dB]", "one added at a time", "core seconds"
     lines = [
         [
             str(r["n"]),
             str(r["candidates"]),
-            *(show(r[k], "{:.2f}") for k in ("chosen", "best")),
+            *(show(r[k], "{:.2f}") for k in ("chosen", "added")),
             show(r["cpu_s"], "{:.0f}"),
         ]
         for r in read("locate")["place"]
