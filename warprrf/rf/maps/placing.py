@@ -79,8 +79,8 @@ def place(
 def best_set(
     snr_db: np.ndarray, n: int, objective: str, level: float = 0.0, *, most: int = MOST_SETS
 ) -> np.ndarray:
-    """What :func:`place` chooses by candidates' maps [dB], NaN outside the air, shape ``(C, Y, X)``; more than ``most`` sets are not
-    all tried."""
+    """What :func:`place` chooses by candidates' maps [dB], NaN outside the air, shape ``(C, Y, X)``; of more than ``most`` sets not
+    all are tried."""
     measure, cells = OBJECTIVES[objective], np.fmax(snr_db, LEAST_DB)[:, ~np.isnan(snr_db).all(axis=0)]
 
     def worth(some: Sequence[int]) -> float:
