@@ -8,7 +8,8 @@ import pytest
 from furnished import RECEIVERS
 
 import warprrf as wr
-from warprrf.rf.fields.bistatic.locate import as_data
+from warprrf.rf.fields.bistatic.locate import Question, as_data
+from warprrf.rf.tracing.render import path_gains
 
 UNSEEN = np.array([[3.9, 2.0, 1.4], [1.7, 3.1, 1.2]])
 OTHERS = np.array([[4.4, 0.6, 2.3], [0.7, 3.5, 2.4], [4.5, 3.6, 2.5]])
@@ -96,3 +97,29 @@ def test_slopes_of_what_no_field_has_are_refused(field):
         field.slope(UNSEEN[0], quantity="delay")
     with pytest.raises(ValueError, match="step_m"):
         field.slope(UNSEEN[0], step_m=-0.01)
+
+
+def test_receivers_traced_at_once_get_what_each_gets_alone(field):
+    tracer = field.tracer().on_grid((20, 40), 1)
+    places = np.concatenate([UNSEEN, OTHERS[:1]])
+    materials, model = field.materials_of(tracer), field.state
+    together = path_gains(tracer.view(places, field.effects), model, materials).apart
+    for place, found in zip(places, together, strict=True):
+        alone = path_gains(tracer.view(place, field.effects), model, materials)
+        assert len(alone.specular) > 1 and alone.by_ray().max() > 0
+        np.testing.assert_allclose(found.specular, alone.specular, rtol=1e-12)
+        np.testing.assert_allclose(found.by_ray(), alone.by_ray(), rtol=1e-6)
+        np.testing.assert_array_equal(found.view.receivers, alone.view.receivers)
+        np.testing.assert_array_equal(found.view.hits.face, alone.view.hits.face)
+        np.testing.assert_allclose(found.view.paths.arrival, alone.view.paths.arrival, atol=1e-12)
+
+
+def test_slopes_hold_near_where_they_were_taken(scene, field):
+    question = Question(field, as_data(field, furnished.spectra(scene, UNSEEN[:1])))
+    there = question.errors(UNSEEN[0] + 0.05, 0.1, quick=True)
+    near = question.errors(UNSEEN[0] + 0.02, 0.1, quick=True, near=there)
+    anew = question.errors(UNSEEN[0] + 0.02, 0.1, quick=True)
+    np.testing.assert_array_equal(near.rise, there.rise)
+    np.testing.assert_allclose(near.error, anew.error, atol=1e-5)
+    np.testing.assert_array_equal(near.sloped, there.unknown)
+    assert not np.allclose(anew.rise, there.rise)
