@@ -258,6 +258,44 @@ def test_a_click_in_the_browser_chooses_the_path_under_it(viewer, found, page):
     _until(lambda: answers.described(paths, k)[1] in viewer._rays.label, 30)
 
 
+@pytest.fixture(scope="module")
+def table(viewer, tmp_path_factory):
+    """What a horn of 20 degrees reads at ``RECEIVER``, as a CSV file that says it stood elsewhere."""
+    angles = [(e, a) for e in (-40.0, 0.0, 40.0) for a in np.arange(-180.0, 180.0, 15.0)]
+    up, around = np.radians(angles).T
+    toward = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=1)
+    field = viewer.subject.field
+    paths = field.paths(RECEIVER)
+    off = np.arccos(np.clip(toward @ paths.arrival.T, -1.0, 1.0))
+    power_db = 10.0 * np.log10(wr.horn(np.radians(20.0)).gain_off_boresight(off) @ paths.power)
+    ends = ",".join(str(x) for x in [*field.transmitter, 1.0, 1.0, 1.0])
+    lines = ["tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,elevation_deg,azimuth_deg,power_db"]
+    lines += [f"{ends},{e},{a},{power:.2f}" for (e, a), power in zip(angles, power_db, strict=True)]
+    file = tmp_path_factory.mktemp("table") / "horn <20>.csv"
+    file.write_text("\n".join(lines))
+    return file
+
+
+@browsed
+def test_a_table_given_to_the_page_puts_the_receiver_where_it_was_read(viewer, page, table):
+    """Through the browser's own choice of a file; what is no table is said to be none, and moves nothing."""
+    survey, start = viewer._survey, viewer.receiver
+    survey._width_deg.value, survey._floor_db.value = 20.0, -200.0
+    _click(page, "Survey")
+    (given,) = page.find_elements(By.CSS_SELECTOR, "input[type=file]")
+    wrong = table.with_name("wrong.csv")
+    wrong.write_text("a,b\n1,2\n")
+    given.send_keys(str(wrong))
+    _until(lambda: "lacks the columns" in viewer.message, 60)
+    np.testing.assert_array_equal(viewer.receiver, start)
+    given.send_keys(str(table))
+    _until(lambda: "horn &lt;20&gt;.csv: at " in survey.legend.content, 300)
+    viewer.wait()
+    assert np.linalg.norm(viewer.receiver - RECEIVER) < 0.1, survey.legend.content
+    assert survey.listed[0].label.startswith("likely by ")
+    _click(page, "Channel")
+
+
 @browsed
 def test_a_thousand_updates_leave_memory_as_it_is(viewer, page):
     rng = np.random.default_rng(0)

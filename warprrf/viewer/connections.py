@@ -58,6 +58,14 @@ SENT: dict[str, dict[str, Any]] = {
     },
     "GuiUpdateMessage": {"uuid": Text, "updates": dict[Literal["value"], bool | Number | Text]},
     "GetRenderResponseMessage": {"payload": bytes, "render_uuid": Text},
+    "FileTransferStartUpload": {
+        "source_component_uuid": Text, "transfer_uuid": Text, "filename": Text, "mime_type": Text,
+        "part_count": Annotated[int, msgspec.Meta(ge=0, le=100)], "size_bytes": Annotated[int, msgspec.Meta(ge=0, le=2**24)],
+    },
+    "FileTransferPart": {
+        "source_component_uuid": Text, "transfer_uuid": Text, "part_index": Count,
+        "content": Annotated[bytes, msgspec.Meta(max_length=2**20)],
+    },
 }  # fmt: skip
 """Messages of viser's page as far as this viewer uses them, and the types of their fields."""
 

@@ -1,8 +1,11 @@
-"""The panel of what is computed for many places: radio map, errors where it was measured, where to measure next."""
+"""The panel of what is computed for many places: radio map, errors where it was measured, where to measure next, and where what
+was read was read."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -12,6 +15,7 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.maps.radio_map import QUANTITIES
 from warprrf.rf.positions import is_free
+from warprrf.rf.spectra.antenna import horn
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.readings import Readings
@@ -19,12 +23,13 @@ from warprrf.viewer import answers, pictures
 from warprrf.viewer.page import Page, Setting
 from warprrf.viewer.subject import Subject
 
-MEASURED, SUGGESTED = (240, 160, 30), (190, 30, 200)
+MEASURED, SUGGESTED, LOCATED = (240, 160, 30), (190, 30, 200), (30, 160, 90)
 PSNR_DB = (15.0, 40.0)
 READING_DB = 10.0
 WORST = 5
 CANDIDATE_M = 1.0  # between places that could be measured next
 CLEAR_M = 0.3  # of them to a transmitter
+FLOOR_DB = -150.0  # of readings, at first
 HEIGHT_M = 1.5  # of a map where nothing was measured, at first
 _OCTAHEDRON = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
 _OCTAHEDRON_FACES = np.array(
@@ -33,7 +38,7 @@ _OCTAHEDRON_FACES = np.array(
 
 
 class Survey:
-    """Map, errors and suggestions, each computed in the background when its button is pressed.
+    """Map, errors, suggestions and places of readings, each computed in the background when its button is pressed.
 
     Args:
         asked: gives the field as the settings ask for it.
@@ -72,6 +77,12 @@ class Survey:
         if subject.field.model == "bistatic":
             self._count = Setting(gui.add_slider("places", min=1, max=10, step=1, initial_value=3))
             self.suggest = self._add("suggest where to measure next", self._suggest)
+            self._floor_db = Setting(gui.add_number("noise floor of a table [dB]", FLOOR_DB, step=1.0))
+            self._width_deg = Setting(
+                gui.add_number("its horn's width [degrees], 0 for none", 0.0, min=0.0, max=120.0, step=1.0)
+            )
+            table = gui.add_upload_button("find a receiver by its table (.csv)", mime_type=".csv,text/csv")
+            table.on_upload(lambda _: self.locate(table.value.name, table.value.content))
         if subject.spectra is not None:
             self.errors = self._add("errors at measured places", self._spectrum_errors)
         if subject.readings is not None:
@@ -164,6 +175,32 @@ class Survey:
             self._page.scene.add_label(f"/suggested/{k}", f"measure {k + 1}", position=place)
         self._explain("to measure next, best first", "")
         self._list(chosen, [str(k + 1) for k in range(count)])
+
+    def locate(self, name: str, content: bytes) -> None:
+        """Put the receiver where the readings of a CSV file of that ``name`` were read; what it says of that is not looked at."""
+        self._page.in_background(lambda progress: self._locate(self._asked(), name, content, progress))
+
+    def _locate(self, field: RadioField, name: str, content: bytes, progress: Progress) -> None:
+        width = np.radians(float(self._width_deg.value))
+        floor = 10.0 ** (float(self._floor_db.value) / 10.0)
+        with TemporaryDirectory() as folder:
+            file = Path(folder) / "readings.csv"
+            file.write_bytes(content)
+            readings = Readings.load(
+                file,
+                frequency_hz=field.frequency_hz,
+                floor=floor,
+                receive_pattern=horn(width) if width else None,
+            )
+        found = field.locate(readings, progress=progress)
+        self._mark("located", found.candidates, LOCATED, 0.2)
+        self._list(found.candidates, [f"likely by {one:.0%}" for one in found.likelihoods])
+        at = ", ".join(f"{x:.2f}" for x in found.position)
+        sure = "" if found.known else "; not known, see the other places"
+        self._explain(
+            f"{name}: at {at} m, give or take {found.std_m:.2f} m{sure}", "", "located"
+        )
+        self._go_to(found.position)
 
     def _spectrum_errors(self, field: RadioField, progress: Progress) -> None:
         truth = self._subject.spectra
