@@ -1,9 +1,10 @@
 """Fixtures of more than one folder."""
 
 import sys
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from functools import partialmethod
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import warp as wp
@@ -21,18 +22,34 @@ def pytest_addoption(parser):
     parser.addoption("--on", default="cpu", help="the device of tests that name none (default: %(default)s)")
 
 
-@pytest.fixture(autouse=True)
-def _default_device(request, monkeypatch):
-    """Tests that name no device run on the CPU, where a GPU is at hand too. Where none is, those that ask for one get a
-    second CPU device that the library takes for one. Arrays of the other device are refused there."""
+@contextmanager
+def _preferred(on):
+    """A device that arrays of others are refused on: a GPU, or where none is at hand a second CPU device that the library
+    takes for one."""
+    strict = mock.patch.object(wp.config, "launch_array_access_mode", wp.config.LaunchArrayAccessMode.STRICT)
+    with strict, nullcontext() if wp.is_cuda_available() else second_device(), wp.ScopedDevice(on):
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _preferred_device(request):
+    """That of `--on`, of what many tests share too."""
     on = request.config.getoption("--on")
-    if on == "cpu" and not request.node.get_closest_marker("cuda"):
+    with nullcontext() if on == "cpu" else _preferred(on):
+        yield
+
+
+@pytest.fixture(autouse=True)
+def _default_device(request, _preferred_device):
+    """Tests that name no device run on the CPU, where a GPU is at hand too; those that ask for a GPU get one."""
+    if request.config.getoption("--on") != "cpu":
+        yield
+    elif request.node.get_closest_marker("cuda"):
+        with _preferred("cpu"):
+            yield
+    else:
         with wp.ScopedDevice("cpu"):
             yield
-        return
-    monkeypatch.setattr(wp.config, "launch_array_access_mode", wp.config.LaunchArrayAccessMode.STRICT)
-    with nullcontext() if wp.is_cuda_available() else second_device(), wp.ScopedDevice(on):
-        yield
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])

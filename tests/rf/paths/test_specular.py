@@ -23,6 +23,13 @@ PANE = (
 )
 
 
+@pytest.fixture(autouse=True)
+def _on_the_cpu():
+    """Where torch's tensors lie; tests/gradients run on GPUs too."""
+    with wp.ScopedDevice("cpu"):
+        yield
+
+
 def room(*materials):
     mesh, part = joined(box_mesh([-4, -3, 0], [4, 3, 3], inward=True), PANE)
     return wr.Scene(mesh, materials or (ROUGH, GLASS), part)
