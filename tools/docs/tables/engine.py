@@ -118,3 +118,19 @@ def _leaves(found: Row, prefix: str = "") -> Iterable[tuple[str, float]]:
             yield from _leaves(value, f"{name}: ")
         elif isinstance(value, int | float) and not isinstance(value, bool):
             yield name, value
+
+
+@entry("truths")
+def _truths() -> str:
+    head = (
+        "engine", "processor seconds of a spectrum", "noise, rms [dB]", "total over the first row's [dB]",
+        "least time at its noise, over its",
+    )  # fmt: skip
+    lines = [
+        [
+            r["engine"], show(r["core_s"], "{:.1f}"), show(r["noise_db"], "{:.2f}"), show(r["total_db"], "{:+.2f}"),
+            show(r.get("ratio"), "{:.0f}"),
+        ]
+        for r in read("truths")["rows"]
+    ]  # fmt: skip
+    return markdown(head, lines)
