@@ -197,9 +197,7 @@ class Survey:
         self._list(found.candidates, [f"likely by {one:.0%}" for one in found.likelihoods])
         at = ", ".join(f"{x:.2f}" for x in found.position)
         sure = "" if found.known else "; not known, see the other places"
-        self._explain(
-            f"{name}: at {at} m, give or take {found.std_m:.2f} m{sure}", "", "located"
-        )
+        self._explain(f"{name}: at {at} m, give or take {found.std_m:.2f} m{sure}", "", "located")
         self._go_to(found.position)
 
     def _spectrum_errors(self, field: RadioField, progress: Progress) -> None:

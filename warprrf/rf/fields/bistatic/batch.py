@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from math import ceil
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -50,16 +51,9 @@ class Batch:
             alike.setdefault((o.ratio, o.measured.together is None), []).append(k)
         found = []
         for every in alike.values():
-            readings = sum(len(observations[k].target.db) for k in every)
-            count = max(
-                -(
-                    -len(material)
-                    * int(np.prod(columns[every[0]].single.shape[1:3]))
-                    * readings
-                    // MOST_NUMBERS
-                ),
-                1,
-            )
+            lobes, moments, _ = columns[every[0]].single.shape[1:]
+            numbers = len(material) * lobes * moments * sum(len(observations[k].target.db) for k in every)
+            count = max(ceil(numbers / MOST_NUMBERS), 1)
             for own in np.array_split(every, min(count, len(every))):
                 parts = Columns.joined([columns[k] for k in own])
                 found.append(cls([observations[k] for k in own], parts, effects, material))
