@@ -80,11 +80,23 @@ def test_photos_mend_wrong_depths(room, spoiled, found):
     assert np.median(after) < 0.01 and (after < 0.03).mean() > 0.9
 
 
-def test_right_depths_stay_as_they_are(room, spoiled, found):
+def test_right_depths_stay_right(room, spoiled, found):
     true = np.array(room[1])
     error = np.abs(found / true - 1)[~spoiled[1]]
-    assert (error == 0).mean() > 0.9
+    assert np.median(error) < 0.003
     assert (error < 0.02).mean() > 0.97
+
+
+def test_rough_depths_become_as_exact_as_photos_allow(room):
+    """Squares of 8 pixels, each off by 5 % rms; a pixel is 0.8 % of the depth along a line of sight 9 degrees aside."""
+    cameras, true, photos = room
+    rng = np.random.default_rng(4)
+    rough = [t * np.exp(0.05 * rng.normal(size=(15, 20))).repeat(8, 0).repeat(8, 1) for t in true]
+    result = np.array(mended(rough, cameras, photos))
+    shown = patterned(room) & (result > 0)
+    error = np.abs(result / np.array(true) - 1)[shown]
+    assert np.median(np.abs(np.array(rough) / np.array(true) - 1)[shown]) > 0.03
+    assert np.median(error) < 0.003 and np.percentile(error, 75) < 0.008
 
 
 def test_a_plain_wall_keeps_its_depth(room, spoiled, found):
