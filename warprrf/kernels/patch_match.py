@@ -205,7 +205,7 @@ def match(
         x = int(-1)
         least = float(UNKNOWN)
         for m in range(REACH):
-            far = 1 + 2 * m  # odd: of the other colour
+            far = 1 + 4 * m  # odd: of the other colour
             xm = j + far * (wp.where(k == 0, 1, 0) - wp.where(k == 1, 1, 0))
             ym = i + far * (wp.where(k == 2, 1, 0) - wp.where(k == 3, 1, 0))
             if xm >= 0 and ym >= 0 and xm < width and ym < height:

@@ -24,9 +24,9 @@ from warprrf.kernels.patch_match import UNKNOWN, match
 LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 GOOD_ANGLE_DEG = 9.0  # between two lines of sight: less tells depths badly, more changes what a window shows
 SOURCES = 3  # photos that one is compared with
-ROUNDS = ((3, 0.0), (1, 0.3))
-"""How often planes are handed on between pixels, and what it costs to contradict another photo's plane in full: first
-photos alone, then each knows what the others found."""
+ROUNDS = ((range(3), 0.0), (range(3, 4), 0.3))
+"""Turns in which planes are handed on between pixels, finer and finer ones, and what it costs to contradict another photo's
+plane in full: first photos alone, then each knows what the others found."""
 SETTLED = 0.05  # a plane of less cost (one minus a correlation) stays as it is
 PROVED = 0.6  # planes of more cost prove nothing
 CHECKED = 8  # maps of other photos that a depth is checked against
@@ -158,14 +158,14 @@ class _Comparison:
         first: np.ndarray,
         others: np.ndarray,
         told: wp.array,
-        turns: int,
+        turns: range,
         contradicting: float,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Better planes ``(H, W, 3)`` of one photo than ``first``, by comparison with ``others``, and their costs ``(H, W)``.
 
         Args:
             told: planes of all photos (see :meth:`upload`).
-            turns: how often planes are handed on between pixels.
+            turns: in which planes are handed on between pixels.
             contradicting: cost of a plane that contradicts what is told of another photo.
         """
         camera, device = self.cameras[view], self.device
@@ -187,7 +187,7 @@ class _Comparison:
             wp.array(self.sizes[others], dtype=wp.vec3i, device=device), self.grey, told, contradicting,
             planes, costs,
         ]  # fmt: skip
-        for number in range(-1, turns):
+        for number in (-1, *turns):
             for colour in (0, 1):
                 settings = [
                     colour, number, view, 1 / camera.fx, wp.vec2(*self.bounds), SETTLED,
