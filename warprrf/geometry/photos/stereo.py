@@ -55,7 +55,8 @@ def mended(
     bounds = 1 / (1.6 * float(far)), 1 / (0.6 * float(near))
     comparison = _Comparison.of(views, photos, bounds, device)
     others = [_companions(k, views, depths, comparison.sharpness, SOURCES) for k in range(len(views))]
-    planes = [comparison.start(k, depth) for k, depth in enumerate(depths)]
+    started = [comparison.start(k, depth) for k, depth in enumerate(depths)]
+    planes = list(started)
     work, costs = len(ROUNDS) * len(views), [np.zeros(0)] * len(views)
     for number, (turns, contradicting) in enumerate(ROUNDS):
         told = comparison.upload(planes)
@@ -63,10 +64,11 @@ def mended(
             progress("stereo", number * len(views) + k, work)
             planes[k], costs[k] = comparison.match(k, planes[k], others_of, told, turns, contradicting)
     progress("stereo", work, work)
-    found = [
-        np.where((cost < PROVED) & kept, 1 / (np.maximum(plane[..., 0], 1e-6) * ahead(view)), 0.0)
-        for plane, cost, kept, view in zip(planes, costs, comparison.kept, views, strict=True)
-    ]
+    found = []
+    for k, (view, depth, plane) in enumerate(zip(views, depths, planes, strict=True)):
+        moved = (plane[..., 0] != started[k][..., 0]) | (depth == 0)
+        there = np.where(moved, 1 / (np.maximum(plane[..., 0], 1e-6) * ahead(view)), depth)
+        found.append(np.where((costs[k] < PROVED) & comparison.kept[k], there, 0.0))
     result = []
     for k, (view, depth) in enumerate(zip(views, depths, strict=True)):
         checked = _companions(k, views, depths, np.ones(len(views)), CHECKED)
