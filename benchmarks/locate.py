@@ -1,27 +1,35 @@
-"""Where a receiver is, by what it read: the field asked backwards, beside the nearest measurement."""
+"""Where a receiver is, by what it read: the field asked backwards, beside the nearest measurement; and where transmitters go."""
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
 
 import warprrf as wr
 from benchmarks.fits import FitOptions, Fits, experiment
-from benchmarks.measurements import POINTINGS, RANGE_DB
+from benchmarks.measurements import OTHERS, POINTINGS, RANGE_DB
 from benchmarks.report import Row
 from benchmarks.runner import option
+from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT
+from warprrf.rf.maps.placing import OBJECTIVES, best_set
+from warprrf.rf.positions import is_free
 from warprrf.rf.spectra.spectrum import directions_from_angles, pixel_directions
 
 HELP = """\
 A field of the lobby is fitted to 50 of Sionna RT's spectra, on the reconstruction of `make lobby`, or on the true mesh where there
 is none. Test receivers, which no fit has seen, are located: from their spectrum; from a horn's pointings at three elevations, of
-unknown gain and zero of azimuth, with noise. Beside it stands the training receiver whose measurement is most alike. Each receiver
-is kept as soon as it is found.
+unknown gain and zero of azimuth, with noise; from the powers of six transmitters, which the exact engine gives. Beside it stands
+the place whose measurement is most alike: of Sionna's training receivers, or, for powers, of 400 that the exact engine gives; for
+powers also multilateration, as if all six were in sight. Then transmitters are chosen among 200 places under the
+ceiling, by maps of single bounces in cells of a metre. Each receiver is kept as soon as it is found.
 
 examples:
   python -m benchmarks locate
@@ -33,6 +41,15 @@ PER_DEG = 1.0 / np.sqrt(
     8.0 * np.log(2.0)
 )  # standard deviation of a Gaussian over its full width at half maximum
 TURNS = 72  # zeros of azimuth that the nearest measurement is sought under
+MORE = (7.5, 1.5, 2.6), (7.5, 10.5, 2.6)
+"""Transmitters [m] beside those of the data set and of the benchmark of measurements."""
+POWER_SHAPE = 30, 60  # of the spectra whose sums are powers
+CEILING_M, PLACES, PER_METRE = 2.9, 200, {"cell": 1.0, "shape": (10, 20)}
+"""Height and number of candidates, and options of their maps."""
+OBJECTIVE = "worst tenth"
+MAPPED = wr.Effects(
+    mirrors=1, scatterings=1, mirror_scatter=False, scatter_mirror=False, transmissions=0, diffractions=0
+)
 COLUMNS = {
     "rows": (
         ("measured", "located from", "{}"), ("test", "receivers", "{}"), ("median_cm", "median [cm]", "{:.1f}"),
@@ -40,7 +57,12 @@ COLUMNS = {
         ("blocked_p90_cm", "blocked: 90th [cm]", "{:.1f}"), ("wrong", "beyond 30 cm", "{:.1%}"),
         ("wrong_told", "of these not known", "{:.0%}"), ("covered", "within 95 % ellipsoid", "{:.0%}"),
         ("cpu_s", "CPU seconds each", "{:.1f}"), ("nearest_cm", "nearest measurement [cm]", "{:.0f}"),
-    )
+        ("lateration_cm", "multilateration [cm]", "{:.0f}"),
+    ),
+    "place": (
+        ("objective", "objective", "{}"), ("candidates", "candidates", "{}"), ("n", "transmitters", "{}"),
+        ("cpu_s", "core seconds", "{:.0f}"), ("chosen", "chosen", "{:.2f}"), ("added", "one added at a time", "{:.2f}"),
+    ),
 }  # fmt: skip
 
 
@@ -56,29 +78,36 @@ class Options(FitOptions):
     truths: tuple[str, ...] = ("sionna",)
     counts: tuple[int, ...] = option((TRAIN,), "spectra that the field is fitted to")
     field: str | None = option(None, "a field's file that was fitted before")
-    parts: tuple[str, ...] = option(("spectrum", "horn"), "from what", choices=("spectrum", "horn"))
+    parts: tuple[str, ...] = option(
+        ("spectrum", "horn", "powers", "place"),
+        "what is done",
+        choices=("spectrum", "horn", "powers", "place"),
+    )
+    prints: int = option(400, "places with whose powers those of six transmitters are compared")
 
 
-def horn_readings(ds: wr.SpectrumDataset, k: int, seed: int | None, turn: float = 0.0) -> np.ndarray:
-    """Powers of the pointings at receiver ``k``, turned by ``turn`` [rad]; with noise where there is a seed.
+def horn_readings(ds: wr.SpectrumDataset, turn: float = 0.0) -> np.ndarray:
+    """Powers of the pointings at all receivers, turned by ``turn`` [rad], without noise, shape ``(R, N)``.
 
     The spectrum holds a beam already: a narrower horn over it is one of the stated width.
     """
     own = np.sqrt((HORN_DEG * PER_DEG) ** 2 - np.degrees(ds.beam_sigma_rad) ** 2) / PER_DEG
     toward = directions_from_angles(*(POINTINGS + [0.0, turn]).T)
     cosine = np.clip(toward @ pixel_directions(ds.shape).reshape(-1, 3).T, -1.0, 1.0)
-    power = wr.horn(np.radians(own)).gain_off_boresight(np.arccos(cosine)) @ ds.path_gain[k].ravel()
-    if seed is None:
-        return np.asarray(power)
-    return np.asarray(
-        power * 10.0 ** (NOISE_DB / 10.0 * np.random.default_rng([seed, k]).normal(size=len(power)))
-    )
+    gain = wr.horn(np.radians(own)).gain_off_boresight(np.arccos(cosine))
+    return np.asarray(ds.path_gain.reshape(len(ds), -1) @ gain.T)
+
+
+def noise(count: int, seed: int, k: int) -> np.ndarray:
+    """Factors by which readings of receiver ``k`` are wrong."""
+    return np.asarray(10.0 ** (NOISE_DB / 10.0 * np.random.default_rng([seed, k]).normal(size=count)))
 
 
 def horn_of(ds: wr.SpectrumDataset, k: int, seed: int) -> wr.Readings:
     """The same as a table of unknown gain and zero of azimuth."""
     gain, zero = 10.0 ** (CHAIN_DB / 10.0), np.radians(ZERO_DEG)
-    power = gain * horn_readings(ds, k, seed)
+    power = gain * horn_readings(ds.subset([k]))[0]
+    power *= noise(len(power), seed, k)
     floor = power.max() * 10.0 ** (-RANGE_DB / 10.0)
     return wr.Readings(
         ds.transmitter, ds.receivers[k], np.maximum(power, floor), ds.frequency_hz, floor, arrival=POINTINGS - [0.0, zero],
@@ -92,15 +121,134 @@ def nearest_spectrum(test: wr.SpectrumDataset, k: int, train: wr.SpectrumDataset
     return np.asarray(train.receivers[int(error.argmin())])
 
 
-def nearest_horn(
-    test: wr.SpectrumDataset, k: int, known: np.ndarray, train: wr.SpectrumDataset, seed: int
-) -> np.ndarray:
-    """Place of the training receiver whose readings ``known`` (R, T, N) are most alike under any turn and gain [m]."""
-    read = 10.0 * np.log10(horn_readings(test, k, seed))
-    read = np.maximum(read - read.max(), -RANGE_DB)
-    db = 10.0 * np.log10(known)
-    error = np.abs(np.maximum(db - db.max(axis=2, keepdims=True), -RANGE_DB) - read).mean(axis=2).min(axis=1)
-    return np.asarray(train.receivers[int(error.argmin())])
+def nearest_horn(one: wr.Readings, known: np.ndarray) -> int:
+    """Which of the places with readings ``known`` (R, T, N) by turn has the most like those of ``one``, under any gain."""
+    read, db = NEPER * np.log(one.power / one.power.max()), NEPER * np.log(known)
+    db = np.maximum(db - db.max(axis=2, keepdims=True), -RANGE_DB)
+    return int(np.abs(db - np.maximum(read, -RANGE_DB)).mean(axis=2).min(axis=1).argmin())
+
+
+def multilaterated(one: wr.Readings, bounds: np.ndarray) -> np.ndarray:
+    """Place within ``bounds`` (2, 3) from which transmitters of these powers would be as far as free space says [m]."""
+    far_db = -NEPER * np.log(one.power) - 20.0 * np.log10(4.0 * np.pi * one.frequency_hz / SPEED_OF_LIGHT)
+
+    def missed(at: np.ndarray) -> np.ndarray:
+        return 20.0 * np.log10(np.linalg.norm(one.transmitters - at, axis=1)) - far_db
+
+    low, high = bounds
+    starts = low + (high - low) * np.array([(x, y, 0.3) for x in (0.2, 0.5, 0.8) for y in (0.2, 0.5, 0.8)])
+    found = [least_squares(missed, start, bounds=(low, high)) for start in starts]
+    return np.asarray(min(found, key=lambda one: one.cost).x)
+
+
+class Question:
+    """What receivers are located from, and what stands beside.
+
+    Args:
+        options, fits: of the benchmark.
+        test: the receivers.
+        pool: training receivers of the same truth.
+    """
+
+    def __init__(
+        self, options: Options, fits: Fits, test: wr.SpectrumDataset, pool: wr.SpectrumDataset
+    ) -> None:
+        self.options, self.test, self.pool, self.job = options, test, pool, fits.job
+        self.scene = wr.Scene.load(options.xml)
+
+    def asked(self, part: str, k: int) -> Any:
+        """What receiver ``k`` read."""
+        if part == "spectrum":
+            return self.test.subset([k])
+        if part == "horn":
+            return horn_of(self.test, k, self.job.seed)
+        power, at = (
+            self.powers["test"][k] * noise(len(self.sources), self.job.seed, k),
+            self.test.receivers[k],
+        )
+        floor = float(self.test.floor)
+        return wr.Readings(
+            self.sources, at, np.maximum(power, floor), self.test.frequency_hz, floor, std_db=NOISE_DB
+        )
+
+    def beside(self, part: str, k: int, asked: Any) -> dict[str, float]:
+        """How far off others are [m]."""
+        true, more = self.test.receivers[k], {}
+        if part == "spectrum":
+            rival = nearest_spectrum(self.test, k, self.pool)
+        elif part == "horn":
+            rival = self.pool.receivers[nearest_horn(asked, self.turned)]
+        else:
+            off = np.abs(np.log(self.powers["prints"]) - np.log(asked.power)).mean(axis=1)
+            rival = self.print_places[int(off.argmin())]
+            found = multilaterated(asked, self.scene.mesh.bounds)
+            more["lateration_m"] = float(np.linalg.norm(found - true))
+        return {"nearest_m": float(np.linalg.norm(rival - true)), **more}
+
+    @cached_property
+    def sources(self) -> np.ndarray:
+        """The six transmitters [m]."""
+        return np.array([self.test.transmitter, *OTHERS.values(), *MORE])
+
+    @cached_property
+    def print_places(self) -> np.ndarray:
+        """Where fingerprints are [m]."""
+        told = json.loads((self.options.xml.parent / "receivers.json").read_text())
+        places = np.array(told["receivers_m"])[np.array(told["role"]) == "train"]
+        return np.asarray(places[: self.options.prints])
+
+    @cached_property
+    def turned(self) -> np.ndarray:
+        """What a horn reads at training receivers, by turn, shape ``(R, T, N)``."""
+        turns = 2.0 * np.pi / TURNS * np.arange(TURNS)
+        return np.stack([horn_readings(self.pool, turn) for turn in turns], axis=1)
+
+    @cached_property
+    def powers(self) -> dict[str, np.ndarray]:
+        """Powers of the six transmitters at test receivers and at fingerprints, shape ``(R, 6)`` each."""
+        found = {}
+        for name, places in (("test", self.test.receivers), ("prints", self.print_places)):
+            spectra = [self.simulated(source, places, POWER_SHAPE).path_gain for source in self.sources]
+            found[name] = np.stack([gain.sum(axis=(1, 2)) for gain in spectra], axis=1)
+        return found
+
+    def simulated(self, source: np.ndarray, places: np.ndarray, shape: tuple[int, int]) -> wr.SpectrumDataset:
+        """The exact engine's spectra."""
+        return wr.simulate(
+            self.scene, transmitter=source, receivers=places, frequency_hz=self.test.frequency_hz, shape=shape,
+            progress=self.job.progress,
+        )  # fmt: skip
+
+
+def placed(field: Any, job: Any) -> list[Row]:
+    """One and two transmitters of the candidates under the ceiling, as :func:`warprrf.place` chooses them."""
+    low, high = field.mesh.bounds[:, :2]
+    axes = [np.linspace(a + 0.3, b - 0.3, 40) for a, b in zip(low, high, strict=True)]
+    every = np.stack([*(a.ravel() for a in np.meshgrid(*axes)), np.full(1600, CEILING_M)], axis=1)
+    free = every[is_free(field.mesh, every, field.transmitter, clearance_m=0.1)]
+    candidates = free[np.linspace(0, len(free) - 1, PLACES).astype(int)]
+    rough, maps, start = replace(field, effects=MAPPED), list[np.ndarray](), time.process_time()
+    for k, source in enumerate(candidates):
+        maps.append(rough.radio_map(1.5, transmitter=source, **PER_METRE).best_beam_snr_db)
+        job.progress("place", k + 1, PLACES)
+    snr_db, spent, rows = np.stack(maps), time.process_time() - start, list[Row]()
+    cells = snr_db[:, ~np.isnan(snr_db).all(axis=0)]
+    for n in (1, 2):
+        start = time.process_time()
+        chosen = best_set(snr_db, n, OBJECTIVE)
+        whole, added = spent + time.process_time() - start, best_set(snr_db, n, OBJECTIVE, most=0)
+        best, one = (OBJECTIVES[OBJECTIVE](cells[some].max(axis=0), 0.0) for some in (chosen, added))
+        rows.append(
+            {
+                "objective": OBJECTIVE,
+                "candidates": PLACES,
+                "n": n,
+                "cpu_s": whole,
+                "chosen": best,
+                "added": one,
+            }
+        )
+    return rows
 
 
 def rows(options: Options, fits: Fits) -> Iterator[Row]:
@@ -117,33 +265,31 @@ def rows(options: Options, fits: Fits) -> Iterator[Row]:
     known = options.field
     field = wr.RadioField.load(known) if known else fits.fit(room, train)
     pool = truth.data.subset(truth.data.role == "train")
-    turned = np.stack([
-        [horn_readings(pool, r, None, turn) for turn in 2.0 * np.pi / TURNS * np.arange(TURNS)] for r in range(len(pool))
-    ]) if "horn" in options.parts else np.zeros(0)  # fmt: skip
+    question = Question(options, fits, test, pool)
     ask: dict[str, Any] = {"store": fits.job.out / "map.nc", "progress": fits.job.progress}
-    field.locate(test.subset([0]), **ask)  # makes the map, which does not count
     for part in options.parts:
+        if part == "place":
+            for row in fits.row("place", lambda: {"rows": placed(field, fits.job)}, known or name)["rows"]:
+                yield {"part": part, **row}
+            continue
+        if part == "powers":
+            ask["store"] = fits.job.out / "maps.nc"
+        field.locate(question.asked(part, 0), **ask)  # makes the map, which does not count
         found = []
         for k in range(len(test)):
 
             def make(k: int = k, part: str = part) -> Row:
-                true, seed = test.receivers[k], fits.job.seed
-                one = test.subset([k]) if part == "spectrum" else horn_of(test, k, seed)
+                asked, true = question.asked(part, k), test.receivers[k]
                 start = time.process_time()
-                answer = field.locate(one, **ask)
+                answer = field.locate(asked, **ask)
                 spent, off = time.process_time() - start, answer.position - true
-                rival = (
-                    nearest_spectrum(test, k, pool)
-                    if part == "spectrum"
-                    else nearest_horn(test, k, turned, pool, seed)
-                )
                 return {
                     "error_m": float(np.linalg.norm(off)), "known": answer.known, "misfit": answer.misfit, "cpu_s": spent,
-                    "squares": float(off @ np.linalg.pinv(answer.covariance) @ off),
-                    "nearest_m": float(np.linalg.norm(rival - true)), "blocked": not bool(test.line_of_sight[k]),
+                    "squares": float(off @ np.linalg.pinv(answer.covariance) @ off), **question.beside(part, k, asked),
+                    "blocked": not bool(test.line_of_sight[k]),
                 }  # fmt: skip
 
-            found.append(fits.row(f"{part} {options.every * k}", make, known or name))
+            found.append(fits.row(f"{part} {options.every * k}", make, known or name, options.prints))
         yield {"measured": f"{part}, {name}", **summary(found)}
 
 
@@ -162,7 +308,11 @@ def summary(found: list[Row]) -> Row:
         "wrong": float(wrong.mean()), "wrong_told": float(told[wrong].mean()) if wrong.any() else None,
         "covered": float(np.mean([one["squares"] < most for one in found])),
         "cpu_s": float(np.median([one["cpu_s"] for one in found])),
-        "nearest_cm": 100.0 * float(np.median([one["nearest_m"] for one in found])), "receivers": found,
+        **{
+            f"{name}_cm": 100.0 * float(np.median([one[f"{name}_m"] for one in found]))
+            for name in ("nearest", "lateration") if f"{name}_m" in found[0]
+        },
+        "receivers": found,
     }  # fmt: skip
 
 

@@ -88,6 +88,9 @@ from warprrf.rf import channel as channel
 # Fresnel coefficients, materials, absorption by the air
 from warprrf.rf import em as em
 
+# derivatives of paths, slopes of what is traced anew
+from warprrf.rf import paths as paths
+
 # Sionna RT, DeepMIMO, digital twins
 from warprrf.rf import interop as interop
 

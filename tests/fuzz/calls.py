@@ -37,7 +37,7 @@ SERVERS = ("view",)
 """What starts a server for each call: tests/viewer has its refusals."""
 SPREADS = ("channel.angular_spread", "channel.coherence_bandwidth", "channel.delay_spread")
 """What is NaN where there is no power, as their documentation says."""
-ABSTRACT = ("RadioField", "BistaticField", "HarmonicField")
+ABSTRACT = ("RadioField", "BistaticField", "HarmonicField", "paths.SpecularPaths", "paths.PathValues")
 """Classes that nobody makes by calling them."""
 REFUSED = (
     "Paths.from_sionna",
@@ -164,6 +164,9 @@ CLASSES: dict[str, Callable[[Place], Any]] = {
     "SpectrumDataset": lambda p: p.spectra.subset([0, 1, 2]),
     **{f"{kind}Field": lambda p: p.field for kind in ("Radio", "Bistatic")},
     "HarmonicField": lambda p: p.harmonic,
+    "paths.SpecularPaths": lambda p: wr.paths.trace_specular(
+        p.scene, transmitter=p.transmitter, receivers=POINTS, frequency_hz=300e9
+    ),
     "FitOptions": lambda p: FitOptions(),
     "FieldOptions": lambda p: FieldOptions(),
     "Antenna": lambda p: replace(wr.horn(0.3), polarisation="VH"),
@@ -295,6 +298,14 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "Antenna.field": lambda p: {"directions": TOWARDS},
     "Antenna.gain_off_boresight": lambda p: {"angle": np.array([0.0, 0.3])},
     "Antenna.turned": lambda p: {"orientation": (0.1, 0.2, 0.3)},
+    "paths.SpecularPaths.evaluate": lambda p: {
+        "transmitter": p.transmitter + 1e-3, "receivers": POINTS + 1e-3, "transmitter_orientation": (0.1, 0.2, 0.3),
+        "receiver_orientation": (0.1, 0.2, 0.3), "thickness_m": np.full(len(p.scene.materials), 0.1),
+        "relative_permittivity": np.full(len(p.scene.materials), 5.0), "scattering": np.zeros(len(p.scene.materials)),
+    },
+    "paths.trace_specular": lambda p: {"receivers": POINTS},
+    "paths.retraced_slope": lambda p: {"answer": lambda at: at.sum(axis=1)},
+    "RadioField.slope": lambda p: {"receivers": POINTS[0], "quantity": "total", "step_m": 0.01},
     "Paths.after": lambda p: {"time_s": 1e-3, "doppler_hz": p.paths.doppler_hz(receiver_velocity=[1.0, 0.0, 0.0])},
     "Paths.doppler_hz": lambda p: {
         "transmitter_velocity": [1.0, 0.0, 0.0], "moving": {p.scene.object_names[0]: (0.0, 1.0, 0.0)}, "scene": p.scene,

@@ -1,20 +1,29 @@
-"""Gradients of the rasteriser's whole path (parameters, image, loss), of rays through Gaussians and of path records by
-their materials, in float64: Warp's tape against finite differences on many random scenes, with the cutoffs of photos; what
-lies at a cutoff; second backward calls."""
+"""Gradients of the rasteriser's whole path (parameters, image, loss), of rays through Gaussians, of path records by
+their materials, and of specular paths by ends, orientations and materials, in float64: Warp's tape against finite differences
+on many random scenes, with the cutoffs of photos; what lies at a cutoff; second backward calls."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 import warp as wp
+from radio_scenes import box_mesh, joined
 from rays_by_definition import blended, met
 from scipy.spatial.transform import Rotation
 
 from warprrf import device
+from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussian_rays import GaussianRays
 from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
 from warprrf.kernels.radio import records
+from warprrf.rf.em.materials import Material
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.paths.specular import OUTPUTS, POSITIONS
+from warprrf.rf.paths.trace import trace_specular
+from warprrf.rf.scene import Scene
 from warprrf.rf.tracing.model import Parameters
 from warprrf.rf.tracing.records import Materials, Records
 
@@ -75,6 +84,25 @@ def loss_of_powers(
     wp.atomic_add(loss, 0, weight[i] * wp.log(power[i] + wp.float64(0.1)))
 
 
+@wp.kernel
+def loss_of_numbers(
+    values: wp.array(dtype=Any), weight: wp.array(dtype=Any), loss: wp.array(dtype=wp.float64)
+):
+    """Weighted sum."""
+    i = wp.tid()
+    wp.atomic_add(loss, 0, weight[i] * values[i])
+
+
+@wp.kernel
+def loss_of_vectors(
+    values: wp.array(dtype=Any), weight: wp.array(dtype=Any), loss: wp.array(dtype=wp.float64)
+):
+    """Weighted sum of components; vectors of weight 0 may be NaN."""
+    i = wp.tid()
+    if wp.length_sq(weight[i]) > wp.float64(0.0):
+        wp.atomic_add(loss, 0, wp.dot(weight[i], values[i]))
+
+
 class WholePath:
     """Parameters ``values`` and a loss of them; ``spoil`` names one whose adjoint is planted wrong."""
 
@@ -87,14 +115,16 @@ class WholePath:
         )
         self.draw(seed, np.random.default_rng(seed))
 
-    def record(self, values: dict[str, np.ndarray]) -> tuple[wp.Tape, wp.array, dict[str, wp.array]]:
+    def record(
+        self, values: dict[str, np.ndarray], *only: Any
+    ) -> tuple[wp.Tape, wp.array, dict[str, wp.array]]:
         arrays = self.arrays(values)
         loss = wp.zeros(1, dtype=wp.float64, requires_grad=True)
         with wp.Tape() as tape:
             if self.spoil is not None:  # recorded first, so it runs last, when the gradient is complete
                 wrong = arrays[self.spoil]
                 tape.record_func(lambda: wrong.grad.assign(wrong.grad.numpy() * (1 + 1e-4)), [wrong])
-            self.add_loss(arrays, loss)
+            self.add_loss(arrays, loss, *only)
         return tape, loss, arrays
 
     def arrays(self, values: dict[str, np.ndarray]) -> dict[str, wp.array]:
@@ -253,6 +283,107 @@ class PathRecords(WholePath):
             wp.launch(loss_of_powers, dim=9, inputs=[power, weight, loss])
 
 
+class SpecularPaths(WholePath):
+    """Line of sight, chains of up to two mirrors and ways through up to two slabs, in a turned room with a pane and a solid wall
+    across half of it: gains, Jones matrices, delays, angles and vertices by all that they hang on."""
+
+    share = 1.0
+
+    def draw(self, seed, rng):
+        self.frequency_hz = float(np.exp(rng.uniform(np.log(1e9), np.log(100e9))))
+        half = rng.uniform(1.5, 4.0, 3)
+        sheet = box_mesh([0.3, -half[1], -half[2]], [0.301, rng.uniform(-0.5, 1.0), half[2]])
+        sheet = sheet[0], sheet[1][(sheet[0][sheet[1]][:, :, 0] == 0.3).all(axis=1)]
+        solid = box_mesh(
+            [-0.5, rng.uniform(-1.0, 0.5), -half[2]], [-0.5 + rng.uniform(0.01, 0.2), half[1], half[2]]
+        )
+        mesh, part = joined(box_mesh(-half, half, inward=True), sheet, solid)
+        turn = Rotation.random(None, rng).as_matrix()
+        lossy = rng.uniform(0.01, 0.1, 3) * self.frequency_hz * 4.0 / 18e9
+        materials = [
+            Material.custom(f"m{k}", relative_permittivity=rng.uniform(2.0, 8.0), conductivity=lossy[k])
+            for k in range(3)
+        ]
+        ends = np.concatenate([rng.uniform(0.5, 0.9, (1, 3)), rng.uniform(-0.9, 0.9, (2, 3))]) * half
+        ends[:, 0] = np.array([1.0, -1.0, 1.0]) * rng.uniform(0.6, 0.9, 3) * half[0]
+        held = trace_specular(
+            Scene(Mesh(mesh.vertices @ turn.T, mesh.faces), materials, part), transmitter=turn @ ends[0],
+            receivers=ends[1:] @ turn.T, frequency_hz=self.frequency_hz, mirror_order=2, transmissions=2,
+        )  # fmt: skip
+        wavelength_m = SPEED_OF_LIGHT / self.frequency_hz
+        self.held, self.values = (
+            held,
+            {
+                **held.parameters,
+                "transmitter_orientation": rng.normal(size=(1, 3)),
+                "receiver_orientation": rng.normal(size=(2 if seed % 2 else 1, 3)),
+                "thickness_m": rng.uniform(0.2, 3.0, 3) * wavelength_m,
+                "roughness_m": rng.uniform(0.02, 0.1, 3) * wavelength_m,
+                "scattering": rng.uniform(0.1, 0.8, 3),
+            },
+        )
+        known = {name: getattr(held.evaluate(**self.values), name) for name in OUTPUTS}
+        self.weights = {
+            name: rng.normal(size=numbers(v).shape) * np.isfinite(numbers(v)) for name, v in known.items()
+        }
+        # gains of 1e-4 and delays of 1e-8 count as much as angles
+        self.scales = {name: np.nanmax(np.abs(value)) for name, value in known.items()}
+
+    def arrays(self, values):
+        types = {name: wp.vec3d for name in POSITIONS}
+        return {k: wp.array(v, dtype=types.get(k, wp.float64), requires_grad=True) for k, v in values.items()}
+
+    def add_loss(self, a, loss, only=OUTPUTS):
+        found = self.held.evaluate(**a)
+        for name in only:
+            values = getattr(found, name).flatten()
+            weight = wp.array(self.weights[name] / self.scales[name], dtype=values.dtype)
+            weight = weight.reshape((values.size,))
+            kernel = loss_of_numbers if values.dtype is wp.float64 else loss_of_vectors
+            wp.launch(kernel, dim=values.size, inputs=[values, weight, loss])
+
+    def errors(self):
+        """Per input: worst deviation of a derivative of what is made of any output, relative to the largest of that output."""
+        worst = {}
+        for (name, _), (found, expected) in self.slopes().items():
+            if np.abs(expected).max() > 1e-6:  # not of what does not hang on it
+                off = np.abs(found - expected).max() / np.abs(expected).max()
+                worst[name] = max(worst.get(name, 0.0), float(off))
+        return worst
+
+    def slopes(self):
+        """By input and output: derivatives by the tape, and central differences with one Richardson step."""
+        found, k = {}, 2.0 * np.pi * self.frequency_hz / SPEED_OF_LIGHT
+        for output in OUTPUTS:
+            tape, loss, arrays = self.record(self.values, (output,))
+            tape.backward(loss)
+            for name, array in arrays.items():
+                found[name, output] = array.grad.numpy().copy(), np.zeros(self.values[name].shape)
+        for name, value in self.values.items():
+            for at in np.ndindex(value.shape):
+                size = 1.0 if name in POSITIONS[2:] else 10.0 / k if name in POSITIONS else value[at]
+                step = (1e-2 if name == "conductivity" else 1e-4) * size  # delays hardly hang on it
+                move = step * (
+                    np.arange(value.size).reshape(value.shape) == np.ravel_multi_index(at, value.shape)
+                )
+                sides = [
+                    self.held.evaluate(**{**self.values, name: value + m * move}) for m in (1, -1, 2, -2)
+                ]
+                for output in OUTPUTS:
+                    up, down, far_up, far_down = (numbers(getattr(side, output)) for side in sides)
+                    near, far = up - down, far_up - far_down
+                    if output in ("phi_r", "phi_t"):  # across pi
+                        near, far = ((d + np.pi) % (2.0 * np.pi) - np.pi for d in (near, far))
+                    slope = np.nan_to_num(8.0 * near - far) / (12.0 * step)
+                    found[name, output][1][at] = (self.weights[output] * slope).sum() / self.scales[output]
+        return found
+
+
+def numbers(values):
+    """Complex numbers as two."""
+    return values.view(float).reshape(*values.shape, 2) if np.iscomplexobj(values) else values
+
+
 def random_camera(rng: np.random.Generator, means: np.ndarray, *, spherical: bool) -> Camera:
     """A panorama amid the Gaussians, or a photo that shows two of their means at least."""
     if spherical:
@@ -267,7 +398,7 @@ def random_camera(rng: np.random.Generator, means: np.ndarray, *, spherical: boo
             return camera
 
 
-SCENES = {Pictures: 32, Rays: 32, PathRecords: 60}
+SCENES = {Pictures: 32, Rays: 32, PathRecords: 60, SpecularPaths: 60}
 EVERY = pytest.mark.parametrize("kind", SCENES)
 
 

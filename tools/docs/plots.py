@@ -11,10 +11,12 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
+import warp as wp  # noqa: E402
 from scipy.special import erfc  # noqa: E402
 from tables.common import NAMES, TRUTHS, read  # noqa: E402
 from tables.paper import PLACES, paper  # noqa: E402
 
+import warprrf as wr  # noqa: E402
 from warprrf.rf.em.diffraction import EdgeRays, diffraction_matrices  # noqa: E402
 
 STYLE = {
@@ -190,3 +192,63 @@ def _half_plane() -> Any:
     axes[0].set_ylabel("over the incident field [dB]")
     axes[1].legend(fontsize=7, loc="lower left")
     return figure
+
+
+@entry(
+    "slopes",
+    "A walk past a screen at 140 GHz: total path gain, and its slope with visibility frozen and retraced",
+)
+def _slopes() -> Any:
+    where, (vertices, faces) = np.arange(-2.5, 2.5, 0.02), _room_with_a_screen()
+    asked: dict[str, Any] = {"transmitter": [-3.0, 0.4, 1.6], "frequency_hz": 140e9, "mirror_order": 2}
+    scene = wr.Scene(wr.Mesh(vertices, faces), [wr.em.itu_material("concrete")], np.zeros(len(faces), int))
+    walk = np.column_stack([np.full(len(where), 2.0), where, np.full(len(where), 1.2)])
+
+    def total_db(at: np.ndarray) -> Any:
+        return 10.0 * np.log10(wr.trace_paths(scene, receivers=at, **asked).power.sum(axis=1))
+
+    held, at = (
+        wr.paths.trace_specular(scene, receivers=walk, **asked),
+        wp.array(walk, dtype=wp.vec3d, requires_grad=True),
+    )
+    with wp.Tape() as tape:
+        gain = held.evaluate(receivers=at).gain
+    tape.backward(grads={gain: wp.array(2.0 * gain.numpy(), dtype=wp.vec2d)})  # of the sum of |gain|^2
+    total = total_db(walk)
+    frozen = 10.0 / np.log(10.0) * at.grad.numpy()[:, 1] / 10.0 ** (total / 10.0)
+    retraced = wr.paths.retraced_slope(total_db, walk)[:, 1]
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2))
+    summed = total[0] + np.cumsum(frozen) * 0.02
+    for line, style, label in ((total, "-", "traced"), (summed, "--", "first total, plus frozen slopes")):
+        axes[0].plot(
+            where, line, style, lw=1.2, color=COLOURS["bistatic" if style == "-" else "rf3dgs+"], label=label
+        )
+    for line, name, label in (
+        (retraced, "bistatic", "retraced, 1 cm"),
+        (frozen, "rf3dgs+", "visibility frozen"),
+    ):
+        axes[1].plot(
+            where, line, "-" if name == "bistatic" else "--", lw=1.2, color=COLOURS[name], label=label
+        )
+    axes[0].set(xlabel="along the walk [m]", ylabel="total path gain [dB]")
+    axes[1].set(xlabel="along the walk [m]", ylabel="slope [dB/m]", yscale="symlog")
+    for ax in axes:
+        ax.legend(fontsize=7)
+    return figure
+
+
+def _room_with_a_screen() -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a room, faces inward, with a sheet that hides part of it."""
+    corners = np.array([[x, y, z] for x in (-4, 4) for y in (-3, 3) for z in (0, 3)], float)
+    sheet = np.array([[0, y, z] for y in (-0.8, 0.9) for z in (0, 2.2)], float)
+    sides = [
+        (0, 2, 3, 1),
+        (4, 5, 7, 6),
+        (0, 1, 5, 4),
+        (2, 6, 7, 3),
+        (0, 4, 6, 2),
+        (1, 3, 7, 5),
+        (8, 10, 11, 9),
+    ]
+    faces = [t for a, b, c, d in sides for t in ((a, b, c), (a, c, d))]
+    return np.concatenate([corners, sheet]), np.array(faces)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warprrf.geometry.mesh import Mesh, components, vectors_across
-from warprrf.rows import Rows
+from warprrf.rows import Rows, distinct_rows
 
 LEAST_BEND_RAD = np.radians(1.0)
 """Faces that are bent less make no edge."""
@@ -101,8 +101,8 @@ def _candidates(mesh: Mesh, normal: np.ndarray, least_bend_rad: float) -> np.nda
     sides = np.sort(corner[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     owner, third = np.repeat(face, 3), mesh.triangles[face][:, [2, 0, 1]].reshape(-1, 3)
     start = mesh.triangles[face].reshape(-1, 3)
-    found, index, count = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(index.reshape(-1), kind="stable")
+    once, index, count = distinct_rows(sides)
+    found, order = sides[once], np.argsort(index, kind="stable")
     first = order[np.cumsum(count)[count == 2] - 2]
     second = order[np.cumsum(count)[count == 2] - 1]
     a, b = normal[owner[first]], normal[owner[second]]
@@ -142,7 +142,8 @@ def _split(mesh: Mesh, sides: np.ndarray, place: np.ndarray, reach: float) -> np
     order = np.lexsort((at, side))
     side, name = side[order], name[order]
     pieces = np.column_stack([name[:-1], name[1:]])[side[:-1] == side[1:]]
-    pieces = np.unique(np.sort(pieces, axis=1), axis=0)
+    pieces = np.sort(pieces, axis=1)
+    pieces = pieces[distinct_rows(pieces)[0]]
     return pieces[pieces[:, 0] != pieces[:, 1]]
 
 

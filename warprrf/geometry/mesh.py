@@ -36,6 +36,7 @@ from warprrf.device import DeviceLike
 from warprrf.geometry.mesh_files import MeshOptions, load_mesh
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
 from warprrf.kernels.rays.mesh import closest_faces, find_crossings, find_touching
+from warprrf.rows import distinct_rows
 
 ENDPOINT_CLEARANCE = 1e-4
 """Length at both ends of a segment in which :meth:`Mesh.visible` ignores surfaces [m]."""
@@ -228,19 +229,19 @@ class Mesh:
     @cached_property
     def welded_faces(self) -> np.ndarray:
         """Faces with vertices at one place (to 1e-6 of the box's half diagonal) given one index, shape ``(F, 3)``."""
-        point, index = np.unique(self.vertices, axis=0, return_inverse=True)
+        first, index, _ = distinct_rows(self.vertices)
+        point = self.vertices[first]
         reach = max(2.0 * self.rounding_m, 0.5e-6 * float(np.linalg.norm(np.ptp(self.bounds, axis=0))))
         near = cKDTree(point - self.center).query_pairs(reach, output_type="ndarray")
         link = sparse.coo_array((np.ones(len(near), bool), near.T), shape=(len(point), len(point)))
         place = csgraph.connected_components(link, directed=False)[1]
-        return np.asarray(place[index.reshape(-1)][self.faces])
+        return np.asarray(place[index][self.faces])
 
     @cached_property
     def first_at_place(self) -> np.ndarray:
         """The first face with the same three corners: itself unless it repeats one, however wound, shape ``(F,)``."""
-        corner = np.sort(self.welded_faces, axis=1)
-        first, index = np.unique(corner, axis=0, return_index=True, return_inverse=True)[1:]
-        return np.asarray(first[index.reshape(-1)])
+        first, index, _ = distinct_rows(np.sort(self.welded_faces, axis=1))
+        return first[index]
 
     @cached_property
     def is_closed(self) -> bool:
@@ -252,9 +253,10 @@ class Mesh:
         first, second, third = faces.T
         faces = faces[(first != second) & (second != third) & (third != first)]
         lowest = faces.argmin(axis=1)[:, None]
-        faces = np.unique(np.take_along_axis(faces, (lowest + np.arange(3)) % 3, axis=1), axis=0)
+        faces = np.take_along_axis(faces, (lowest + np.arange(3)) % 3, axis=1)
+        faces = faces[distinct_rows(faces)[0]]
         edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        return len(edges) > 0 and bool((np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all())
+        return len(edges) > 0 and bool((distinct_rows(edges)[2] % 2 == 0).all())
 
     @cached_property
     def distinct_faces(self) -> np.ndarray:
@@ -291,8 +293,8 @@ class Mesh:
     def _largest_hole(self, corner: np.ndarray, face: np.ndarray) -> float:
         """Diagonal of the box around the largest border of faces with the welded vertices ``corner`` (K, 3) [m]."""
         edge = np.sort(corner[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        edge, count = np.unique(edge, axis=0, return_counts=True)
-        edge = edge[count % 2 == 1]
+        first, _, count = distinct_rows(edge)
+        edge = edge[first[count % 2 == 1]]
         if len(edge) == 0:
             return 0.0
         # Holes that touch in a vertex are two: borders go on where exactly two edges meet.

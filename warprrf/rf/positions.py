@@ -15,13 +15,14 @@ the same number of solids; in a court, under a bridge or below a canopy some of 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, users_level
+from warprrf.checks import check_array, check_positive, checked, users_level
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -85,6 +86,54 @@ class Ends(NamedTuple):
     def shaped(self, results: Any) -> Any:
         """``results`` of all rows as they are handed out: a single one by itself."""
         return results[0] if self.single else results
+
+
+def beside(points: np.ndarray, step_m: float) -> np.ndarray:
+    """Places ``step_m`` from ``points`` (..., 3) along x, y and z, then against them, shape ``(..., 6, 3)``."""
+    return np.asarray(points[..., None, :] + step_m * np.concatenate([np.eye(3), -np.eye(3)]))
+
+
+def quotients(answers: Any, step_m: float) -> np.ndarray:
+    """Slopes along x, y and z on a last axis [1/m], of answers at the six places of :func:`beside`, first axis."""
+    found = np.moveaxis(np.asarray(answers), 0, -1)
+    return np.asarray((found[..., :3] - found[..., 3:]) / (2.0 * step_m))
+
+
+@checked
+def retraced_slope(
+    answer: Callable[[np.ndarray], Any], points: ArrayLike, *, step_m: float = 0.01
+) -> np.ndarray:
+    """Slopes of what is traced anew on either side of each place: central differences.
+
+    Of totals and spectra much is edges of shadows, which derivatives of paths (:func:`warprrf.paths.trace_specular`) do not know.
+
+    Args:
+        answer: of positions ``(N, 3)`` [m] to numbers ``(N, ...)``; called once.
+        points: where slopes are wanted [m], shape ``(3,)`` or ``(R, 3)``.
+        step_m: how far away it is asked [m].
+
+    Returns:
+        Shape ``(..., 3)`` for one point, else ``(R, ..., 3)``, in the answer's unit per metre.
+
+    Raises:
+        ValueError: naming the argument; for another number of answers.
+
+    Example::
+
+        def total_db(at):
+            return 10 * np.log10(wr.trace_paths(scene, transmitter=tx, receivers=at, frequency_hz=f).power.sum(axis=1))
+
+        wr.paths.retraced_slope(total_db, [3.0, 2.0, 1.5])  # [dB/m], shape (3,)
+    """
+    at, step = check_receivers("points", points), check_positive("step_m", step_m)
+    places = beside(at, step).reshape(-1, 3)
+    found = np.asarray(answer(places))
+    if found.ndim == 0 or len(found) != len(places):
+        raise ValueError(
+            f"answer: got shape {found.shape} for {len(places)} positions, expected a row for each"
+        )
+    found = found.reshape(*at.shape[:-1], 6, *found.shape[1:])
+    return quotients(np.moveaxis(found, at.ndim - 1, 0), step)
 
 
 def check_positions(

@@ -9,6 +9,7 @@ from furnished import SHAPE, SIGMA, TX, F
 import warprrf as wr
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.observations import Frame
+from warprrf.rf.maps.placing import best_set
 from warprrf.rf.tracing.model import Effects
 
 CANDIDATES = np.array(
@@ -49,6 +50,16 @@ def test_one_and_two_transmitters_are_as_good_as_the_best_of_all_sets(field, snr
             assert found >= max(every) - 0.1
         else:  # 0.1 dB
             assert found >= max(every) * 10 ** (-0.01)
+
+
+def test_pairs_are_all_tried_while_they_are_few():
+    """The best single one covers four cells of six; the two that cover three cover all."""
+    snr_db = np.zeros((3, 1, 7))
+    for candidate, cells in enumerate(((0, 1, 2, 3), (0, 1, 4), (2, 3, 5))):
+        snr_db[candidate, 0, cells] = 20.0
+    snr_db[..., 6] = np.nan
+    assert best_set(snr_db, 2, "share", 10.0).tolist() == [1, 2]
+    assert best_set(snr_db, 2, "share", 10.0, most=2).tolist() == [0, 1]
 
 
 def test_bad_input_names_the_argument(field):

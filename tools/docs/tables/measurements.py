@@ -42,16 +42,34 @@ def _locate() -> str:
         "blocked: median",
         "90th percentile",
     )
-    further = ("beyond 30 cm", "within 95 % ellipsoid", "core seconds each", "nearest measurement [cm]")
+    further = (
+        "beyond 30 cm", "within 95 % ellipsoid", "core seconds each", "nearest measurement [cm]", "multilateration",
+    )  # fmt: skip
     keys = ("median_cm", "p90_cm", "blocked_median_cm", "blocked_p90_cm")
     lines = [
         [
             r["measured"], str(r["test"]), *(show(r[key], "{:.1f}") for key in keys), f"{r['wrong']:.0%}",
             f"{r['covered']:.0%}", show(r["cpu_s"]), show(r["nearest_cm"], "{:.0f}"),
+            show(r.get("lateration_cm"), "{:.0f}"),
         ]
         for r in read("locate")["rows"]
     ]  # fmt: skip
     return markdown((*head, *further), lines)
+
+
+@entry("place")
+def _place() -> str:
+    head = "transmitters", "of candidates", "chosen: worst tenth [dB]", "one added at a time", "core seconds"
+    lines = [
+        [
+            str(r["n"]),
+            str(r["candidates"]),
+            *(show(r[k], "{:.2f}") for k in ("chosen", "added")),
+            show(r["cpu_s"], "{:.0f}"),
+        ]
+        for r in read("locate")["place"]
+    ]
+    return markdown(head, lines)
 
 
 @entry("flat")

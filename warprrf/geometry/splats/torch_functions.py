@@ -180,7 +180,7 @@ def _raster(tensor: torch.Tensor, blending: Blending | None = None) -> Rasterize
     return Rasterizer(device=resolve(str(tensor.device)), blending=blending, real=real)
 
 
-def _shared(tensor: torch.Tensor, dtype: type) -> wp.array:
+def shared(tensor: torch.Tensor, dtype: type) -> wp.array:
     """The tensor's memory as a Warp array, without a gradient yet."""
     return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
 
@@ -188,7 +188,7 @@ def _shared(tensor: torch.Tensor, dtype: type) -> wp.array:
 def _seed(arrays: tuple[wp.array, ...], incoming: tuple[torch.Tensor | None, ...]) -> None:
     """Let torch's gradients be those of the arrays; the adjoint reads them and nothing writes them."""
     for array, gradient in zip(arrays, incoming, strict=True):
-        array.grad = None if gradient is None else _shared(gradient, array.dtype)
+        array.grad = None if gradient is None else shared(gradient, array.dtype)
 
 
 def _gradients(arrays: tuple[wp.array, ...], wanted: tuple[bool, ...], adjoint: Any) -> list[Any]:
@@ -206,7 +206,7 @@ def _stream_of(tensor: torch.Tensor | None) -> Any:
     return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device)))
 
 
-def _in_stream(static: Function) -> Function:
+def in_stream(static: Function) -> Function:
     """A forward or backward in the stream of the first tensor among its arguments, if there is one: gradients of
     outputs that nobody used are None."""
 
@@ -221,11 +221,11 @@ def _in_stream(static: Function) -> Function:
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    @_in_stream
+    @in_stream
     def forward(ctx: Any, cam: Camera, blending: Blending | None, *tensors: torch.Tensor) -> Any:
         r = _raster(tensors[0], blending)
         types = (r._vector(3), r._vector(4), r._vector(3), r.real, r.real, r.real)
-        inputs = tuple(_shared(t, dtype) for t, dtype in zip(tensors, types, strict=True))
+        inputs = tuple(shared(t, dtype) for t, dtype in zip(tensors, types, strict=True))
         image, ctx.adjoint = r.blend_with_adjoint(
             r.prepare(inputs[0], inputs[1], inputs[2], inputs[3], cam),
             inputs[4],
@@ -240,7 +240,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    @_in_stream
+    @in_stream
     def backward(ctx: Any, *incoming: torch.Tensor | None) -> Any:
         _ = ctx.saved_tensors  # raises if an input or an output was changed in place since forward
         _seed(ctx.outputs, incoming)
@@ -249,10 +249,10 @@ class _Rasterize(torch.autograd.Function):
 
 class _Colors(torch.autograd.Function):
     @staticmethod
-    @_in_stream
+    @in_stream
     def forward(ctx: Any, cam: Camera, means: torch.Tensor, sh: torch.Tensor) -> Any:
         r = _raster(means)
-        inputs = (_shared(means, r._vector(3)), _shared(sh, r.real))
+        inputs = (shared(means, r._vector(3)), shared(sh, r.real))
         out = wp.zeros((len(means), sh.shape[2]), dtype=r.real, device=r.device)
         origin = r.colors_into(*inputs, cam, out)
         ctx.inputs, ctx.out = inputs, out
@@ -262,7 +262,7 @@ class _Colors(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    @_in_stream
+    @in_stream
     def backward(ctx: Any, incoming: torch.Tensor) -> Any:
         _ = ctx.saved_tensors  # raises if an input was changed in place since forward
         _seed((ctx.out,), (incoming.clone(),))  # Warp's own adjoint zeroes what it has read
@@ -271,12 +271,12 @@ class _Colors(torch.autograd.Function):
 
 class _Rays(torch.autograd.Function):
     @staticmethod
-    @_in_stream
+    @in_stream
     def forward(ctx: Any, query: tuple[str, tuple[Any, ...], Any, Any], *tensors: torch.Tensor) -> Any:
         method, arguments, options, blending = query
         r = _raster(tensors[0])
         types = (r._vector(3), r._vector(4), r._vector(3), r.real)
-        ctx.inputs = tuple(_shared(t, dtype) for t, dtype in zip(tensors, types, strict=True))
+        ctx.inputs = tuple(shared(t, dtype) for t, dtype in zip(tensors, types, strict=True))
         rays = GaussianRays(ctx.inputs, blending=blending)
         found, ctx.adjoint = getattr(rays, method)(*arguments, **options)
         hits = not isinstance(found, wp.array)
@@ -291,7 +291,7 @@ class _Rays(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    @_in_stream
+    @in_stream
     def backward(ctx: Any, *incoming: torch.Tensor) -> Any:
         _ = ctx.saved_tensors  # raises if an input was changed in place since forward
         _seed(ctx.outputs, tuple(g.double() for g in incoming[: len(ctx.outputs)]))

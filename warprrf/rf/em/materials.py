@@ -548,6 +548,12 @@ def assumed_permittivity(name: str, frequency_hz: float) -> float:
 
 
 @lru_cache(maxsize=64)
+def itu_permittivity(itu: str, frequency_hz: float) -> complex:
+    """Complex relative permittivity of a material of ITU-R P.2040, by the law of the nearest band."""
+    return itu_material(itu).extrapolated().permittivity(frequency_hz)
+
+
+@lru_cache(maxsize=64)
 def _mean_permittivity(names: tuple[str, ...], frequency_hz: float) -> float:
-    found = [abs(itu_material(one).extrapolated().permittivity(frequency_hz)) for one in names]
+    found = [abs(itu_permittivity(one, frequency_hz)) for one in names]
     return 1.0 + float(np.exp(np.mean(np.log(np.maximum(np.array(found) - 1.0, 1e-3)))))

@@ -43,7 +43,7 @@ from warprrf.rf.fields.location import Location
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
 from warprrf.rf.paths.path_set import PATH_VARIABLES, Paths, arrays_of, ends_and_attributes
-from warprrf.rf.positions import Ends, check_positions
+from warprrf.rf.positions import Ends, check_positions, retraced_slope
 from warprrf.rf.spectra.antenna import Antenna, Pattern, samples_of
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.readings import Readings
@@ -421,6 +421,43 @@ class RadioField(ABC):
             found.append(self.trace_links(ends.receivers[own], source, replace(asked, progress=tell)))
             rows = np.concatenate([rows, own])
         return Links.joined(found)[0 if ends.single else np.argsort(rows)]
+
+    def slope(
+        self,
+        receivers: ArrayLike,
+        transmitter: ArrayLike | None = None,
+        *,
+        quantity: str = "total",
+        step_m: float = 0.01,
+    ) -> np.ndarray:
+        """How what arrives changes with a receiver's place, by differences of spectra traced anew on either side of it, so that the
+        edges of shadows count.
+
+        Args:
+            receivers, transmitter: as for :meth:`spectrum`.
+            quantity: ``"total"``, 10 log10(total path gain + floor), or ``"spectrum"``, the same of each pixel.
+            step_m: how far to either side it is asked [m].
+
+        Returns:
+            [dB/m] along x, y and z, shape ``(3,)`` or ``(H, W, 3)`` for one receiver and transmitter, else ``(R, 3)`` or
+            ``(R, H, W, 3)``.
+
+        Raises:
+            ValueError: as for :meth:`spectrum`, at the receivers or within ``step_m`` of them; for another quantity or step.
+
+        Example::
+
+            field.slope([7.0, 4.0, 1.5])  # of the total [dB/m]
+        """
+        check_choice("quantity", quantity, ("total", "spectrum"))
+        ends = self.check_positions(receivers, transmitter)
+
+        def decibels(at: np.ndarray) -> np.ndarray:
+            gain = self.spectra(at, np.repeat(ends.transmitters, 6, axis=0)).path_gain
+            gain = gain.sum(axis=(1, 2), dtype=float) if quantity == "total" else gain.astype(float)
+            return 10.0 * np.log10(gain + self.floor)
+
+        return np.asarray(ends.shaped(retraced_slope(decibels, ends.receivers, step_m=step_m)))
 
     def suggest(
         self,

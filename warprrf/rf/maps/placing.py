@@ -1,12 +1,14 @@
-"""Where transmitters go: candidates compared by the radio maps that a field has of each, added one at a time.
+"""Where transmitters go: candidates compared by the radio maps that a field has of each.
 
-With several transmitters each receiver takes the one that it gets best. Adding the best one at a time comes close to the best set,
-because the more there are, the less another one brings (Nemhauser, Wolsey and Fisher 1978).
+With several transmitters each receiver takes the one that it gets best. All sets are tried as long as they are few; of more, the
+best one is added at a time, which comes close where each brings less the more there are (Nemhauser, Wolsey and Fisher 1978).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import combinations
+from math import comb
 from typing import Any
 
 import numpy as np
@@ -22,6 +24,7 @@ OBJECTIVES: dict[str, Callable[[np.ndarray, float], float]] = {
     "mean rate": lambda snr_db, level_db: float(np.mean(np.log2(1.0 + 10.0 ** (snr_db / 10.0)))),
 }
 """Of cells' signal-to-noise ratios (C,) [dB]: the share of those above a level, what nine of ten exceed, Shannon's rate."""
+MOST_SETS = 50_000  # seconds; pairs of 300 candidates
 LEAST_DB = -300.0  # of a cell that gets nothing
 
 
@@ -51,7 +54,8 @@ def place(
         options: attributes of :class:`~warprrf.rf.maps.radio_map.MapOptions`.
 
     Returns:
-        Indices of candidates, in the order in which they were added, shape ``(n,)``.
+        Indices of candidates, shape ``(n,)``: the best of all sets up to :data:`MOST_SETS`, else in the order in which they were
+        added.
 
     Raises:
         ValueError: naming the argument; for a candidate where no transmitter can be.
@@ -63,18 +67,29 @@ def place(
     places = check_array("candidates", candidates, (None, 3))
     check_count("n", n, 1, len(places))
     check_choice("objective", objective, OBJECTIVES)
-    measure, level = OBJECTIVES[objective], check_number("level_db", level_db)
+    level = check_number("level_db", level_db)
     found = []
     for k, source in enumerate(places):
         found.append(radio_map(field, height, cell, source, MapOptions(**options)).best_beam_snr_db)
         if progress is not None:
             progress("place", k + 1, len(places))
-    snr_db = np.stack(found)
-    snr_db = np.fmax(snr_db, LEAST_DB)[:, ~np.isnan(snr_db).all(axis=0)]  # cells in the air
-    best, chosen = np.full(snr_db.shape[1], LEAST_DB), list[int]()
+    return best_set(np.stack(found), n, objective, level)
+
+
+def best_set(
+    snr_db: np.ndarray, n: int, objective: str, level: float = 0.0, *, most: int = MOST_SETS
+) -> np.ndarray:
+    """What :func:`place` chooses by candidates' maps [dB], NaN outside the air, shape ``(C, Y, X)``; of more than ``most`` sets not
+    all are tried."""
+    measure, cells = OBJECTIVES[objective], np.fmax(snr_db, LEAST_DB)[:, ~np.isnan(snr_db).all(axis=0)]
+
+    def worth(some: Sequence[int]) -> float:
+        return measure(cells[list(some)].max(axis=0), level)
+
+    if comb(len(cells), n) <= most:
+        return np.array(max(combinations(range(len(cells)), n), key=worth))
+    chosen = list[int]()
     for _ in range(n):
-        left = [k for k in range(len(places)) if k not in chosen]
-        with_each = [measure(np.maximum(best, snr_db[k]), level) for k in left]
-        chosen.append(left[int(np.argmax(with_each))])
-        best = np.maximum(best, snr_db[chosen[-1]])
+        left = [k for k in range(len(cells)) if k not in chosen]
+        chosen.append(max(left, key=lambda k: worth([*chosen, k])))
     return np.array(chosen)

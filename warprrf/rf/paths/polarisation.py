@@ -39,26 +39,6 @@ def turns(stops: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return found
 
 
-def jones_matrices(
-    stops: np.ndarray, normal: np.ndarray, turn: np.ndarray, te: np.ndarray, tm: np.ndarray
-) -> np.ndarray:
-    """Jones matrices ``(L, 2, 2)`` of chains, along zenith and azimuth unit vectors of departure and arrival.
-
-    Args:
-        stops, normal: As :func:`turns` takes them.
-        turn: What it returns, shape ``(L, k)``.
-        te, tm: Reflection coefficients of each mirror, complex, shape ``(L, k)``.
-    """
-    if te.shape[1] == 0:
-        return _directly(stops) + 0j
-    jones = np.broadcast_to(np.eye(2, dtype=complex), (len(stops), 2, 2))
-    rotation, reflected = _rotations(turn), np.stack([te, tm], axis=-1)
-    for k in range(te.shape[1]):
-        jones = reflected[:, k, :, None] * (rotation[:, k] @ jones)
-    into, out = _ends(stops, normal)
-    return out @ jones @ into
-
-
 def vertical_ends(stops: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fields of antennas along the zenith unit vectors of departure and arrival, in the (TE, TM) of the first mirror and
     behind the last, shape ``(L, 2)`` each; arguments as for :func:`turns`."""

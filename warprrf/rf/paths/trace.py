@@ -6,7 +6,10 @@ Angles: arrival points from the receiver to the last interaction, departure from
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_count, checked
@@ -18,10 +21,10 @@ from warprrf.rf.em.fresnel import SurfaceTable, surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.paths.edge_paths import EdgeFinder, EdgePaths
 from warprrf.rf.paths.images import MOST_CHAINS, MirrorImages
-from warprrf.rf.paths.mirror_paths import MirrorPaths, exact_paths, stops_of
+from warprrf.rf.paths.mirror_paths import MirrorPaths, exact_paths
 from warprrf.rf.paths.path_set import Paths
-from warprrf.rf.paths.polarisation import jones_matrices
 from warprrf.rf.paths.slabs import Walls
+from warprrf.rf.paths.specular import OUTPUTS, SpecularPaths, fixed_parameters
 from warprrf.rf.positions import Ends, check_positions, question_unit, warn_of_unmodelled
 
 
@@ -82,6 +85,81 @@ def trace_paths(
     Warns:
         UserWarning: below 100 GHz and outdoors, of diffraction and transmission if not asked for.
     """
+    ends, frequency, order, most = _checked_question(
+        mesh_or_scene, receivers, transmitter, frequency_hz, mirror_order, transmissions, diffractions, device
+    )
+    tell: Progress = progress or (lambda stage, done, total: None)
+    found: dict[int, Paths] = {}
+    for source, own in ends.groups():
+        tell("patches", 0, 1)
+        tracer = MirrorTracer(
+            mesh_or_scene, transmitter=source, frequency_hz=frequency, device=device, **most
+        )
+        tell("patches", 1, 1)
+        found |= zip(own.tolist(), tracer.trace_each(ends.receivers[own], order, progress), strict=True)
+    several = [found[k] for k in sorted(found)]
+    return (several[0] if ends.single else Paths.stack(several)).with_gas(gas)
+
+
+@checked
+def trace_specular(
+    mesh_or_scene: GeometryLike,
+    *,
+    transmitter: ArrayLike,
+    receivers: ArrayLike,
+    frequency_hz: float,
+    mirror_order: int = 1,
+    transmissions: int = 0,
+    progress: Progress | None = None,
+    device: DeviceLike = None,
+) -> SpecularPaths:
+    """The paths of :func:`~warprrf.trace_paths`, edges and gas apart, as a function of both ends, of their antennas' orientations
+    and of materials, which Warp's tape and torch differentiate.
+
+    Which paths there are and what each meets is held fixed: only near where they were traced do they stay those that there are.
+
+    Args:
+        mesh_or_scene, frequency_hz, mirror_order, transmissions, progress, device: As of :func:`trace_paths`.
+        transmitter: Position [m], shape ``(3,)``.
+        receivers: Positions [m], shape ``(3,)`` or ``(R, 3)``.
+
+    Returns:
+        See :meth:`SpecularPaths.evaluate`.
+
+    Raises:
+        ValueError: as :func:`trace_paths`, and for several transmitters.
+
+    Example::
+
+        held = wr.paths.trace_specular(scene, transmitter=tx, receivers=rx, frequency_hz=60e9, mirror_order=2)
+        eta = wp.array(held.parameters["relative_permittivity"], dtype=wp.float64, requires_grad=True)
+        with wp.Tape() as tape:
+            values = held.evaluate(relative_permittivity=eta)
+        tape.backward(grads={values.tau: wp.ones(len(held), dtype=wp.float64)})
+        eta.grad  # of the summed delays [s], one for each material
+    """
+    if np.ndim(transmitter) != 1:
+        raise ValueError(f"transmitter: got shape {np.shape(transmitter)}, expected (3,)")
+    ends, frequency, order, most = _checked_question(
+        mesh_or_scene, receivers, transmitter, frequency_hz, mirror_order, transmissions, 0, device
+    )
+    tracer = MirrorTracer(
+        mesh_or_scene, transmitter=ends.transmitters[0], frequency_hz=frequency, device=device, **most
+    )
+    return tracer.trace_specular(ends.receivers, order, progress)
+
+
+def _checked_question(
+    mesh_or_scene: GeometryLike,
+    receivers: ArrayLike,
+    transmitter: ArrayLike,
+    frequency_hz: float,
+    mirror_order: int,
+    transmissions: int,
+    diffractions: int,
+    device: DeviceLike,
+) -> tuple[Ends, float, int, dict[str, int]]:
+    """What :func:`trace_paths` is asked, checked: ends, carrier, order, most slabs and edges."""
     ends, frequency = Ends.of(receivers, transmitter), check_frequency(frequency_hz)
     mesh, wavelength_m = as_mesh(mesh_or_scene), SPEED_OF_LIGHT / frequency
     question_unit(mesh, wavelength_m)
@@ -95,17 +173,7 @@ def trace_paths(
         "transmissions": check_count("transmissions", transmissions, 0, 3),
         "diffractions": check_count("diffractions", diffractions, 0, 1),
     }
-    tell: Progress = progress or (lambda stage, done, total: None)
-    found: dict[int, Paths] = {}
-    for source, own in ends.groups():
-        tell("patches", 0, 1)
-        tracer = MirrorTracer(
-            mesh_or_scene, transmitter=source, frequency_hz=frequency, device=device, **most
-        )
-        tell("patches", 1, 1)
-        found |= zip(own.tolist(), tracer.trace_each(ends.receivers[own], order, progress), strict=True)
-    several = [found[k] for k in sorted(found)]
-    return (several[0] if ends.single else Paths.stack(several)).with_gas(gas)
+    return ends, frequency, order, most
 
 
 class MirrorTracer:
@@ -157,6 +225,7 @@ class MirrorTracer:
                 self.mesh, eta, thickness, self.wavelength_m, transmissions, clearance, device
             )
         self.images = MirrorImages(self.patches, self.transmitter, max_chains=max_chains, device=device)
+        self._fixed = fixed_parameters(materials, self.table, self.frequency_hz, self.images.device)
         self.edges: EdgeFinder | None = None
         if diffractions:
             self.edges = EdgeFinder(
@@ -176,25 +245,34 @@ class MirrorTracer:
         self, receivers: ArrayLike, mirror_order: int = 1, progress: Progress | None = None
     ) -> list[Paths]:
         """Paths of each of ``receivers`` (R, 3), one after the other."""
-        found = self.find(receivers, mirror_order, progress)
-        points = np.asarray(receivers, float)
-        jones, amplitude, excess_m = self._passed_on(found, points)
+        points = check_array("receivers", receivers, (None, 3))
+        found = self.find(points, mirror_order, progress)
+        held = self._held(found, points).evaluate()
         over = None if self.edges is None else self.edges.find(points, min(mirror_order, 1), progress)
         ends = np.searchsorted(found.receiver, np.arange(len(points) + 1))
+        kind = np.where(found.slabs > 0, "slab", np.where(found.order == 0, "los", "mirror")).astype("<U7")
         result = []
         for k, point in enumerate(points):
-            own = np.arange(ends[k], ends[k + 1])
-            own = own[np.lexsort((found.length_m[own], found.order[own], found.slabs[own] > 0))]
-            kind = np.where(found.slabs[own] > 0, "slab", np.where(found.order[own] == 0, "los", "mirror"))
+            own = slice(ends[k], ends[k + 1])
+            columns: dict[str, Any] = {name: getattr(held, name)[own] for name in OUTPUTS}
+            if self.table is None:
+                columns["jones"] = None
             result.append(
-                Paths._from_points(
-                    self.transmitter, point, found.point[own], amplitude[own], kind.astype("<U7"), self.frequency_hz,
-                    None if jones is None else jones[own], excess_m[own], interactions=found.code[own],
+                Paths(
+                    **columns, kind=kind[own], valid=np.ones(ends[k + 1] - ends[k], bool), interactions=found.code[own],
+                    frequency_hz=self.frequency_hz, transmitter=self.transmitter.copy(), receiver=point.copy(),
                 )
             )  # fmt: skip
             if over is not None:
                 result[-1] = Paths.concatenate([result[-1], self._over(over, k, point)])
         return result
+
+    def trace_specular(
+        self, receivers: ArrayLike, mirror_order: int = 1, progress: Progress | None = None
+    ) -> SpecularPaths:
+        """Paths to ``receivers`` (R, 3) as a function of ends and materials; see :func:`trace_specular`."""
+        points = check_array("receivers", receivers, (None, 3))
+        return self._held(self.find(points, mirror_order, progress), points)
 
     def _over(self, found: EdgePaths, k: int, point: np.ndarray) -> Paths:
         """The paths over edges of receiver ``k``, at ``point``."""
@@ -219,33 +297,18 @@ class MirrorTracer:
         points = check_array("receivers", receivers, (None, 3))
         if (points == self.transmitter).all(axis=1).any():
             raise ValueError("receivers: got a receiver at the transmitter's place, expected them apart")
-        return exact_paths(self.images, points, order, progress, self.walls)
+        found = exact_paths(self.images, points, order, progress, self.walls)
+        return found.take(np.lexsort((found.length_m, found.order, found.slabs > 0, found.receiver)))
 
-    def _passed_on(
-        self, found: MirrorPaths, receivers: np.ndarray
-    ) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
-        """Jones matrices ``(L, 2, 2)``, None for a bare mesh, and amplitudes ``(L,)``, both without the delay's phase; and by how
-        much slabs make paths longer than they are [m], ``(L,)``."""
-        friis, excess_m = self.wavelength_m / (4.0 * np.pi * found.length_m), np.zeros(len(found))
-        if self.table is None:
-            return None, friis.astype(complex), excess_m
-        jones, phase = np.zeros((len(found), 2, 2), complex), np.ones(len(found), complex)
-        size = np.ones(len(found))
-        for count, own in found.by_interactions:
-            patch, slab, cos = (a[own, :count] for a in (found.patch, found.slab, found.cosine))
-            through = slab >= 0
-            material = self.patches.group[patch]
-            material[through] = self._face_material[slab[through]]
-            te, tm = self.table.reflection(material, cos, self.wavelength_m)
-            if through.any():
-                solid = found.thickness_m[own, :count][through]
-                te[through], tm[through], longer = self.table.passage(
-                    material[through], cos[through], self.wavelength_m, solid
-                )
-                excess_m[own] = np.bincount(np.nonzero(through)[0], longer, minlength=len(own))
-            stops = stops_of(self.transmitter, found.point[own, :count], receivers[found.receiver[own]])
-            jones[own] = jones_matrices(stops, found.normal[own, :count], found.turn[own, :count], te, tm)
-            phase[own] = np.where(te == 0, 1.0, te / np.where(te == 0, 1.0, np.abs(te))).prod(axis=1)
-            if count:
-                size[own] = np.sqrt(0.5 * (np.abs(jones[own]) ** 2).sum(axis=(1, 2)))
-        return friis[:, None, None] * jones, friis * size * phase, excess_m
+    def _held(self, found: MirrorPaths, points: np.ndarray) -> SpecularPaths:
+        """Those found, to ``points`` (R, 3), as a function of ends and materials."""
+        mirror, slab = found.patch >= 0, found.slab >= 0
+        offset, material = np.zeros(found.patch.shape), np.full(found.patch.shape, -1)
+        offset[mirror] = self.patches.offset[found.patch[mirror]]
+        offset[slab] = (self.mesh.triangles[found.slab[slab], 0] * found.normal[slab]).sum(axis=1)
+        if self.table is not None:
+            material[mirror] = self.patches.group[found.patch[mirror]]
+            material[slab] = self._face_material[found.slab[slab]]
+        where, ends = self.images.device, {"transmitter": self.transmitter[None], "receivers": points}
+        traced = {name: wp.array(value, dtype=wp.vec3d, device=where) for name, value in ends.items()}
+        return SpecularPaths(found, offset, material, traced | self._fixed, self.frequency_hz, where)

@@ -35,6 +35,18 @@ class PathGains:
         """Of each line of sight and mirror path, shape ``(L,)``."""
         return self.tables[SPECULAR]
 
+    @property
+    def apart(self) -> list[PathGains]:
+        """Those of each receiver, all that is scattered in one table."""
+        rays, found = self.by_ray().reshape(len(self.view.receivers), -1), list[PathGains]()
+        index, none = np.arange(rays.shape[1]), np.zeros((rays.shape[1], 0), np.int32)
+        for k, power in enumerate(rays):
+            view, direct = self.view.of(k), self.specular[self.view.paths.receiver == k]
+            every = Records(power, index, none, np.zeros((*none.shape, 3)), none[:1])
+            records = view.records | {"rays": every}
+            found.append(PathGains(view, {SPECULAR: direct, "rays": power}, records, self.parameters))
+        return found
+
     def by_ray(self, names: Iterable[str] | None = None) -> np.ndarray:
         """Of everything but those, or of the sequences ``names``, by the ray that sees it, shape ``(R K,)``."""
         count, records = len(self.view.hits.face), self.records

@@ -25,7 +25,7 @@ from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.scans import is_scan, scanned_patches
 from warprrf.geometry.splats.gaussians import gaussians_of
 from warprrf.rf.em.fresnel import SurfaceTable
-from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, is_name_alone, itu_material, itu_name
+from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, is_name_alone, itu_name, itu_permittivity
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.slabs import Walls
 from warprrf.rf.tracing.colours import Colours, colour_groups
@@ -268,7 +268,7 @@ class Surface:
         eta[known] = a * ghz**b - 1j * c * ghz**d / (2.0 * np.pi * frequency_hz * VACUUM_PERMITTIVITY)
         for g, name in enumerate(map(itu_name, self.group_names)):
             if name is not None and not known[g]:
-                eta[g], known[g] = itu_material(name).extrapolated().permittivity(frequency_hz), True
+                eta[g], known[g] = itu_permittivity(name, frequency_hz), True
         known_slab = known & ~np.isnan(self.thickness_m)
         thickness = np.where(np.isnan(self.thickness_m), ASSUMED_THICKNESS_M, self.thickness_m) / wavelength_m
         absorbed = 4.0 * np.pi * np.where(known_slab, 0.0, thickness) * np.sqrt(eta).imag

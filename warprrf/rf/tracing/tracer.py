@@ -147,6 +147,15 @@ class View:
             self.lit[:] = [np.packbits(bits)]
         return {name: made[name] if name in made else self.records[name] for name in (SPECULAR, *wanted)}
 
+    def of(self, k: int) -> View:
+        """That of receiver ``k`` alone; nothing but its line of sight and mirrors is known."""
+        h, own = self.hits, self.paths.receiver == k
+        rays = slice(k * len(h.directions), (k + 1) * len(h.directions))
+        hits = replace(h, origins=h.origins[[k]], face=h.face[rays], range_m=h.range_m[rays])
+        paths, direct = self.paths.of(np.array([k])), self.records[SPECULAR].take(own)
+        direct = replace(direct, ray=np.arange(len(paths), dtype=np.int32))
+        return View(self.tracer, self.receivers[[k]], hits, paths, {SPECULAR: direct}, self.keeps)
+
     def without_records(self) -> View:
         """The same that keeps no records but those of line of sight and mirrors."""
         return replace(self, records={SPECULAR: self.records[SPECULAR]}, keeps=False)

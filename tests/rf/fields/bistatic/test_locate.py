@@ -8,7 +8,8 @@ import pytest
 from furnished import RECEIVERS
 
 import warprrf as wr
-from warprrf.rf.fields.bistatic.locate import as_data
+from warprrf.rf.fields.bistatic.locate import Question, as_data
+from warprrf.rf.tracing.render import path_gains
 
 UNSEEN = np.array([[3.9, 2.0, 1.4], [1.7, 3.1, 1.2]])
 OTHERS = np.array([[4.4, 0.6, 2.3], [0.7, 3.5, 2.4], [4.5, 3.6, 2.5]])
@@ -74,3 +75,51 @@ def test_what_cannot_be_located_is_refused(scene, field, horn):
     ):  # fmt: skip
         with pytest.raises((TypeError, ValueError), match=text):
             as_data(field, what)
+
+
+@pytest.mark.parametrize("quantity", ["total", "spectrum"])
+def test_slopes_of_a_field_are_differences_of_spectra_traced_beside(field, quantity):
+    found = field.slope(UNSEEN, quantity=quantity, step_m=0.02)
+    for k, place in enumerate(UNSEEN):
+        for axis, step in enumerate(0.02 * np.eye(3)):
+            sides = [field.spectrum(place + way * step).path_gain.astype(float) for way in (1, -1)]
+            up, down = (g if quantity == "spectrum" else g.sum() for g in sides)
+            expected = 10 * np.log10((up + field.floor) / (down + field.floor)) / 0.04
+            np.testing.assert_allclose(found[k, ..., axis], expected, rtol=1e-3, atol=1e-3)
+    assert np.abs(found).max() > 1.0
+    one = field.slope(UNSEEN[0], quantity=quantity, step_m=0.02)
+    assert one.shape == ((3,) if quantity == "total" else (*field.shape, 3))
+    np.testing.assert_allclose(one, found[0], rtol=1e-5, atol=1e-3)
+
+
+def test_slopes_of_what_no_field_has_are_refused(field):
+    with pytest.raises(ValueError, match="quantity"):
+        field.slope(UNSEEN[0], quantity="delay")
+    with pytest.raises(ValueError, match="step_m"):
+        field.slope(UNSEEN[0], step_m=-0.01)
+
+
+def test_receivers_traced_at_once_get_what_each_gets_alone(field):
+    tracer = field.tracer().on_grid((20, 40), 1)
+    places = np.concatenate([UNSEEN, OTHERS[:1]])
+    materials, model = field.materials_of(tracer), field.state
+    together = path_gains(tracer.view(places, field.effects), model, materials).apart
+    for place, found in zip(places, together, strict=True):
+        alone = path_gains(tracer.view(place, field.effects), model, materials)
+        assert len(alone.specular) > 1 and alone.by_ray().max() > 0
+        np.testing.assert_allclose(found.specular, alone.specular, rtol=1e-12)
+        np.testing.assert_allclose(found.by_ray(), alone.by_ray(), rtol=1e-6)
+        np.testing.assert_array_equal(found.view.receivers, alone.view.receivers)
+        np.testing.assert_array_equal(found.view.hits.face, alone.view.hits.face)
+        np.testing.assert_allclose(found.view.paths.arrival, alone.view.paths.arrival, atol=1e-12)
+
+
+def test_slopes_hold_near_where_they_were_taken(scene, field):
+    question = Question(field, as_data(field, furnished.spectra(scene, UNSEEN[:1])))
+    there = question.errors(UNSEEN[0] + 0.05, 0.1, quick=True)
+    near = question.errors(UNSEEN[0] + 0.02, 0.1, quick=True, near=there)
+    anew = question.errors(UNSEEN[0] + 0.02, 0.1, quick=True)
+    np.testing.assert_array_equal(near.rise, there.rise)
+    np.testing.assert_allclose(near.error, anew.error, atol=1e-5)
+    np.testing.assert_array_equal(near.sloped, there.unknown)
+    assert not np.allclose(anew.rise, there.rise)

@@ -26,9 +26,11 @@ from warprrf.rf.fields.bistatic.field_map import SPACING_M, FieldMap, best_on_ma
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, Place, as_list, huber, kinds_of, places_of
 from warprrf.rf.fields.bistatic.uncertainty import bins
 from warprrf.rf.fields.location import Location
+from warprrf.rf.positions import beside, quotients
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.spectra.spectrum import Spectrum
+from warprrf.rf.tracing.render import PathGains, path_gains
 from warprrf.rf.tracing.tracer import Tracer
 
 STARTS = 2  # places of the lattice that are searched from; in a lobby the best one is within it of the truth
@@ -44,9 +46,12 @@ SUB_PIXELS = (
 SMOOTH = 3  # pixels of a spectrum that slopes are means over, along each axis: noise of slopes would pass for curvature
 HUBER = 3.0  # standard deviations
 LEAST_STD_DB = 0.3  # of a pixel: no field is so exact that tenths of a decibel tell places apart
-BLOCKS = (
-    12  # along each axis of a spectrum, whose errors hang together: what one edge in the wrong place spoils
-)
+BLOCKS = 12
+"""Along each axis of a spectrum, whose errors hang together: what one edge in the wrong place spoils."""
+SPREAD = 1.8
+"""Of a spectrum's covariance: blocks are not all that hangs together. By 20 receivers of a lobby, none of them fitted to or tested:
+half of their squared errors, and 95 of 100, were 1.7 and 1.9 times what blocks say."""
+GIVEN_UP = 2.0  # times the least loss of an earlier start: others are left where they leave more
 FOLLOWED = 1.4  # times the least loss: candidates are followed below
 SAME_M = 0.1  # candidates nearer than this are one
 SURE, EXPLAINED = 0.95, 4.0  # likelihood and misfit of a place that is known
@@ -92,11 +97,14 @@ def as_data(field: Any, measured: Any) -> list[Measured]:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Unknowns (U,) and what they leave: errors in standard deviations ``(N,)`` and their slopes ``(N, U)``."""
+    """Unknowns (U,) and what they leave: errors in standard deviations ``(N,)`` and their slopes ``(N, U)``, which were taken at
+    the unknowns ``sloped`` over ``step_m``."""
 
     unknown: np.ndarray
     error: np.ndarray
     rise: np.ndarray
+    sloped: np.ndarray
+    step_m: float
 
     @property
     def threshold(self) -> float:
@@ -173,10 +181,11 @@ class Question:
             found[k] = replace(found[k], arrival=found[k].arrival + [0.0, by], azimuth_known=True)
         return found
 
-    def errors(self, unknown: np.ndarray, step_m: float, *, quick: bool) -> Found:
-        """What ``unknown`` (U,) leaves; slopes are differences over ``step_m`` to either side. ``quick``: with few
-        rays and single mirrors."""
-        points = unknown[:3] + step_m * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    def errors(self, unknown: np.ndarray, step_m: float, *, quick: bool, near: Found | None = None) -> Found:
+        """What ``unknown`` (U,) leaves; slopes by position are differences over ``step_m`` to either side, or those that were
+        found ``near``. ``quick``: with few rays and single mirrors."""
+        here = unknown[None, :3]
+        points = np.concatenate([here, beside(here[0], step_m)]) if near is None else here
         kinds, further, seen = kinds_of(self.moved(unknown)), {}, dict[Any, Any]()
         for j, k in enumerate(self.turned):
             other = unknown + TURN_RAD * (np.arange(len(unknown)) == 3 + j)
@@ -185,23 +194,24 @@ class Question:
         for place in self.places:
             key = place.transmitter.tobytes(), place.shape, place.beam_sigma_rad
             if key not in seen:
-                seen[key] = self._views(place, points, quick)
-            views, *under = seen[key]
+                seen[key] = self._gains(place, points, quick)
+            gains = seen[key]
             chain = 3 + len(self.turned) + self.chains.index(place.chain) if place.chain else None
-            gain = 1.0 if chain is None else float(np.exp(unknown[chain]))
+            times = 1.0 if chain is None else float(np.exp(unknown[chain]))
             column, turned = further.get(place.data, (0, None))
-            asked = [(kinds[place.data], *one) for one in zip(points, views, strict=True)]
-            asked += [] if turned is None else [(turned, points[0], views[0])]
-            observed = [kind.observe(replace(place, receiver=point), view) for kind, point, view in asked]
-            powers = [gain * o.predicted(*under) for o in observed]
+            asked = [(kinds[place.data], *one) for one in zip(points, gains, strict=True)]
+            asked += [] if turned is None else [(turned, points[0], gains[0])]
+            observed = [kind.observe(replace(place, receiver=point), g.view) for kind, point, g in asked]
+            powers = [times * o.of_gains(g) for o, (*_, g) in zip(observed, asked, strict=True)]
             target, weight = observed[0].target, self.weights[place.data]
             target = target if weight is None else target.trusted(weight)
             error, *others = (target.error(power) / NOISE_DB for power in powers)
             rise = np.zeros((len(error), len(unknown)))
             # Of both sides: the noise of one alone would hang together with that of the errors, and pull the place aside.
-            rise[:, :3] = (np.stack(others[:3], axis=1) - np.stack(others[3:6], axis=1)) / (2.0 * step_m)
+            if near is None:
+                rise[:, :3] = quotients(others[:6], step_m)
             if turned is not None:
-                rise[:, column] = (others[6] - error) / TURN_RAD
+                rise[:, column] = (others[-1] - error) / TURN_RAD
             if chain is not None:
                 rise[:, chain] = target.slope(powers[0]) * powers[0] / NOISE_DB
             if weight is not None:
@@ -211,10 +221,14 @@ class Question:
                 ).reshape(rise.shape)
             errors.append(error)
             rises.append(rise)
-        return Found(unknown, np.concatenate(errors), np.concatenate(rises))
+        rise = np.concatenate(rises)
+        if near is not None:
+            rise[:, :3] = near.rise[:, :3]
+        at = (unknown, step_m) if near is None else (near.sloped, near.step_m)
+        return Found(unknown, np.concatenate(errors), rise, *at)
 
-    def _views(self, place: Place, points: np.ndarray, quick: bool) -> tuple[Any, ...]:
-        """What is seen at ``points`` under a place's transmitter, the model, and its evaluation there."""
+    def _gains(self, place: Place, points: np.ndarray, quick: bool) -> list[PathGains]:
+        """What is received at each of ``points`` under a place's transmitter, all traced at once."""
         f = self.field
         tracer, model = f.tracer(place.transmitter), f.state
         if quick:
@@ -223,16 +237,15 @@ class Question:
             (place.seen_from, quick), tracer.on_grid(place.shape, SUB_PIXELS[not quick])
         )
         few.beam_sigma_rad = place.beam_sigma_rad
-        paths = few.paths(points, model.effects)
-        views = [
-            few.view(point, model.effects, paths=paths.of(np.array([k]))) for k, point in enumerate(points)
-        ]
-        return views, model, f.materials_of(tracer)
+        return path_gains(few.view(points, model.effects), model, f.materials_of(tracer)).apart
 
-    def descend(self, unknown: np.ndarray, *, quick: bool) -> Found:
-        """From ``unknown`` (U,) to where errors are least."""
+    def descend(
+        self, unknown: np.ndarray, *, quick: bool, near: Found | None = None, most: float = np.inf
+    ) -> Found:
+        """From ``unknown`` (U,) to where errors are least; given up where after a step they leave more than ``most``. Slopes
+        are at first those that were found ``near``, and hold as far about their place as they were taken over."""
         damping, difference = 1e-3, FIRST_DIFFERENCE_M if quick else 2.0 * DIFFERENCE_M
-        now = self.errors(unknown, difference, quick=quick)
+        now = self.errors(unknown, difference, quick=quick, near=near)
         for _ in range(STEPS[0 if quick else 1]):
             threshold = now.threshold
             curvature, gradient = now.normal(threshold)
@@ -243,10 +256,11 @@ class Question:
                 step *= 0.5  # not through walls
             length = float(np.linalg.norm(step[:3]))
             difference = float(np.clip(0.5 * length, DIFFERENCE_M, difference))
-            other = self.errors(now.unknown + step, difference, quick=quick)
+            holds = np.linalg.norm((now.unknown + step - now.sloped)[:3]) < now.step_m
+            other = self.errors(now.unknown + step, difference, quick=quick, near=now if holds else None)
             better = other.loss(threshold) < now.loss(threshold)
             now, damping = (other, 0.2 * damping) if better else (now, max(1.0, 4.0 * damping))
-            if length < SHORTEST_M * (3.0 if quick else 1.0):
+            if length < SHORTEST_M * (3.0 if quick else 1.0) or now.loss(threshold) > most:
                 break
         return now
 
@@ -263,7 +277,7 @@ class Question:
         block = np.resize(BLOCKS * row + column, count)
         score = best.rise * (huber(best.error, threshold)[1] * best.error)[:, None]
         sums = np.stack([np.bincount(block, one) for one in score.T], axis=1)
-        return np.asarray(inverse @ (sums.T @ sums) @ inverse)[:3, :3]
+        return np.asarray(SPREAD * inverse @ (sums.T @ sums) @ inverse)[:3, :3]
 
 
 def locate(
@@ -279,7 +293,10 @@ def locate(
 
 def search(question: Question, maps: dict[bytes, FieldMap]) -> Location:
     """From the lattice's best places to the candidates, and what is known of the likeliest."""
-    first = [question.descend(start, quick=True) for start in question.starts(maps)]
+    first, most = list[Found](), np.inf
+    for start in question.starts(maps):
+        first.append(question.descend(start, quick=True, most=most))
+        most = min(most, GIVEN_UP * first[-1].loss(first[-1].threshold))
     threshold = min(one.threshold for one in first)
     first.sort(key=lambda one: one.loss(threshold))
     least, found, rest = first[0].loss(threshold), list[Found](), list[Found]()
@@ -287,7 +304,7 @@ def search(question: Question, maps: dict[bytes, FieldMap]) -> Location:
         if one.loss(threshold) >= FOLLOWED * least:
             rest.append(one)
         elif not one.near(first[: first.index(one)]):
-            found.append(question.descend(one.unknown, quick=False))
+            found.append(question.descend(one.unknown, quick=False, near=one))
     best = min(found, key=lambda one: one.loss(threshold))
     ahead = {id(one): least - best.loss(threshold) for one in rest}  # what all effects would bring them too
     spread = best.loss(threshold) / max(len(best.error) - len(best.unknown), 1)

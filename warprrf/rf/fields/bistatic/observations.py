@@ -41,7 +41,7 @@ from warprrf.rf.spectra.readings import Readings, fading_db, path_weights, quest
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, to_db
 from warprrf.rf.tracing.model import SETS, Effects, Layout, Model, Parameters
 from warprrf.rf.tracing.records import Bins, Materials
-from warprrf.rf.tracing.render import path_gains
+from warprrf.rf.tracing.render import PathGains, path_gains
 from warprrf.rf.tracing.tracer import SPECULAR, View
 
 OWN_GAIN = -2
@@ -239,8 +239,12 @@ class Observation:
 
     def predicted(self, model: Model, materials: Materials) -> np.ndarray:
         """Readings under a model of groups, residual and gains included, in units of the floor, shape ``(N,)``."""
-        power = np.maximum(read(path_gains(self.view, model, materials), self.measured), 0.0) / self.floor
-        return self.gain(model.parameters, power) * power
+        return self.of_gains(path_gains(self.view, model, materials))
+
+    def of_gains(self, gains: PathGains) -> np.ndarray:
+        """The same of the path gains that its view gets."""
+        power = np.maximum(read(gains, self.measured), 0.0) / self.floor
+        return self.gain(gains.parameters, power) * power
 
     @property
     def path(self) -> np.ndarray:

@@ -122,9 +122,7 @@ def learn_errors(
     growth, middle = 0.0, float(np.mean(gaps))
     if len(gaps) >= 4 and np.ptp(gaps) > 0.1:
         growth = float(np.clip(np.polyfit(gaps - middle, np.log(np.maximum(typical, 1e-3)), 1)[0], 0.0, 0.3))
-    return ErrorModel(
-        np.maximum(table, LEAST_DB), np.array(growth), np.array(middle), receivers, covariance
-    )
+    return ErrorModel(np.maximum(table, LEAST_DB), np.array(growth), np.array(middle), receivers, covariance)
 
 
 def _scale(error: np.ndarray) -> float:
