@@ -4,7 +4,8 @@ A pixel's plane is its inverse depth along the optical axis and how that changes
 depth is linear in the image on a plane. With ``A = K_s R K^-1`` and ``b = K_s t`` of another photo, pixel ``p`` lies there
 at ``A (u, v, 1) + b w(p)``. Source: Bleyer, Rhemann and Rother, "PatchMatch Stereo", BMVC 2011; the two colours of a
 chess board are updated in turns as in Galliani, Lasinger and Schindler, "Massively parallel multiview stereopsis by
-surface normal diffusion", ICCV 2015.
+surface normal diffusion", ICCV 2015. That a plane also costs what it contradicts in other photos is of Xu and Tao,
+"Multi-scale geometric consistency guided multi-view stereo", CVPR 2019, as is taking the best of several neighbours.
 """
 
 import warp as wp
@@ -19,11 +20,15 @@ UNKNOWN = wp.constant(2.0)  # cost of what no two photos show: that of opposite 
 BLANK = wp.constant(3.0)  # cost of a window that shows nothing
 SAME = wp.constant(1.0e-3)  # planes whose inverse depths differ by this part of them in a window are one
 SIMILAR = wp.constant(0.06)  # grey values this far from the middle's count 1/e: a window ends at an edge
+STEP = wp.constant(2)  # pixels between samples of a window
 FLAT = wp.constant(1.0e-5)  # variance of a window that shows nothing
-TRIALS = wp.constant(6)  # planes near its best that a pixel tries in a turn, the first at any depth
+REACH = wp.constant(3)  # neighbours in each direction, of which the one of least cost hands on its plane
+TRIALS = wp.constant(3)  # planes near its best that a pixel tries in a turn
 WANDER = wp.constant(
     0.3
 )  # their inverse depths differ by up to this part in the first turn, by half in each next
+LOST = wp.constant(0.5)  # a pixel of more cost tries any depth, once
+UNLIKE = wp.constant(0.02)  # depths of two photos that differ by this part contradict each other in full
 STEEPEST = wp.constant(6.0)  # tangent of a plane's largest angle to the image
 window = wp.types.vector(length=SIDE * SIDE, dtype=wp.float32)
 
@@ -50,8 +55,8 @@ def correlation(
     square = float(0.0)
     product = float(0.0)
     for k in range(SAMPLES):
-        i = float(k % wp.static(SIDE)) - wp.static(0.5 * (SIDE - 1))
-        j = float(k // wp.static(SIDE)) - wp.static(0.5 * (SIDE - 1))
+        i = float(STEP * (k % wp.static(SIDE) - wp.static(SIDE // 2)))
+        j = float(STEP * (k // wp.static(SIDE) - wp.static(SIDE // 2)))
         h = start + across * i + down * j
         if h[2] < 1.0e-6:
             return float(-2.0)
@@ -71,6 +76,27 @@ def correlation(
 
 
 @wp.func
+def contradiction(
+    plane: wp.vec3, u: float, v: float, a: wp.mat33, b: wp.vec3, told: wp.array(dtype=wp.vec3), size: wp.vec3i
+) -> float:
+    """How far the depth that another photo has there is from a plane's, in [0, 1]; 1 where it has none."""
+    h = a * wp.vec3(u, v, 1.0) + b * plane[0]
+    if h[2] < 1.0e-6:
+        return float(1.0)
+    x = h[0] / h[2]
+    y = h[1] / h[2]
+    if x < 0.0 or y < 0.0 or x >= float(size[1]) or y >= float(size[2]):
+        return float(1.0)
+    j = int(x)
+    i = int(y)
+    other = told[size[0] + i * size[1] + j]
+    w = other[0] + other[1] * (x - float(j) - 0.5) + other[2] * (y - float(i) - 0.5)
+    if w < 1.0e-6:
+        return float(1.0)
+    return wp.min(wp.abs(plane[0] / h[2] / w - 1.0) / UNLIKE, 1.0)
+
+
+@wp.func
 def disagreement(
     plane: wp.vec3,
     u: float,
@@ -83,12 +109,16 @@ def disagreement(
     shifts: wp.array(dtype=wp.vec3),
     sizes: wp.array(dtype=wp.vec3i),
     images: wp.array(dtype=wp.float32),
+    told: wp.array(dtype=wp.vec3),
+    contradicting: float,
 ) -> float:
     """One minus the mean of the two best correlations: what hides a surface in some photos does not count."""
     best = float(-2.0)
     second = float(-2.0)
     for s in range(sizes.shape[0]):
         c = correlation(plane, u, v, grey, weight, mean, variance, turns[s], shifts[s], images, sizes[s])
+        if contradicting > 0.0 and c > -1.5:
+            c = c - contradicting * contradiction(plane, u, v, turns[s], shifts[s], told, sizes[s])
         if c > best:
             second = best
             best = c
@@ -113,6 +143,8 @@ def match(
     shifts: wp.array(dtype=wp.vec3),
     sizes: wp.array(dtype=wp.vec3i),
     images: wp.array(dtype=wp.float32),
+    told: wp.array(dtype=wp.vec3),
+    contradicting: float,
     planes: wp.array(dtype=wp.vec3),
     costs: wp.array(dtype=wp.float32),
 ):
@@ -125,6 +157,8 @@ def match(
         settled: planes of less cost stay.
         size: of the photo: where it begins in ``images``, its width and its height.
         turns, shifts, sizes: ``A``, ``b`` and size of each photo that it is compared with.
+        told: planes that all photos have so far, as ``images`` are laid out.
+        contradicting: cost of a plane that contradicts the one that is told of another photo.
     """
     n = offset + wp.tid()
     width = size[1]
@@ -145,8 +179,8 @@ def match(
     weight = window()
     whole = float(0.0)
     for k in range(SAMPLES):
-        x = wp.clamp(j + k % wp.static(SIDE) - wp.static(SIDE // 2), 0, width - 1)
-        y = wp.clamp(i + k // wp.static(SIDE) - wp.static(SIDE // 2), 0, height - 1)
+        x = wp.clamp(j + STEP * (k % wp.static(SIDE) - wp.static(SIDE // 2)), 0, width - 1)
+        y = wp.clamp(i + STEP * (k // wp.static(SIDE) - wp.static(SIDE // 2)), 0, height - 1)
         grey[k] = images[size[0] + y * width + x]
         weight[k] = wp.exp(-wp.abs(grey[k] - middle) / SIMILAR)
         whole = whole + weight[k]
@@ -162,20 +196,46 @@ def match(
         return
     best = planes[here]
     if turn < 0:
-        costs[here] = disagreement(best, u, v, grey, weight, mean, variance, turns, shifts, sizes, images)
+        costs[here] = disagreement(
+            best, u, v, grey, weight, mean, variance, turns, shifts, sizes, images, told, contradicting
+        )
         return
-    for k in range(8):
-        far = 1 + 4 * (k // 4)
-        x = j + far * wp.where(k % 4 == 0, 1, wp.where(k % 4 == 1, -1, 0))
-        y = i + far * wp.where(k % 4 == 2, 1, wp.where(k % 4 == 3, -1, 0))
-        if x >= 0 and y >= 0 and x < width and y < height:
+    for k in range(4):
+        y = int(-1)
+        x = int(-1)
+        least = float(UNKNOWN)
+        for m in range(REACH):
+            far = 1 + 4 * m  # odd: of the other colour
+            xm = j + far * (wp.where(k == 0, 1, 0) - wp.where(k == 1, 1, 0))
+            ym = i + far * (wp.where(k == 2, 1, 0) - wp.where(k == 3, 1, 0))
+            if xm >= 0 and ym >= 0 and xm < width and ym < height:
+                c = costs[ym * width + xm]
+                if c < least:
+                    least = c
+                    x = xm
+                    y = ym
+        if y >= 0:
             other = planes[y * width + x]
             w = other[0] + other[1] * float(j - x) + other[2] * float(i - y)
             bend = wp.abs(other[1] - best[1]) + wp.abs(other[2] - best[2])
-            new = wp.abs(w - best[0]) + wp.static(0.5 * SIDE) * bend > SAME * best[0]
+            new = wp.abs(w - best[0]) + wp.static(1.0 * SIDE) * bend > SAME * best[0]
             if new and w > bounds[0] and w < bounds[1]:
                 trial = wp.vec3(w, other[1], other[2])
-                c = disagreement(trial, u, v, grey, weight, mean, variance, turns, shifts, sizes, images)
+                c = disagreement(
+                    trial,
+                    u,
+                    v,
+                    grey,
+                    weight,
+                    mean,
+                    variance,
+                    turns,
+                    shifts,
+                    sizes,
+                    images,
+                    told,
+                    contradicting,
+                )
                 if c < cost:
                     cost = c
                     best = trial
@@ -183,14 +243,16 @@ def match(
     reach = WANDER * wp.pow(0.5, float(turn))
     for k in range(TRIALS):
         w = best[0] * (1.0 + reach * wp.randf(state, -1.0, 1.0))
-        if k == 0:
+        if k == 0 and turn == 0 and cost > LOST:
             w = bounds[0] + (bounds[1] - bounds[0]) * wp.randf(state)
         limit = STEEPEST * slope * w
         dx = wp.clamp(best[1] + reach * 4.0 * slope * w * wp.randf(state, -1.0, 1.0), -limit, limit)
         dy = wp.clamp(best[2] + reach * 4.0 * slope * w * wp.randf(state, -1.0, 1.0), -limit, limit)
         if w > bounds[0] and w < bounds[1]:
             trial = wp.vec3(w, dx, dy)
-            c = disagreement(trial, u, v, grey, weight, mean, variance, turns, shifts, sizes, images)
+            c = disagreement(
+                trial, u, v, grey, weight, mean, variance, turns, shifts, sizes, images, told, contradicting
+            )
             if c < cost:
                 cost = c
                 best = trial

@@ -87,6 +87,19 @@ def test_right_depths_stay_as_they_are(room, spoiled, found):
     assert (error < 0.02).mean() > 0.97
 
 
+def test_rough_depths_become_as_exact_as_photos_allow(room):
+    """Squares of 8 pixels, each off by 5 % rms; seen from 9 degrees aside a pixel is 5 % of the depth: half
+    are found to a tenth of it."""
+    cameras, true, photos = room
+    rng = np.random.default_rng(4)
+    rough = [t * np.exp(0.05 * rng.normal(size=(15, 20))).repeat(8, 0).repeat(8, 1) for t in true]
+    result = np.array(mended(rough, cameras, photos))
+    shown = patterned(room) & (result > 0)
+    error = np.abs(result / np.array(true) - 1)[shown]
+    assert np.median(np.abs(np.array(rough) / np.array(true) - 1)[shown]) > 0.03
+    assert np.median(error) < 0.005 and np.percentile(error, 90) < 0.02
+
+
 def test_a_plain_wall_keeps_its_depth(room, spoiled, found):
     plain = (shown_x(room) > PLAIN_X - 1e-6) & ~spoiled[1]
     assert plain.sum() > 5000

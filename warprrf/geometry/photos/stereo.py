@@ -1,9 +1,9 @@
-"""Depth maps mended by the photos: where they show no common texture at a depth but do at another, the other is right.
+"""Depth of every pixel by comparison of photos: a small plane for each, which several photos and their own planes confirm.
 
-Depth maps of Gaussians are exact where planes were known, and vague elsewhere. Every pixel's depth is compared in the
-photos that show its place from aside; pixels that disagree look for a better one
-(:mod:`warprrf.kernels.patch_match`), which counts where the maps of other photos confirm it. What others see through
-is left out.
+Depth maps of Gaussians are exact where planes were known, and vague elsewhere. They are where the search starts
+(:mod:`warprrf.kernels.patch_match`): each photo is compared with those that show its places from aside, at every pixel;
+then once more, where a plane also costs what it contradicts the planes that the others found. A depth that two photos
+found takes the place of the old one; what one sees through is left out.
 """
 
 from __future__ import annotations
@@ -23,46 +23,14 @@ from warprrf.kernels.patch_match import UNKNOWN, match
 
 LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 GOOD_ANGLE_DEG = 9.0  # between two lines of sight: less tells depths badly, more changes what a window shows
-
-DOWNSCALE = 2  # photos are compared at the depth maps' size divided by this
 SOURCES = 3  # photos that one is compared with
-TURNS = 2  # how often planes are handed on between pixels
-SETTLED = 0.2  # a depth of less cost (one minus a correlation) stays as it is
-PROVED = 0.6  # depths of more cost prove nothing
-GAIN = 0.05  # by which a new depth has to cost less than the old one
-CHECKED, AGREED = 8, 2  # maps of other photos that a depth is checked against, and how many must agree on it
-TOLERANCE = 0.02  # up to this part of the range two depths agree
-
-
-@dataclass(frozen=True)
-class _Map:
-    """A depth map of small planes.
-
-    Attributes:
-        camera: its camera.
-        planes: inverse depth along the optical axis [1/m] and its change per pixel in a row and a column,
-            ``(H, W, 3)``.
-        proved: photos agree there.
-        better: and do so clearly more than on the plane that was there before.
-    """
-
-    camera: Camera
-    planes: np.ndarray
-    proved: np.ndarray
-    better: np.ndarray
-
-    def ranges(self) -> np.ndarray:
-        """Euclidean ranges [m], 0 where nothing is proved."""
-        return np.where(self.proved, 1 / (self.planes[..., 0] * ahead(self.camera)), 0.0)
-
-    def at(self, view: Camera) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-        """Which pixels of the map the pixels of ``view``, the same photo in another size, fall into, and their ranges."""
-        x = (np.arange(view.width) + 0.5) * self.camera.width / view.width
-        y = (np.arange(view.height) + 0.5) * self.camera.height / view.height
-        place = np.ix_(y.astype(int), x.astype(int))
-        plane = self.planes[place]
-        w = plane[..., 0] + plane[..., 1] * (x % 1 - 0.5) + plane[..., 2] * (y % 1 - 0.5)[:, None]
-        return place, 1 / (np.maximum(w, 1e-6) * ahead(view))
+ROUNDS = ((range(3), 0.0), (range(3, 4), 0.3))
+"""Turns in which planes are handed on between pixels, finer and finer ones, and what it costs to contradict another photo's
+plane in full: first photos alone, then each knows what the others found."""
+SETTLED = 0.05  # a plane of less cost (one minus a correlation) stays as it is
+PROVED = 0.6  # planes of more cost prove nothing
+CHECKED = 8  # maps of other photos that a depth is checked against
+TOLERANCE = 0.015  # up to this part of the range two depths that photos found agree; one of Gaussians, up to twice as much
 
 
 def mended(
@@ -73,38 +41,41 @@ def mended(
     progress: Progress,
     device: DeviceLike = None,
 ) -> list[np.ndarray]:
-    """Depth maps with what photos prove wrong replaced by what they prove, or left out.
+    """Depth maps of what photos prove, and elsewhere of what was there, where no photo sees through it.
 
     Args:
         depths: ranges [m], ``(height, width)`` of each of ``views``, 0 where unknown.
         views: cameras of the photos, of any size.
         photos: one a view, in this order.
     """
-    cameras = [v.resized(max(2, v.width // DOWNSCALE), max(2, v.height // DOWNSCALE)) for v in views]
-    coarse = [_sampled(depth, camera) for depth, camera in zip(depths, cameras, strict=True)]
-    known = [depth[depth > 0] for depth in coarse]
+    known = [depth[depth > 0] for depth in depths]
     if sum(map(len, known)) == 0:
         return list(depths)
     near, far = np.percentile(np.concatenate(known), [0.5, 99.5])
     bounds = 1 / (1.6 * float(far)), 1 / (0.6 * float(near))
-    comparison = _Comparison.of(cameras, photos, bounds, device)
-    maps = []
-    for k, depth in enumerate(coarse):
-        progress("stereo", k, len(coarse))
-        others = _companions(k, cameras, coarse, comparison.sharpness, SOURCES)
-        maps.append(comparison.map_of(k, depth, others))
-    progress("stereo", len(coarse), len(coarse))
-    ranges = [found.ranges() for found in maps]
+    comparison = _Comparison.of(views, photos, bounds, device)
+    others = [_companions(k, views, depths, comparison.sharpness, SOURCES) for k in range(len(views))]
+    started = [comparison.start(k, depth) for k, depth in enumerate(depths)]
+    planes = list(started)
+    work, costs = len(ROUNDS) * len(views), [np.zeros(0)] * len(views)
+    for number, (turns, contradicting) in enumerate(ROUNDS):
+        told = comparison.upload(planes)
+        for k, others_of in enumerate(others):
+            progress("stereo", number * len(views) + k, work)
+            planes[k], costs[k] = comparison.match(k, planes[k], others_of, told, turns, contradicting)
+    progress("stereo", work, work)
+    found = []
+    for k, (view, depth, plane) in enumerate(zip(views, depths, planes, strict=True)):
+        moved = (plane[..., 0] != started[k][..., 0]) | (depth == 0)
+        there = np.where(moved, 1 / (np.maximum(plane[..., 0], 1e-6) * ahead(view)), depth)
+        found.append(np.where((costs[k] < PROVED) & comparison.kept[k], there, 0.0))
     result = []
     for k, (view, depth) in enumerate(zip(views, depths, strict=True)):
-        others = _companions(k, cameras, coarse, np.ones(len(cameras)), CHECKED)
-        pairs = [(cameras[s], ranges[s]) for s in others]
-        agreed, _ = _votes(ranges[k], cameras[k], pairs, TOLERANCE)
-        place, fine = maps[k].at(view)
-        right = (maps[k].better & (agreed >= AGREED))[place]
-        _, crossed = _votes(coarse[k], cameras[k], pairs, 2 * TOLERANCE)
-        wrong = (crossed >= AGREED)[place]
-        result.append(np.where(right, fine, np.where(wrong, 0.0, depth)))
+        checked = _companions(k, views, depths, np.ones(len(views)), CHECKED)
+        maps = [(views[s], found[s]) for s in checked]
+        agreed, _ = _votes(found[k], view, maps, TOLERANCE)
+        _, crossed = _votes(depth, view, maps, 2 * TOLERANCE)
+        result.append(np.where(agreed > 0, found[k], np.where(crossed > 0, 0.0, depth)))
     return result
 
 
@@ -169,15 +140,41 @@ class _Comparison:
         sharpness = np.clip(blur / max(float(np.median(blur)), 1e-12), 0.3, 1.5)
         return cls(cameras, sizes, flat, kept, sharpness, bounds, where)
 
-    def map_of(self, view: int, depth: np.ndarray, others: np.ndarray) -> _Map:
-        """The map of one photo, from ``depth`` and comparison with ``others``."""
+    def start(self, view: int, depth: np.ndarray) -> np.ndarray:
+        """Planes along a depth map, ``(H, W, 3)``; at any depth where it is unknown."""
+        known = depth > 0
+        w = np.where(known, 1 / np.where(known, depth * ahead(self.cameras[view]), 1.0), 0.0)
+        planes = np.stack([w, *np.gradient(w)[::-1]], axis=-1)
+        bent = ~known | (np.abs(planes[..., 1:]).max(axis=-1) > 0.05 * w)  # across an edge
+        planes[bent, 1:] = 0.0
+        planes[~known, 0] = np.random.default_rng(view).uniform(*self.bounds, (~known).sum())
+        return planes.astype(np.float32)
+
+    def upload(self, planes: Sequence[np.ndarray]) -> wp.array:
+        """Planes of all photos, flat."""
+        return wp.array(np.concatenate([p.reshape(-1, 3) for p in planes]), dtype=wp.vec3, device=self.device)
+
+    def match(
+        self,
+        view: int,
+        first: np.ndarray,
+        others: np.ndarray,
+        told: wp.array,
+        turns: range,
+        contradicting: float,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Better planes ``(H, W, 3)`` of one photo than ``first``, by comparison with ``others``, and their costs ``(H, W)``.
+
+        Args:
+            told: planes of all photos (see :meth:`upload`).
+            turns: in which planes are handed on between pixels.
+            contradicting: cost of a plane that contradicts what is told of another photo.
+        """
         camera, device = self.cameras[view], self.device
-        first = self._start(depth, camera, view)
-        nothing = np.zeros(depth.shape, dtype=bool)
         if len(others) < 2:
-            return _Map(camera, first, nothing, nothing)
+            return first, np.full(first.shape[:2], float(UNKNOWN))
         planes = wp.array(first.reshape(-1, 3), dtype=wp.vec3, device=device)
-        costs = wp.full(depth.size, float(UNKNOWN), dtype=wp.float32, device=device)
+        costs = wp.full(len(planes), float(UNKNOWN), dtype=wp.float32, device=device)
         inverse = np.linalg.inv(_lens(camera))
         turn = [self.cameras[s].rotation @ camera.rotation.T for s in others]
         shift = [
@@ -185,14 +182,14 @@ class _Comparison:
             for s, r in zip(others, turn, strict=True)
         ]
         lenses = [_lens(self.cameras[s]) for s in others]
-        turns = np.array([k @ r @ inverse for k, r in zip(lenses, turn, strict=True)], dtype=np.float32)
+        rotations = np.array([k @ r @ inverse for k, r in zip(lenses, turn, strict=True)], dtype=np.float32)
         shifts = np.array([k @ t for k, t in zip(lenses, shift, strict=True)], dtype=np.float32)
         sources = [
-            wp.array(turns, dtype=wp.mat33, device=device), wp.array(shifts, dtype=wp.vec3, device=device),
-            wp.array(self.sizes[others], dtype=wp.vec3i, device=device), self.grey, planes, costs,
+            wp.array(rotations, dtype=wp.mat33, device=device), wp.array(shifts, dtype=wp.vec3, device=device),
+            wp.array(self.sizes[others], dtype=wp.vec3i, device=device), self.grey, told, contradicting,
+            planes, costs,
         ]  # fmt: skip
-        before = np.zeros(0)
-        for number in range(-1, TURNS):
+        for number in (-1, *turns):
             for colour in (0, 1):
                 settings = [
                     colour, number, view, 1 / camera.fx, wp.vec2(*self.bounds), SETTLED,
@@ -200,22 +197,7 @@ class _Comparison:
                 ]  # fmt: skip
                 count = camera.height * ((camera.width + 1) // 2)
                 launch(match, count, [*settings, *sources], device=device, grain=32)
-            if number < 0:
-                before = costs.numpy().reshape(depth.shape).copy()
-        cost = costs.numpy().reshape(depth.shape)
-        proved = (cost < PROVED) & self.kept[view]
-        better = proved & ((cost < before - GAIN) | (depth <= 0))
-        return _Map(camera, planes.numpy().reshape(first.shape).astype(np.float64), proved, better)
-
-    def _start(self, depth: np.ndarray, camera: Camera, view: int) -> np.ndarray:
-        """Planes along a depth map; at any depth where it is unknown."""
-        known = depth > 0
-        w = np.where(known, 1 / np.where(known, depth * ahead(camera), 1.0), 0.0)
-        planes = np.stack([w, *np.gradient(w)[::-1]], axis=-1)
-        bent = ~known | (np.abs(planes[..., 1:]).max(axis=-1) > 0.05 * w)  # across an edge
-        planes[bent, 1:] = 0.0
-        planes[~known, 0] = np.random.default_rng(view).uniform(*self.bounds, (~known).sum())
-        return planes.astype(np.float32)
+        return planes.numpy().reshape(first.shape), costs.numpy().reshape(first.shape[:2])
 
 
 def _lens(camera: Camera) -> np.ndarray:
