@@ -1,6 +1,7 @@
 """Paths as a function of ends, orientations and materials: the values of `trace_paths`, in NumPy, on Warp's tape and in torch;
 slopes of what is traced anew."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -261,3 +262,14 @@ def test_a_retraced_slope_is_a_central_difference():
         retraced_slope(lambda at: 0.0, [1.0, 2.0, 3.0])
     with pytest.raises(ValueError, match="step_m"):
         retraced_slope(lambda at: at, [1.0, 2.0, 3.0], step_m=0)
+
+
+def test_a_pickle_brings_back_what_answers_the_same():
+    held = wr.paths.trace_specular(room(), receivers=RX, **ASKED)
+    again = pickle.loads(pickle.dumps(held))
+    np.testing.assert_array_equal(again.receiver, held.receiver)
+    moved = RX + 0.001
+    np.testing.assert_array_equal(again.evaluate(receivers=moved).gain, held.evaluate(receivers=moved).gain)
+    assert (
+        repr(again) == repr(held) == f"SpecularPaths({len(held)} to {len(RX)} receivers at {F / 1e9:g} GHz)"
+    )

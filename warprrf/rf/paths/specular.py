@@ -83,6 +83,7 @@ class SpecularPaths:
         device: wp.Device,
     ) -> None:
         self.receiver, self.frequency_hz, self.device = found.receiver, frequency_hz, device
+        self._made_of = found, offset, material
         self._traced, self._shape = {name: traced[name] for name in TYPES}, found.patch.shape
         mirrors = found.patch >= 0
         self._there = mirrors | (found.slab >= 0)
@@ -113,6 +114,13 @@ class SpecularPaths:
 
     def __len__(self) -> int:
         return self._shape[0]
+
+    def __repr__(self) -> str:
+        receivers = self._traced["receivers"].shape[0]
+        return f"SpecularPaths({len(self)} to {receivers} receivers at {self.frequency_hz / 1e9:g} GHz)"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _put_together, (self._made_of, self.parameters, self.frequency_hz, str(self.device))
 
     def evaluate(
         self,
@@ -253,3 +261,15 @@ def fixed_parameters(
         }
     found |= dict.fromkeys(POSITIONS[2:], np.zeros((1, 3)))
     return {name: wp.array(array, dtype=TYPES[name], device=device) for name, array in found.items()}
+
+
+def _put_together(
+    made_of: tuple[MirrorPaths, np.ndarray, np.ndarray],
+    parameters: Mapping[str, np.ndarray],
+    frequency_hz: float,
+    device: str,
+) -> SpecularPaths:
+    """What a pickle holds of :class:`SpecularPaths`, on the device that it was on."""
+    where = _device.resolve(device)
+    traced = {name: wp.array(value, dtype=TYPES[name], device=where) for name, value in parameters.items()}
+    return SpecularPaths(*made_of, traced, frequency_hz, where)
