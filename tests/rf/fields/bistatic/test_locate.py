@@ -123,3 +123,28 @@ def test_slopes_hold_near_where_they_were_taken(scene, field):
     np.testing.assert_allclose(near.error, anew.error, atol=1e-5)
     np.testing.assert_array_equal(near.sloped, there.unknown)
     assert not np.allclose(anew.rise, there.rise)
+
+
+def test_slopes_are_taken_anew_farther_away_than_they_were_taken_over(scene, field, monkeypatch):
+    errors, gone = Question.errors, []
+
+    def watched(question, unknown, step_m, *, quick, near=None):
+        if near is not None:
+            gone.append(np.linalg.norm((unknown - near.sloped)[:3]) / near.step_m)
+        return errors(question, unknown, step_m, quick=quick, near=near)
+
+    monkeypatch.setattr(Question, "errors", watched)
+    field.locate(furnished.spectra(scene, UNSEEN[:1]))
+    Question(field, as_data(field, furnished.spectra(scene, UNSEEN[:1]))).descend(UNSEEN[0] + 0.6, quick=True)
+    assert gone and max(gone) < 1.0
+
+
+def test_most_places_lie_within_their_ellipsoid(scene, field):
+    """Of 95 %, from another engine's spectra; nor is it many times too large."""
+    places = np.concatenate([UNSEEN, OTHERS, [[2.6, 1.1, 1.0], [3.4, 3.2, 1.8], [1.2, 1.9, 2.1]]])
+    ds, squares = furnished.spectra(scene, places), []
+    for k, true in enumerate(places):
+        found = field.locate(ds.subset([k]))
+        off = found.position - true
+        squares.append(off @ np.linalg.solve(found.covariance, off))
+    assert np.mean(np.array(squares) < 7.81) > 0.6 and np.median(squares) > 0.5
