@@ -18,6 +18,42 @@ def _measurements() -> str:
     return markdown(("fitted to", *(title for _, title, _ in columns)), lines)
 
 
+@entry("headline-less")
+def _headline_less() -> str:
+    rows = read("measurements")["rows"]
+    one, horn, power = (
+        next(r for r in rows if r["readings"] == name) for name in ("1 spectrum, mean of 20", "horn", "power")
+    )
+    at = read("locate")["rows"]
+    lines = [
+        ["one spectrum, of 60 x 120 pixels", f"spectra: PSNR {one['psnr_db']:.1f} dB"],
+        ["a horn's readings at ten places, its gain unknown", f"spectra: PSNR {horn['psnr_db']:.1f} dB"],
+        ["total power at 50 places, the meter's gain unknown", f"total power: {power['total_rms_db']:.1f} dB rms"],
+        *(
+            [f"50 spectra; what a new receiver reads: {r['measured'].replace(', true mesh', '')}",
+             f"where it is: {r['median_cm']:.0f} cm in the median, {r['p90_cm']:.0f} cm for nine of ten"]
+            for r in at
+        ),
+    ]  # fmt: skip
+    return markdown(("known", "found at receivers that no fit has seen"), lines)
+
+
+@entry("headline-measured")
+def _headline_measured() -> str:
+    found, lines = read("measured_flat"), []
+    for held_out in dict.fromkeys(r["held_out"] for r in found["rows"]):
+        rows = [r for r in found["rows"] if r["held_out"] == held_out]
+        field = find(rows, model="field")
+        others = [r for r in rows if not r["model"].startswith(("field", "traced"))]
+        best = min(others, key=lambda r: r["rms_db"])
+        noise = found["noise"]["all"]["halves_by_time"]
+        rival = f"{best['rms_db']:.1f} ({best['model']})"
+        lines.append(
+            [f"flat, Bluetooth, one {held_out} held out", show(field and field["rms_db"]), rival, show(noise)]
+        )
+    return markdown(("measured power, error [dB rms]", "field", "best simple rival", "noise"), lines)
+
+
 @entry("suggest")
 def _suggest() -> str:
     found = read("suggest")
@@ -113,6 +149,21 @@ def _office() -> str:
         for r in read("office")["rows"]
     ]
     return markdown(("carrier [GHz]", "spectra", "receivers", *(title for _, title, _ in columns)), lines)
+
+
+@entry("reciprocal")
+def _reciprocal() -> str:
+    rows, lines = read("reciprocal")["rows"], []
+    keys = "psnr_db", "psnr_db_reciprocal", "psnr_db_blocked", "psnr_db_blocked_reciprocal"
+    for geometry, truth in dict.fromkeys((r["geometry"], r["truth"]) for r in rows):
+        cells = []
+        for count in (10, 50):
+            all_, own, blocked, blocked_own = (
+                show(find(rows, geometry=geometry, truth=truth, n_train=count)[k]) for k in keys
+            )
+            cells.append(f"{all_} / {own} ({blocked} / {blocked_own})")
+        lines.append([geometry, truth, *cells])
+    return markdown(("geometry", "truth", "10 spectra", "50 spectra"), lines)
 
 
 @entry("arrays")
