@@ -58,8 +58,8 @@ def build(real: type) -> Any:
 
     @wp.func
     def slab(eta: vec2, thickness: real, c: real, mirrors: wp.bool):
-        """What a slab of ``thickness`` wavelengths makes of a field at cosine ``c``: (TE, TM) that it reflects, or lets through less
-        the phase of the way through, and by how many wavelengths that way is longer than in air; eqs. (37a), (37b), (43a),
+        """What a slab of ``thickness`` wavelengths makes of a field at cosine ``c``: (TE, TM) that it reflects, or lets through
+        less the phase of the way through, and by how many wavelengths that way is longer than in air; eqs. (37a), (37b), (43a),
         (43b), (44)."""
         one = vec2(real(1.0), real(0.0))
         root = root_of(eta - (real(1.0) - c * c) * one)
