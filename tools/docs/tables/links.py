@@ -95,22 +95,7 @@ def _city_paths() -> str:
         for r in found["scenes"]
         if r["gain_apart"]
     ]
-    return "\n\n".join(
-        [markdown(head, lines), *apart, *_roofs([r["roofs"] for r in found["scenes"] if r.get("roofs")])]
-    )
-
-
-def _roofs(cities: list[dict[str, int]]) -> list[str]:
-    """What share of places the library takes for places in a building; nothing without cities."""
-    if not cities:
-        return []
-    roofed, indoors, under_sky, wrong = (
-        sum(city[key] for city in cities) for key in ("roofed", "roofed_refused", "open", "open_refused")
-    )
-    return [
-        f"Of {roofed} places below a roof in {len(cities)} scenes with streets {100 * indoors / roofed:.1f} % are taken for "
-        f"places in a building (others are passages), of {under_sky} under the sky {100 * wrong / under_sky:.2f} %."
-    ]
+    return "\n\n".join([markdown(head, lines), *apart])
 
 
 @entry("city-verbs")

@@ -1,4 +1,4 @@
-"""What a field is fitted to: readings, arrays, meshes without names, links of a flat; walls; which effects a scene needs."""
+"""What a field is fitted to: readings, arrays, meshes without names, links of a flat; walls; limits; which effects a scene needs."""
 
 from __future__ import annotations
 
@@ -164,6 +164,12 @@ def _reciprocal() -> str:
             cells.append(f"{all_} / {own} ({blocked} / {blocked_own})")
         lines.append([geometry, truth, *cells])
     return markdown(("geometry", "truth", "10 spectra", "50 spectra"), lines)
+
+
+@entry("limits")
+def _limits() -> str:
+    lines = [[r["what"], f"{r['figure']} {r['unit']}", r["date"]] for r in read("limits")["rows"]]
+    return markdown(("what", "figure", "stated on"), lines)
 
 
 @entry("arrays")
