@@ -1,4 +1,4 @@
-"""What a field is fitted to: readings, arrays, meshes without names, links of a flat; walls; limits; which effects a scene needs."""
+"""What a field is fitted to (readings, arrays, meshes without names, links of a flat), walls, limits, and effects of a scene."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def _headline_less() -> str:
         ["a horn's readings at ten places, its gain unknown", f"spectra: PSNR {horn['psnr_db']:.1f} dB"],
         ["total power at 50 places, the meter's gain unknown", f"total power: {power['total_rms_db']:.1f} dB rms"],
         *(
-            [f"50 spectra; what a new receiver reads: {r['measured'].replace(', true mesh', '')}",
-             f"where it is: {r['median_cm']:.0f} cm in the median, {r['p90_cm']:.0f} cm for nine of ten"]
-            for r in at
+            [f"{', '.join(['50 spectra', *given])}; of the new receiver: {seen}",
+             f"its position: error {r['median_cm']:.0f} cm (median), {r['p90_cm']:.0f} cm (90th percentile)"]
+            for r, (seen, *given) in ((r, r["measured"].split(", ")) for r in at)
         ),
     ]  # fmt: skip
-    return markdown(("known", "found at receivers that no fit has seen"), lines)
+    return markdown(("known", "predicted for receivers held out"), lines)
 
 
 @entry("headline-measured")
@@ -49,9 +49,9 @@ def _headline_measured() -> str:
         noise = found["noise"]["all"]["halves_by_time"]
         rival = f"{best['rms_db']:.1f} ({best['model']})"
         lines.append(
-            [f"flat, Bluetooth, one {held_out} held out", show(field and field["rms_db"]), rival, show(noise)]
+            [f"Bluetooth, one {held_out} held out", show(field and field["rms_db"]), rival, show(noise)]
         )
-    return markdown(("measured power, error [dB rms]", "field", "best simple rival", "noise"), lines)
+    return markdown(("error [dB rms]", "radio field", "best simple model", "noise of the measurement"), lines)
 
 
 @entry("suggest")

@@ -63,9 +63,10 @@ def _headline() -> str:
     head = [f"{room}: {name}" for room, own in shown.values() for name, *_ in own]
     old = {r["method"] for r in older_runs()}.intersection(("bistatic", "rf3dgs+", "rf3dgs", "nearest"))
     said = "".join(
-        f"\n\n*Runs of {NAMES[m].strip('*')} are older than what it computes today.*" for m in sorted(old)
+        f"\n\n*Runs of {NAMES[m].strip('*')} are of earlier code: today's figures may differ.*"
+        for m in sorted(old)
     )
-    return markdown(("100 spectra of Sionna RT", *head), lines) + said
+    return markdown(("trained on 100 spectra", *head), lines) + said
 
 
 @entry("paper-psnr")
