@@ -126,7 +126,10 @@ def _paper_margins() -> str:
             for r in sorted(rows, key=lambda r: list(NAMES).index(r["method"]))
         ]
         if lines:
-            head = (f"{name}, 100 spectra: ours less", *(f"{label}, all / blocked" for label, *_ in forms))
+            head = (
+                f"{name}, 100 spectra: bistatic minus",
+                *(f"{label}, all / blocked" for label, *_ in forms),
+            )
             parts.append(markdown(head, lines))
     return "\n\n".join(parts)
 
@@ -157,7 +160,14 @@ def _paper_behind() -> str:
         counts, differences = zip(*sorted(found), strict=True)
         worst = f"{max(differences, key=abs):+.2g}"
         lines.append([place, method, figure, ", ".join(map(str, counts)), worst])
-    return text + ":\n\n" + markdown(("truth", "behind", "in", "spectra", "by at most"), lines)
+    return (
+        text
+        + ":\n\n"
+        + markdown(
+            ("truth", "behind which method", "in which score", "at how many spectra", "largest difference"),
+            lines,
+        )
+    )
 
 
 @entry("paper-detail")
@@ -187,11 +197,14 @@ def _paper_detail() -> str:
 @entry("paper-statement")
 def _paper_statement() -> str:
     published = {r["method"]: r["psnr_db"] for r in read("published")["rows"]}
-    parts = [f"The paper reports RF-3DGS+ {published['rf3dgs+'] - published['rf3dgs']:.1f} dB above RF-3DGS."]
+    parts = []
     for truth, name in PAPER_TRUTHS.items():
         own = [r["psnr_db"]["difference"] for r in read("law")["sizes"] if r["truth"] == truth]
-        parts.append(f"{name[0].upper()}{name[1:]}: {sum(own) / len(own):+.1f} dB over {len(own)} sizes.")
-    return " ".join(parts)
+        parts.append(f"{name}, {sum(own) / len(own):+.1f} dB ({len(own)} numbers of spectra)")
+    return (
+        f"The paper reports RF-3DGS+ {published['rf3dgs+'] - published['rf3dgs']:.1f} dB above RF-3DGS. Here the mean difference "
+        f"in PSNR, RF-3DGS+ minus RF-3DGS, is: {'; '.join(parts)}."
+    )
 
 
 @entry("paper-runs")
@@ -199,13 +212,13 @@ def _paper_runs() -> str:
     hashes = {r["truth"]: r["data"] for r in runs()} | {"paper-law": read("law")["data"]}
     data = "; ".join(f"{name} {hashes[truth]}" for truth, name in PAPER_TRUTHS.items())
     missing_runs = read("paper")["missing"]
-    left = f" Missing runs: {len(missing_runs)}." if missing_runs else ""
+    left = f" Runs not made: {len(missing_runs)}." if missing_runs else ""
     rooms = {r["room"] for r in runs() if r["truth"] in ("exact", "sionna")}
     if old := older_runs():
-        names = " and ".join(dict.fromkeys(NAMES[r["method"]].strip("*") for r in old))
-        left += f" **{len(old)} of {len(runs())} runs, of {names}, are older than what these compute today.**"
-    made = f" Reconstructions of the lobby, from the same photos, behind the rows: {len(rooms)}."
-    return f"Data, by the hash of the file: {data}.{made}{left}"
+        names = "; ".join(dict.fromkeys(NAMES[r["method"]].strip("*") for r in old))
+        left += f" **{len(old)} of {len(runs())} runs ({names}) are of earlier code: today's figures may differ.**"
+    made = f" The lobby's rows are of {len(rooms)} reconstructions from the same photos."
+    return f"Data files by their hash: {data}.{made}{left}"
 
 
 @entry("paper-networks")
@@ -224,7 +237,7 @@ def _paper_networks() -> str:
         if (r["truth"], r["split"]) == (truth, split)
     ]  # fmt: skip
     head = (
-        "network", "truth", "spectra", "training [min]", "on", "last loss over first", "last loss over that at half time",
+        "network", "truth", "spectra", "training [min]", "on", "last loss / first", "last loss / at half time",
         "PSNR [dB]", "LPIPS",
     )  # fmt: skip
     text = (
@@ -272,7 +285,7 @@ def _published() -> str:
 
 @entry("law")
 def _law() -> str:
-    words = {"exact": "power that scatters as it does", "paper-law": "given the paper's factor, path by path"}
+    words = {"paper-law": "made with the paper's factor, path by path"}
     lines = [
         [
             words.get(r["truth"], PLACES.get((r["truth"], "random"), r["truth"])), str(r["count"]),
