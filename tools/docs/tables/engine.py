@@ -94,7 +94,14 @@ def _engine_rays() -> str:
         ]
         for r in read("engine")["rays"]
     ]  # fmt: skip
-    head = ("mesh", "faces", "rays", "million a second", "by Warp's hierarchy", "over bare Embree")
+    head = (
+        "mesh",
+        "faces",
+        "rays",
+        "million rays/s",
+        "by Warp's hierarchy: million rays/s",
+        "ratio to bare Embree",
+    )
     return markdown(head, lines)
 
 
@@ -123,8 +130,8 @@ def _leaves(found: Row, prefix: str = "") -> Iterable[tuple[str, float]]:
 @entry("truths")
 def _truths() -> str:
     head = (
-        "engine", "processor seconds of a spectrum", "noise, rms [dB]", "total over the first row's [dB]",
-        "least time at its noise, over its",
+        "engine", "processor seconds of a spectrum", "noise, rms [dB]", "total power relative to the first row [dB]",
+        "least time at the exact engine's noise, over its time",
     )  # fmt: skip
     lines = [
         [

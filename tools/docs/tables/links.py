@@ -14,7 +14,17 @@ def _map() -> str:
         lines.append([f"field, {r['rays']} rays a cell, up to {r['mirrors']} mirrors{mean}", *_map_errors(r)])
     for r in found["sionna"]:
         lines.append([f"RadioMapSolver, {r['samples']:.0e} samples", *_map_errors(r)])
-    return markdown(("map", "rms [dB]", "median [dB]", "line of sight", "blocked", "core seconds"), lines)
+    return markdown(
+        (
+            "map",
+            "error, rms [dB]",
+            "median [dB]",
+            "line of sight: rms [dB]",
+            "blocked: rms [dB]",
+            "core seconds",
+        ),
+        lines,
+    )
 
 
 def _map_errors(r: Row) -> list[str]:
@@ -157,8 +167,8 @@ def _person() -> str:
         "person",
         (
             ("x", "from the transmitter [m]", "{:g}"), ("deepest_db", "deepest [dB]", "{:.1f}"),
-            ("screen_db", "P.526 [dB]", "{:.1f}"),
-            ("shadow_rms_db", "in the shadow: rms [dB]", "{:.2f}"), ("shadow_most_db", "largest [dB]", "{:.2f}"),
+            ("screen_db", "P.526: deepest [dB]", "{:.1f}"),
+            ("shadow_rms_db", "difference in the shadow: rms [dB]", "{:.2f}"), ("shadow_most_db", "largest [dB]", "{:.2f}"),
         ),
     )  # fmt: skip
 

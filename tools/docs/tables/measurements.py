@@ -11,10 +11,14 @@ def _measurements() -> str:
     columns = (
         ("psnr_db", "PSNR [dB]", "{:.1f}"), ("direction_within_3deg_blocked", "blocked: within 3 degrees", "{:.0%}"),
         ("beam_gain_loss_db", "beam loss [dB]", "{:.2f}"), ("total_rms_db", "total power, rms [dB]", "{:.2f}"),
-        ("total_rms_db_blocked", "blocked", "{:.2f}"), ("gain_error_db", "chain's gain off [dB]", "{:+.2f}"),
-        ("zero_error_deg", "zero off [degrees]", "{:+.1f}"), ("named", "named", "{}"),
+        ("total_rms_db_blocked", "blocked: total power, rms [dB]", "{:.2f}"),
+        ("gain_error_db", "error of the chain's gain [dB]", "{:+.2f}"),
+        ("zero_error_deg", "error of the azimuths' zero [degrees]", "{:+.1f}"), ("named", "wrong readings named", "{}"),
     )  # fmt: skip
-    lines = [[r["readings"], *(show(r.get(key), form) for key, _, form in columns)] for r in found["rows"]]
+    lines = [
+        [r["readings"].replace("asked", "scored"), *(show(r.get(key), form) for key, _, form in columns)]
+        for r in found["rows"]
+    ]
     return markdown(("fitted to", *(title for _, title, _ in columns)), lines)
 
 
@@ -65,21 +69,18 @@ def _suggest() -> str:
         for r in found["rows"]
     ]  # fmt: skip
     wanted = "blocked: within 3 degrees", "beam loss [dB]", "total power, rms [dB]"
-    return markdown(("spectra of", "draws", "PSNR [dB]", "spread", *wanted), lines)
+    return markdown(("spectra of", "draws", "PSNR [dB]", "spread [dB]", *wanted), lines)
 
 
 @entry("locate")
 def _locate() -> str:
     head = (
-        "located from",
-        "receivers",
-        "median [cm]",
-        "90th percentile",
-        "blocked: median",
-        "90th percentile",
-    )
+        "located from, room", "receivers", "error, median [cm]", "90th percentile [cm]", "blocked: median [cm]",
+        "blocked: 90th percentile [cm]",
+    )  # fmt: skip
     further = (
-        "beyond 30 cm", "within 95 % ellipsoid", "core seconds each", "nearest measurement [cm]", "multilateration",
+        "beyond 30 cm", "within the 95 % ellipsoid", "core seconds each", "nearest measurement: median [cm]",
+        "multilateration: median [cm]",
     )  # fmt: skip
     keys = ("median_cm", "p90_cm", "blocked_median_cm", "blocked_p90_cm")
     lines = [
@@ -95,7 +96,9 @@ def _locate() -> str:
 
 @entry("place")
 def _place() -> str:
-    head = "transmitters", "of candidates", "chosen: worst tenth [dB]", "one added at a time", "core seconds"
+    head = (
+        "transmitters", "candidates", "best set: worst tenth [dB]", "one added at a time: worst tenth [dB]", "core seconds",
+    )  # fmt: skip
     lines = [
         [
             str(r["n"]),
@@ -111,10 +114,15 @@ def _place() -> str:
 @entry("flat")
 def _flat() -> str:
     found = read("measured_flat")
-    head = ("held out", "model", "rms [dB]", "in sight", "behind walls", "worst held out")
+    head = ("held out", "model", "error, rms [dB]", "in sight", "behind walls", "worst anchor or room")
     keys = ("rms_db", "seen_db", "behind_db", "worst_db")
     lines = [
-        [f"one {r['held_out']}", r["model"], *(show(r[key], "{:.2f}") for key in keys)] for r in found["rows"]
+        [
+            f"one {r['held_out']}",
+            r["model"].replace("either", "diffraction and transmission"),
+            *(show(r[key], "{:.2f}") for key in keys),
+        ]
+        for r in found["rows"]
     ]
     return markdown(head, lines)
 
@@ -130,13 +138,22 @@ def _flat_noise() -> str:
         ]
         for name, r in ((n, found[n]) for n in ("all", "in sight", "behind walls"))
     ]
-    return markdown(("links", "means", "noise of a mean [dB]", "without drift", "of a single reading"), lines)
+    return markdown(
+        (
+            "links",
+            "means",
+            "noise of a mean, halves by time [dB]",
+            "halves by chance (no drift)",
+            "of a single reading",
+        ),
+        lines,
+    )
 
 
 @entry("office")
 def _office() -> str:
     columns = (
-        ("psnr_db", "PSNR [dB]", "{:.1f}"), ("perfect_db", "of a model without error", "{:.1f}"),
+        ("psnr_db", "PSNR [dB]", "{:.1f}"), ("perfect_db", "PSNR of a model without error [dB]", "{:.1f}"),
         ("total_rms_db", "total power, rms [dB]", "{:.2f}"), ("direction_within_3deg", "within 3 degrees", "{:.0%}"),
     )  # fmt: skip
     lines = [
@@ -183,7 +200,7 @@ def _arrays() -> str:
         ]
         for r in found["rows"]
     ]
-    head = ("carrier [GHz]", "prediction", "PSNR [dB]", "over the nearest [dB]", "where blocked [dB]")
+    head = ("carrier [GHz]", "prediction", "PSNR [dB]", "over the nearest [dB]", "PSNR, blocked [dB]")
     return markdown(head, lines)
 
 
@@ -191,7 +208,7 @@ def _arrays() -> str:
 def _bare_mesh() -> str:
     found = read("bare_mesh")
     meshes = {"named": "names", "bare": "no names, no colours", "scan": "the same, scanned"}
-    head = ("room", "truth", "spectra", "mesh", "PSNR [dB]", "lost [dB]", "where blocked [dB]")
+    head = ("room", "truth", "spectra", "mesh", "PSNR [dB]", "lost [dB]", "PSNR, blocked [dB]")
     lines = []
     for r in found["rows"]:
         figures = (show(r["psnr_db"]), show(r["lost_db"], "{:.2f}"), show(r["psnr_db_blocked"]))
