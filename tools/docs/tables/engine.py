@@ -113,9 +113,22 @@ def _gpu() -> str:
     parts = []
     for file in files:
         found = json.loads(file.read_text())
-        lines = [[name, f"{value:.4g}"] for name, value in _leaves(found) if "kernels" not in name]
+        lines = [_in_unit(name, value) for name, value in _leaves(found) if "kernels" not in name]
         parts += [f"**{found['machine']['device']}**", markdown(("figure", "value"), lines)]
     return "\n\n".join(parts)
+
+
+def _in_unit(name: str, value: float) -> list[str]:
+    """A figure with the unit that its name ends in."""
+    for end, scale, unit in (
+        (" per s", 1e-6, "million a second"),
+        (" s", 1e3, "ms"),
+        (": seconds", 1e3, "ms"),
+        (" m", 1.0, "m"),
+    ):
+        if name.endswith(end):
+            return [name.removesuffix(end), f"{scale * value:.4g} {unit}"]
+    return [name, str(value) if isinstance(value, int) else f"{value:.3g}"]
 
 
 def _leaves(found: Row, prefix: str = "") -> Iterable[tuple[str, float]]:
