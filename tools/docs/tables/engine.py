@@ -95,13 +95,8 @@ def _engine_rays() -> str:
         for r in read("engine")["rays"]
     ]  # fmt: skip
     head = (
-        "mesh",
-        "faces",
-        "rays",
-        "million rays/s",
-        "by Warp's hierarchy: million rays/s",
-        "ratio to bare Embree",
-    )
+        "mesh", "faces", "rays", "million rays/s", "by Warp's hierarchy: million rays/s", "ratio to bare Embree",
+    )  # fmt: skip
     return markdown(head, lines)
 
 
@@ -120,12 +115,13 @@ def _gpu() -> str:
 
 def _in_unit(name: str, value: float) -> list[str]:
     """A figure with the unit that its name ends in."""
-    for end, scale, unit in (
+    units = (
         (" per s", 1e-6, "million a second"),
         (" s", 1e3, "ms"),
         (": seconds", 1e3, "ms"),
         (" m", 1.0, "m"),
-    ):
+    )
+    for end, scale, unit in units:
         if name.endswith(end):
             return [name.removesuffix(end), f"{scale * value:.4g} {unit}"]
     return [name, str(value) if isinstance(value, int) else f"{value:.3g}"]

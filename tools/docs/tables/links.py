@@ -14,17 +14,10 @@ def _map() -> str:
         lines.append([f"field, {r['rays']} rays a cell, up to {r['mirrors']} mirrors{mean}", *_map_errors(r)])
     for r in found["sionna"]:
         lines.append([f"RadioMapSolver, {r['samples']:.0e} samples", *_map_errors(r)])
-    return markdown(
-        (
-            "map",
-            "error, rms [dB]",
-            "median [dB]",
-            "line of sight: rms [dB]",
-            "blocked: rms [dB]",
-            "core seconds",
-        ),
-        lines,
-    )
+    head = (
+        "map", "error, rms [dB]", "median [dB]", "line of sight: rms [dB]", "blocked: rms [dB]", "core seconds",
+    )  # fmt: skip
+    return markdown(head, lines)
 
 
 def _map_errors(r: Row) -> list[str]:

@@ -12,10 +12,7 @@ def _lobby_geometry() -> str:
     rows = [
         ("photos posed", f"{g['posed']} of {g['photos']}"),
         ("PSNR of photos held out", f"{r['photo_psnr_db']:.1f} dB"),
-        (
-            "PSNR of two renderings of one photo that differ in noise alone",
-            f"{r['photo_noise_psnr_db']:.1f} dB",
-        ),
+        ("PSNR of two renderings of one photo with other noise", f"{r['photo_noise_psnr_db']:.1f} dB"),
         (
             f"camera positions, rms error, scale from {g['surveyed']} surveyed ones",
             f"{1e3 * r['camera_rms_m']:.1f} mm",
@@ -161,12 +158,9 @@ def _transmitter() -> str:
         for r in read("transmitter")["second"]
     ]  # fmt: skip
     head = (
-        "model, ten spectra",
-        "PSNR, fitted transmitter [dB]",
-        "PSNR, another one [dB]",
-        "its within 3°",
+        "model, ten spectra", "PSNR, fitted transmitter [dB]", "PSNR, another one [dB]", "its within 3°",
         "its within 3°, blocked",
-    )
+    )  # fmt: skip
     return markdown(head, lines)
 
 

@@ -118,12 +118,11 @@ def _flat() -> str:
     keys = ("rms_db", "seen_db", "behind_db", "worst_db")
     lines = [
         [
-            f"one {r['held_out']}",
-            r["model"].replace("either", "diffraction and transmission"),
+            f"one {r['held_out']}", r["model"].replace("either", "diffraction and transmission"),
             *(show(r[key], "{:.2f}") for key in keys),
         ]
         for r in found["rows"]
-    ]
+    ]  # fmt: skip
     return markdown(head, lines)
 
 
@@ -138,16 +137,10 @@ def _flat_noise() -> str:
         ]
         for name, r in ((n, found[n]) for n in ("all", "in sight", "behind walls"))
     ]
-    return markdown(
-        (
-            "links",
-            "means",
-            "noise of a mean, halves by time [dB]",
-            "halves by chance (no drift)",
-            "of a single reading",
-        ),
-        lines,
-    )
+    head = (
+        "links", "means", "noise of a mean, halves by time [dB]", "halves by chance (no drift)", "of a single reading",
+    )  # fmt: skip
+    return markdown(head, lines)
 
 
 @entry("office")

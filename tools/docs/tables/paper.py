@@ -63,8 +63,7 @@ def _headline() -> str:
     head = [f"{room}: {name}" for room, own in shown.values() for name, *_ in own]
     old = {r["method"] for r in older_runs()}.intersection(("bistatic", "rf3dgs+", "rf3dgs", "nearest"))
     said = "".join(
-        f"\n\n*Runs of {NAMES[m].strip('*')} are of earlier code: today's figures may differ.*"
-        for m in sorted(old)
+        f"\n\n*Runs of {NAMES[m].strip('*')} are of earlier code: today's may differ.*" for m in sorted(old)
     )
     return markdown(("trained on 100 spectra", *head), lines) + said
 
@@ -126,10 +125,8 @@ def _paper_margins() -> str:
             for r in sorted(rows, key=lambda r: list(NAMES).index(r["method"]))
         ]
         if lines:
-            head = (
-                f"{name}, 100 spectra: bistatic minus",
-                *(f"{label}, all / blocked" for label, *_ in forms),
-            )
+            first = f"{name}, 100 spectra: bistatic minus"
+            head = (first, *(f"{label}, all / blocked" for label, *_ in forms))
             parts.append(markdown(head, lines))
     return "\n\n".join(parts)
 
@@ -160,14 +157,8 @@ def _paper_behind() -> str:
         counts, differences = zip(*sorted(found), strict=True)
         worst = f"{max(differences, key=abs):+.2g}"
         lines.append([place, method, figure, ", ".join(map(str, counts)), worst])
-    return (
-        text
-        + ":\n\n"
-        + markdown(
-            ("truth", "behind which method", "in which score", "at how many spectra", "largest difference"),
-            lines,
-        )
-    )
+    head = ("truth", "behind", "in which score", "at how many spectra", "largest difference")
+    return f"{text}:\n\n{markdown(head, lines)}"
 
 
 @entry("paper-detail")
