@@ -3,7 +3,6 @@ and none has never run on one."""
 
 import pytest
 import warp as wp
-
 from fuzz import calls
 from fuzz.place import Place
 
