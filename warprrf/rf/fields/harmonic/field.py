@@ -204,10 +204,11 @@ class HarmonicField(RadioField):
         )
         seen = blank._seen_from(receivers, progress) if transport is None else transport
         rule = chosen.transmittance
-        if seen.shape != blank.shape or seen.rule != rule or not np.array_equal(seen.receivers, receivers):
+        got, wanted = (seen.shape, seen.rule, seen.gaussians), (blank.shape, rule, len(gaussians))
+        if got != wanted or not np.array_equal(seen.receivers, receivers):
             raise ValueError(
-                f"transport: got weights of {len(seen.receivers)} receivers, shape {seen.shape}, rule {seen.rule!r}; "
-                f"expected those of exactly the {len(receivers)} receivers of ds, shape {blank.shape}, rule {rule!r}"
+                f"transport: got weights of {len(seen.receivers)} receivers, (shape, rule, Gaussians) = {got}; expected those "
+                f"of exactly the {len(receivers)} receivers of ds, {wanted}"
             )
         ready = time.perf_counter()
         trained = _train(blank, ds, images, seen.on(device), checkpoint=chosen.checkpoint, progress=progress)
