@@ -116,3 +116,16 @@ def test_rays_move_their_ends_and_what_they_met(box, device):
     with counted_copies(device) as counted:
         box.visible(a, b, device=device)
     assert counted["up"] == 100 * 48 and counted["down"] == 100
+
+
+def test_weights_made_on_the_cpu_are_copied_and_give_the_same_field(box, spectra, device):
+    """But for rounding: a CPU blends blocks of pixels, a GPU each of its own."""
+    g, train = discs_on_mesh(box, SIZES[0]), spectra.subset(range(3))
+    room, how = wr.Reconstruction(g, box), {"iterations": 5, "device": device}
+    seen = transport(g, train.receivers, SHAPE, range_db=train.range_db, device="cpu")
+    here, copied = (
+        wr.RadioField.fit(room, train, "rf3dgs+", transport=given, **how).layers["gain"]
+        for given in (None, seen)
+    )
+    assert np.abs(here).max() > 1.0
+    assert np.allclose(here, copied, atol=1e-3)
