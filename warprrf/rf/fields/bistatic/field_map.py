@@ -159,8 +159,8 @@ def best_on_map(
         _table if one.departure is None and one.delay_s is None else _profiles
     )  # fmt: skip
     power, floor, chain, parts, columns, turns = read(one, maps, chains)
-    floor_db, places = 10.0 * np.log10(floor), len(parts[0][1])
-    db = np.maximum(10.0 * np.log10(np.maximum(power, 1e-300)), floor_db)
+    floor_db, places = (10.0 * np.log10(floor)).astype(np.float32), len(parts[0][1])
+    db = np.maximum(10.0 * np.log10(np.maximum(power, 1e-300)), floor_db).astype(np.float32)
     known, heard = np.full(len(db), -1) if chain is None else chain, db > floor_db
     least, turn, gains = np.full(places, np.inf), np.zeros(places), np.zeros((places, len(chains) + 1))
     for by, own in zip(turns, columns, strict=True):
@@ -170,7 +170,9 @@ def best_on_map(
         for c in np.unique(known[heard & (known >= 0)]):
             gain[:, c] = (db - found)[:, (known == c) & heard].mean(axis=1)
             found[:, known == c] += gain[:, c, None]
-        error = np.abs(np.maximum(found, floor_db) - db).mean(axis=1)
+        np.maximum(found, floor_db, out=found)
+        found -= db
+        error = np.abs(found, out=found).mean(axis=1)
         better = error < least
         least[better], turn[better], gains[better] = error[better], by, gain[better]
     return least, turn, gains[:, : len(chains)]

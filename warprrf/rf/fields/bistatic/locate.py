@@ -35,6 +35,8 @@ from warprrf.rf.tracing.tracer import Tracer
 
 STARTS = 2  # places of the lattice that are searched from; in a lobby the best one is within it of the truth
 STEPS = 4, 3  # most Gauss-Newton steps, first with single mirrors, then with all effects
+LONGER = 1.6
+"""Times a Gauss-Newton step: with errors that count linearly it goes about half the way, and below 2 it cannot overshoot for good."""
 LONGEST_M, SHORTEST_M = 0.35, 3e-3  # steps: none is longer, and shorter ones are the last
 FIRST_DIFFERENCE_M, DIFFERENCE_M = 0.1, 0.04
 """First and least: half of the last step between. Over shorter ones the noise of few rays looks like slopes."""
@@ -44,13 +46,14 @@ SUB_PIXELS = (
     2,
 )  # square root of the rays a pixel, first and to the end: the noise of few rays moves the least loss
 SMOOTH = 3  # pixels of a spectrum that slopes are means over, along each axis: noise of slopes would pass for curvature
-HUBER = 3.0  # standard deviations
-LEAST_STD_DB = 0.3  # of a pixel: no field is so exact that tenths of a decibel tell places apart
+HUBER = 1.0  # standard deviations
+LEAST_STD_DB = 2.0
+"""Of a pixel: where an edge stands some centimetres off, pixels that are known to tenths are wrong by ten decibels."""
 BLOCKS = 12
 """Along each axis of a spectrum, whose errors hang together: what one edge in the wrong place spoils."""
-SPREAD = 1.8
+SPREAD = 4.0
 """Of a spectrum's covariance: blocks are not all that hangs together. By 20 receivers of a lobby, none of them fitted to or tested:
-half of their squared errors, and 95 of 100, were 1.7 and 1.9 times what blocks say."""
+half of their squared errors were 4 times what blocks say."""
 GIVEN_UP = 2.0  # times the least loss of an earlier start: others are left where they leave more
 FOLLOWED = 1.4  # times the least loss: candidates are followed below
 SAME_M = 0.1  # candidates nearer than this are one
@@ -154,15 +157,14 @@ class Question:
         return all(a is b for a, b in zip(self.coarse, self.data, strict=True))
 
     def _weight(self, one: Measured) -> np.ndarray | None:
-        """By what errors of a spectrum's pixels are multiplied before they count as those of readings do."""
+        """By what errors of a spectrum's pixels are multiplied before they count as those of readings do: where rows crowd
+        at the poles, many pixels have one error, so that squares count by solid angle."""
         if not isinstance(one, SpectrumDataset):
             return None
         db = NEPER * np.log1p(np.nan_to_num(one.path_gain[0].astype(float)) / one.floor)
-        known = self.field.errors
-        return (
-            NOISE_DB
-            / (np.maximum(known.table[bins(db)], LEAST_STD_DB) if known else np.full(db.shape, NOISE_DB))
-        ).ravel()
+        known, sine = self.field.errors, np.sin((np.arange(len(db)) + 0.5) * np.pi / len(db))[:, None]
+        std = np.maximum(known.table[bins(db)], LEAST_STD_DB) if known else np.full(db.shape, NOISE_DB)
+        return np.asarray(NOISE_DB / std * np.sqrt(sine / sine.mean())).ravel()
 
     def starts(self, maps: dict[bytes, FieldMap]) -> np.ndarray:
         """Unknowns at the places of a lattice that suit best and lie apart, shape ``(S, U)``."""
@@ -258,7 +260,7 @@ class Question:
             threshold = now.threshold
             curvature, gradient = now.normal(threshold)
             diagonal = np.diag(curvature) + 1e-9 * np.trace(curvature)
-            step = -np.linalg.solve(curvature + damping * np.diag(diagonal), gradient)
+            step = -LONGER * np.linalg.solve(curvature + damping * np.diag(diagonal), gradient)
             step *= min(1.0, LONGEST_M / max(float(np.linalg.norm(step[:3])), 1e-12))
             while not self.field.mesh.visible(now.unknown[None, :3], (now.unknown + 1.1 * step)[None, :3])[0]:
                 step *= 0.5  # not through walls
