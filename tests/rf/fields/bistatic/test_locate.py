@@ -10,7 +10,7 @@ from furnished import RECEIVERS
 import warprrf as wr
 from warprrf.rf.fields.bistatic.field_map import maps_of
 from warprrf.rf.fields.bistatic.locate import Question, as_data
-from warprrf.rf.spectra.spectrum import directions_from_angles, sub_pixel_directions
+from warprrf.rf.spectra.spectrum import directions_from_angles, pixel_solid_angles, sub_pixel_directions
 from warprrf.rf.tracing.render import path_gains
 
 UNSEEN = np.array([[3.9, 2.0, 1.4], [1.7, 3.1, 1.2]])
@@ -168,6 +168,14 @@ def test_receivers_traced_at_once_get_what_each_gets_alone(field):
         np.testing.assert_array_equal(found.view.receivers, alone.view.receivers)
         np.testing.assert_array_equal(found.view.hits.face, alone.view.hits.face)
         np.testing.assert_allclose(found.view.paths.arrival, alone.view.paths.arrival, atol=1e-12)
+
+
+def test_squares_of_pixels_count_by_solid_angle(scene, field):
+    one = furnished.spectra(scene, UNSEEN[:1])
+    even = replace(one, path_gain=np.full_like(one.path_gain, 1e-12))
+    (weight,) = Question(field, as_data(field, even)).weights
+    share = weight.reshape(one.shape) ** 2 / pixel_solid_angles(one.shape)[:, None]
+    np.testing.assert_allclose(share, share.mean(), rtol=1e-6)
 
 
 def test_slopes_hold_near_where_they_were_taken(scene, field):

@@ -29,14 +29,14 @@ from warprrf.rf.fields.location import Location
 from warprrf.rf.positions import beside, quotients
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings
-from warprrf.rf.spectra.spectrum import Spectrum
+from warprrf.rf.spectra.spectrum import Spectrum, pixel_solid_angles
 from warprrf.rf.tracing.render import PathGains, path_gains
 from warprrf.rf.tracing.tracer import Tracer
 
 STARTS = 2  # places of the lattice that are searched from; in a lobby the best one is within it of the truth
 STEPS = 4, 3  # most Gauss-Newton steps, first with single mirrors, then with all effects
 LONGER = 1.6
-"""Times a Gauss-Newton step: with errors that count linearly it goes about half the way, and below 2 it cannot overshoot for good."""
+"""Times a Gauss-Newton step, which goes about half the way where most errors count linearly; twice would be the most."""
 LONGEST_M, SHORTEST_M = 0.35, 3e-3  # steps: none is longer, and shorter ones are the last
 FIRST_DIFFERENCE_M, DIFFERENCE_M = 0.1, 0.04
 """First and least: half of the last step between. Over shorter ones the noise of few rays looks like slopes."""
@@ -162,9 +162,9 @@ class Question:
         if not isinstance(one, SpectrumDataset):
             return None
         db = NEPER * np.log1p(np.nan_to_num(one.path_gain[0].astype(float)) / one.floor)
-        known, sine = self.field.errors, np.sin((np.arange(len(db)) + 0.5) * np.pi / len(db))[:, None]
+        known, area = self.field.errors, pixel_solid_angles(db.shape)[:, None]
         std = np.maximum(known.table[bins(db)], LEAST_STD_DB) if known else np.full(db.shape, NOISE_DB)
-        return np.asarray(NOISE_DB / std * np.sqrt(sine / sine.mean())).ravel()
+        return np.asarray(NOISE_DB / std * np.sqrt(area / area.mean())).ravel()
 
     def starts(self, maps: dict[bytes, FieldMap]) -> np.ndarray:
         """Unknowns at the places of a lattice that suit best and lie apart, shape ``(S, U)``."""
