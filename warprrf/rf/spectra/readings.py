@@ -34,7 +34,7 @@ from warprrf.checks import (
     users_level,
 )
 from warprrf.rf.em.absorption import Air
-from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT, check_frequency
+from warprrf.rf.em.waves import NEPER, check_frequency
 from warprrf.rf.spectra.antenna import Antenna, Pattern, as_antenna, main_lobe, turned_gain
 from warprrf.rf.spectra.levels import FADING_DB, MARGIN_DB, free_space_gain, question_levels
 
@@ -220,14 +220,6 @@ class Readings(PowerTable):
     def zero_known(self) -> bool:
         """Whether azimuths and delays count from known zeros."""
         return self.azimuth_known and self.clock_known
-
-    def from_zero(self, by: float) -> Readings:
-        """The same, ``by`` added to what counts from an unknown zero: to azimuths [rad], or to delays, as length [m]."""
-        if self.arrival is not None and not self.azimuth_known:
-            return replace(self, arrival=self.arrival + [0.0, by], azimuth_known=True)
-        if self.delay_s is not None and not self.clock_known:
-            return replace(self, delay_s=self.delay_s + by / SPEED_OF_LIGHT, clock_known=True)
-        return self
 
     def without_side_lobes(self) -> Readings:
         """The same of antennas with nothing but their main lobes; see :func:`main_lobe`."""

@@ -24,6 +24,7 @@ from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT
 from warprrf.rf.fields.base import Measured
 from warprrf.rf.fields.bistatic.field_map import SPACING_M, FieldMap, best_on_map, coarse, maps_of
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, Place, as_list, huber, kinds_of, places_of
+from warprrf.rf.fields.bistatic.placing import from_zero
 from warprrf.rf.fields.bistatic.uncertainty import bins
 from warprrf.rf.fields.location import Location
 from warprrf.rf.positions import beside, quotients
@@ -187,7 +188,7 @@ class Question:
         """The data with zeros put right."""
         found: list[Any] = list(self.coarse if quick else self.data)
         for k, by in zip(self.turned, unknown[3:], strict=False):
-            found[k] = found[k].from_zero(by)
+            found[k] = from_zero(found[k], by)
         return found
 
     def errors(self, unknown: np.ndarray, step_m: float, *, quick: bool, near: Found | None = None) -> Found:

@@ -57,19 +57,28 @@ def with_zeros(
                 zeros["clock_offset_s"][one.name] = zero / SPEED_OF_LIGHT
             else:
                 zeros["azimuth_zero_deg"][one.name] = float(np.degrees(zero))
-            found[k] = one.from_zero(zero)
+            found[k] = from_zero(one, zero)
     return found, zeros
 
 
+def from_zero(one: Readings, by: float) -> Readings:
+    """The same, ``by`` added to what counts from an unknown zero: to azimuths [rad], or to delays, as length [m]."""
+    if one.arrival is not None and not one.azimuth_known:
+        return replace(one, arrival=one.arrival + [0.0, by], azimuth_known=True)
+    if one.delay_s is not None and not one.clock_known:
+        return replace(one, delay_s=one.delay_s + by / SPEED_OF_LIGHT, clock_known=True)
+    return one
+
+
 def _zero(one: Readings, seen: Sequence[tuple[Place, View]]) -> float:
-    """What to add to azimuths [rad], in (-pi, pi], or to delays [m]; see :meth:`Readings.from_zero`."""
+    """What to add to azimuths [rad], in (-pi, pi], or to delays [m]; see :func:`from_zero`."""
     paths = [(place.rows, *_strongest(view)) for place, view in seen]
     tried = np.linspace(-np.pi, np.pi, STEPS, endpoint=False)
     if one.azimuth_known:
         tried = _clocks(one, paths)
     alike = np.zeros(len(tried))
     for k, by in enumerate(tried):
-        turned = one.from_zero(by)
+        turned = from_zero(one, by)
         for rows, power, *ends in paths:
             expected = path_weights(turned, rows, *ends) @ power
             size = float(np.linalg.norm(expected) * np.linalg.norm(one.power[rows]))
