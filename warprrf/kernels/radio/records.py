@@ -2,8 +2,8 @@
 
 The same coefficients with their phases, of single paths, are in :mod:`warprrf.rf.em.fresnel`.
 
-A record is a power that geometry fixes and up to :data:`MOST` interactions from the transmitter to the receiver. Mirrors
-and slabs multiply Jones matrices in (TE, TM), real: half-spaces have no phase but their sign (ITU-R P.2040-4, eqs. (37a),
+A record is a power that geometry fixes and a few interactions from the transmitter to the receiver. Mirrors and slabs
+multiply Jones matrices in (TE, TM), real: half-spaces have no phase but their sign (ITU-R P.2040-4, eqs. (37a),
 (37b)), and of slabs the sizes of both fields count. Between two of them the axes turn. One interaction may be rough, which
 leaves light unpolarised: a surface that scatters, after Degli-Esposti et al. (2007), or an element that sends what it got
 of others. All records of a table have it in the same column.
@@ -21,8 +21,6 @@ import warp as wp
 from warprrf.cache import once
 from warprrf.kernels.radio import slabs
 
-MOST = 7
-"""Interactions on a record at most."""
 MIRROR, SCATTER, SLAB, SOURCE = 1, 2, 4, 16
 """Kinds of interactions, as far as it has them Sionna RT's: a mirror, a surface that scatters, a slab that is passed, an element
 that sends. 0 for none."""
@@ -194,6 +192,39 @@ def build(real: type) -> Any:
                     wp.adjoint[excess][m.row[g]] += slope / x
 
     @wp.func
+    def shares(t: Table, m: Materials, mirror: wp.array(dtype=real), through: wp.array(dtype=real), i: int):
+        """Product of what materials mirror and let through on record i."""
+        product = real(1.0)
+        for k in range(t.index.shape[1]):
+            if k != t.rough and t.index[i, k] >= 0:
+                if kind_of(t, i, k) == wp.static(MIRROR):
+                    product = product * mirror[m.row[t.index[i, k]]]
+                else:
+                    product = product * through[m.row[t.index[i, k]]]
+        return product
+
+    @wp.func_grad(shares)
+    def adjoint_shares(
+        t: Table,
+        m: Materials,
+        mirror: wp.array(dtype=real),
+        through: wp.array(dtype=real),
+        i: int,
+        adjoint: real,
+    ):
+        """Warp's own adjoint does not go back through a loop of unknown length."""
+        slope = adjoint * shares(t, m, mirror, through, i)
+        for k in range(t.index.shape[1]):
+            if k != t.rough and t.index[i, k] >= 0:
+                row = m.row[t.index[i, k]]
+                if kind_of(t, i, k) == wp.static(MIRROR):
+                    if mirror[row] > real(0.0):
+                        wp.adjoint[mirror][row] += slope / mirror[row]
+                else:
+                    if through[row] > real(0.0):
+                        wp.adjoint[through][row] += slope / through[row]
+
+    @wp.func
     def at(table: wp.array2d(dtype=real), row: int, cosine: real):
         """Row of a table over cosine in [0, 1], interpolated linearly."""
         last = table.shape[1] - 1
@@ -249,15 +280,9 @@ def build(real: type) -> Any:
     ):
         """Power of record i."""
         before = smooth(t, m, excess, i, 0, t.rough)
-        after = smooth(t, m, excess, i, t.rough + 1, wp.static(MOST))
+        after = smooth(t, m, excess, i, t.rough + 1, t.index.shape[1])
         p = t.power[i] * real(0.5) * wp.ddot(before, before) * real(0.5) * wp.ddot(after, after)
-        for k in range(wp.static(MOST)):
-            if k != t.rough and k < t.index.shape[1]:
-                if t.index[i, k] >= 0:
-                    if kind_of(t, i, k) == wp.static(MIRROR):
-                        p = p * mirror[m.row[t.index[i, k]]]
-                    else:
-                        p = p * through[m.row[t.index[i, k]]]
+        p = p * shares(t, m, mirror, through, i)
         if kind_of(t, i, t.rough) == wp.static(SCATTER):
             row = m.row[t.index[i, t.rough]]
             p = p * mixed(t, m, weight, i, row) * unpolarised(m, excess[row], row, t.angle[i, t.rough])
@@ -306,7 +331,7 @@ def build(real: type) -> Any:
                             end = t.rough
                             if k > t.rough:
                                 begin = t.rough + 1
-                                end = wp.static(MOST)
+                                end = t.index.shape[1]
                             run = smooth(t, m, m.excess, i, begin, end)
                             bent = raised(t, m, m.excess, i, begin, end, k)
                             size = wp.ddot(run, run)

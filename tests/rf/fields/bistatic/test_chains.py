@@ -9,7 +9,7 @@ from path_makers import random_directions
 from radio_scenes import joined, mirror_paths
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.kernels.radio.records import MIRROR
+from warprrf.kernels.radio.records import MIRROR, SCATTER, SLAB
 from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.tracing.model import Parameters
 from warprrf.rf.tracing.records import Materials, Records
@@ -49,6 +49,30 @@ def test_a_mirror_met_head_on_has_no_plane_of_incidence():
     normal = np.array([[[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
     share = reflected(np.array([[3.0, 3.0]]), np.ones((1, 2)), turns(stops, normal))
     np.testing.assert_allclose(share, (1.0 / 3.0) ** 4, rtol=1e-12)
+
+
+@pytest.mark.parametrize("rough", [False, True])
+def test_every_interaction_of_a_long_record_counts(rough):
+    """Eight slabs on either side of a surface that scatters, or sixteen and a mirror, met head on; and slopes to their shares."""
+    let_through, other = 0.9, 0.8  # shares of the slabs' material and of what stands in their middle
+    kind = np.full((1, 17), SLAB, np.int32)
+    kind[0, 8] = SCATTER if rough else MIRROR
+    index = (np.arange(17) == 8).astype(np.int32)[None]
+    p = Parameters(
+        np.log(np.full((2, 1), other)),
+        np.log([1.25, 3.0]),
+        np.log([0.5, other]),
+        (0,),
+        log_through=np.log([let_through, 0.5]),
+    )
+    records = Records(np.ones(1), np.zeros(1, np.int32), index, np.tile([1.0, 0.0, 0.0], (1, 17, 1)), kind)
+    materials = Materials(p, (np.zeros(2, complex), np.zeros(2)))
+    one = let_through * (1.0 - 0.2**2) ** 2  # of a face, epsilon_r is 2.25
+    share = other / 9.0 / (np.pi if rough else 1.0)
+    found = records.powers(materials)
+    np.testing.assert_allclose(found, one**16 * share, rtol=1e-12)
+    slope = records.slopes(materials, np.array([0, 4], np.int32), 8)[0] / found
+    np.testing.assert_allclose(slope[[3, 4 if rough else 6]], [16.0, 1.0], rtol=1e-12)
 
 
 @pytest.mark.parametrize(
