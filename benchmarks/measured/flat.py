@@ -8,12 +8,15 @@ outer ones are, and that nothing else stands there. Antennas' patterns, gains an
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import warprrf as wr
-from benchmarks.measured.links import Links, crossings, mean_db
+from benchmarks.measured.links import Links, Place, crossings, mean_db, noise_db
 from warprrf.rf.em.materials import itu_material
 
 FREQUENCY_HZ = 2.44e9
@@ -48,6 +51,12 @@ ROOMS = {
 }
 """Lower and upper corner of each [m]; the rest is the living room. Names are guessed."""
 
+EVERY = wr.Effects(mirrors=2, scatter_mirror=False)
+FIELDS = {
+    "field": EVERY, "field, without diffraction": replace(EVERY, diffractions=0),
+    "field, without either": replace(EVERY, transmissions=0, diffractions=0),
+}  # fmt: skip
+
 
 def scene() -> wr.Scene:
     """The flat: walls as sheets, a floor and a ceiling."""
@@ -65,6 +74,34 @@ def scene() -> wr.Scene:
     of_face = np.repeat([names.index(name) for name, _ in parts], 2)
     materials = [itu_material(itu, name=name, thickness_m=thick) for name, (itu, thick) in MATERIALS.items()]
     return wr.Scene(mesh, materials, of_face, face_object=of_face, object_names=names)
+
+
+def place(folder: Path, seed: int) -> Place:
+    """The flat as measured; ``seed`` is of the halves from whose difference the noise of means is known.
+
+    Raises:
+        FileNotFoundError, ValueError: naming the file that does not fit.
+    """
+    found, readings = links(folder)
+    parts = {"all": np.ones(len(found), bool), "behind walls": found.behind, "in sight": ~found.behind}
+    noise: dict[str, Any] = {"cells": len(np.unique(found.cell)), "links": len(found)} | {
+        name: {"links": int(part.sum())} | noise_db([readings[k] for k in np.flatnonzero(part)], seed)
+        for name, part in parts.items()
+    }
+    every, behind, flat = noise["all"], noise["behind walls"], scene()
+    said = (
+        f"{noise['links']} means of {noise['cells']} cells, {behind['links']} of them behind walls. Noise of a mean, from "
+        f"halves in the order of time: {every['halves_by_time']:.2f} dB, behind walls {behind['halves_by_time']:.2f} dB; from "
+        f"halves by chance: {every['halves_by_chance']:.2f} dB. A single reading scatters by {every['single_reading']:.2f} dB."
+    )
+    traced: dict[str, tuple[wr.Scene, Mapping[str, Any]]] = {
+        "traced": (flat, {"mirror_order": 2, "transmissions": 3, "diffractions": 1}),
+        "traced, without either": (flat, {"mirror_order": 2}),
+    }
+    return Place(
+        str(__doc__).split("\n")[0], (folder,), found, FREQUENCY_HZ, FLOOR_DBM, FEWEST, ("anchor", "room"),
+        traced, {name: (flat, effects) for name, effects in FIELDS.items()}, noise, said,
+    )  # fmt: skip
 
 
 def links(folder: Path) -> tuple[Links, list[np.ndarray]]:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 import warprrf as wr
 from benchmarks.fits import rms
+
+DARK_DB = -300.0  # of what no path reaches
 
 
 @dataclass(frozen=True)
@@ -47,15 +53,53 @@ class Links:
         return np.linalg.norm(self.senders - self.receivers, axis=1)
 
     def subset(self, chosen: np.ndarray) -> Links:
-        """The links named by a mask."""
+        """The links named by a mask or by their numbers."""
         return replace(self, **{name: values[chosen] for name, values in vars(self).items()})
 
     def held_out(self, kinds: Sequence[str]) -> Iterator[tuple[str, str, np.ndarray]]:
-        """What is held out together: its kind, "anchor" or "room", which one, and a mask of its links."""
+        """What is held out together: its kind, "anchor", "pair", "room" or "height", which, and a mask of its links."""
+        own = {"anchor": self.anchor, "pair": self.anchor, "room": self.room, "height": self.receivers[:, 2]}
         for kind in kinds:
-            own = getattr(self, kind)
-            for one in np.unique(own):
-                yield kind, str(one), own == one
+            for which in combinations(np.unique(own[kind]), 2 if kind == "pair" else 1):
+                yield kind, " and ".join(map(str, which)), np.isin(own[kind], which)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A measured place, as the command takes it.
+
+    Attributes:
+        about: what it is, in a sentence.
+        files: what it was read from: files and folders.
+        links: what was measured.
+        frequency_hz: at which paths are traced [Hz].
+        floor_db: the least power that is told from nothing [dB].
+        samples: independent samples of fading that a mean has at least.
+        kinds: what is held out, one at a time: see :meth:`Links.held_out`.
+        traced: rows of sharp paths: the scene as it is known and guessed, and options of their tracing.
+        fields: rows of fields: the scene, and the effects.
+        noise: of the measurement, as figures.
+        said: the same in words.
+        more: figures of this place alone.
+    """
+
+    about: str
+    files: tuple[Path, ...]
+    links: Links
+    frequency_hz: float
+    floor_db: float
+    samples: int
+    kinds: tuple[str, ...]
+    traced: Mapping[str, tuple[wr.Scene, Mapping[str, Any]]]
+    fields: Mapping[str, tuple[wr.Scene, wr.Effects]]
+    noise: Mapping[str, Any]
+    said: str
+    more: Mapping[str, Any] = field(default_factory=dict)
+
+
+def db(power: ArrayLike) -> np.ndarray:
+    """Power in dB, at least :data:`DARK_DB`."""
+    return np.asarray(10.0 * np.log10(np.maximum(power, 10.0 ** (DARK_DB / 10.0))))
 
 
 def mean_db(power_db: np.ndarray) -> float:

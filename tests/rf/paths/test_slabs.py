@@ -69,6 +69,23 @@ def test_one_wall_lets_the_same_through_however_it_is_drawn(how):
     np.testing.assert_allclose(found.tau, expected.tau, rtol=1e-12)
 
 
+def test_five_panes_let_through_what_each_does():
+    """A floor of offices has as many between two ends; one of them asked for too few, and nothing arrives."""
+    panes, part = joined(*(pane(x) for x in np.linspace(-1.0, 1.0, 5)))
+    row = Scene(panes, [GLASS], np.zeros(len(panes.faces), np.int32))
+    straight, once = (
+        p.select(p.interactions.max(axis=1) == 4) for p in (paths(row, most=5), paths(SHEET, most=1))
+    )
+    straight, once = (p.select(p.vertices[:, 0, 2] > 0.5) for p in (straight, once))
+    free = SPEED_OF_LIGHT / F / (4 * np.pi * np.linalg.norm(RX - TX))
+    assert straight.interactions[0, :5].tolist() == [4] * 5 and len(straight.tau) == 1
+    through, of_one = (np.linalg.svd(p.jones[0] / free, compute_uv=False) for p in (straight, once))
+    np.testing.assert_allclose(through, of_one**5, rtol=1e-9)
+    assert len(paths(row, most=4).tau) == 0
+    with pytest.raises(ValueError, match="transmissions"):
+        paths(row, most=9)
+
+
 def test_a_path_through_a_slab_is_what_the_slab_transmits_and_later():
     """Amplitude, and the phase of the whole way: that of air but over the slab, and of the slab's transmission."""
     found = paths(SHEET)

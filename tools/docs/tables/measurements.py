@@ -1,8 +1,12 @@
-"""What a field is fitted to (readings, arrays, meshes without names, links of a flat), walls, limits, and effects of a scene."""
+"""What a field is fitted to (readings, arrays, bare meshes, links of a flat and a floor), walls, limits, effects of a scene."""
 
 from __future__ import annotations
 
-from tables.common import TRUTHS, entry, find, markdown, read, show
+from collections.abc import Sequence
+
+from benchmarks.measured.office import ARRIVALS, NOISE
+from benchmarks.report import cell
+from tables.common import TRUTHS, Row, entry, find, markdown, read, show
 
 
 @entry("measurements")
@@ -140,6 +144,49 @@ def _flat_noise() -> str:
     head = (
         "links", "means", "noise of a mean, halves by time [dB]", "halves by chance (no drift)", "of a single reading",
     )  # fmt: skip
+    return markdown(head, lines)
+
+
+@entry("floor-noise")
+def _floor_noise() -> str:
+    return _columns(NOISE, read("measured_office_noise")["rows"])
+
+
+@entry("floor-heights")
+def _floor_heights() -> str:
+    rows = read("measured_office")["heights"]
+    lines = [[f"{r['height_m']:.1f}", f"{r['later_rms_ns']:.3f}", f"{r['later_most_ns']:.3f}"] for r in rows]
+    return markdown(("receivers at [m]", "straight rays later, rms [ns]", "at most [ns]"), lines)
+
+
+@entry("floor-arrivals")
+def _floor_arrivals() -> str:
+    return _columns(ARRIVALS, read("measured_office")["arrivals"])
+
+
+def _columns(columns: Sequence[tuple[str, str, str]], rows: Sequence[Row]) -> str:
+    lines = [[cell(row[key], form) for key, _, form in columns] for row in rows]
+    return markdown([title for _, title, _ in columns], lines)
+
+
+@entry("floor")
+def _floor() -> str:
+    said = {"pair": "two receivers", "height": "a height"}
+    head = (
+        "held out",
+        "model",
+        "error, rms [dB]",
+        "mean [dB]",
+        "no path",
+        *(f"receiver {k}" for k in range(1, 5)),
+    )
+    lines = [
+        [
+            said[r["held_out"]], r["model"], f"{r['rms_db']:.2f}", f"{r['behind_bias_db']:+.2f}", f"{r['dark']:.0%}",
+            *(f"{r['each_db'][str(k)]:.2f}" for k in range(1, 5)),
+        ]
+        for r in read("measured_office")["rows"]
+    ]  # fmt: skip
     return markdown(head, lines)
 
 

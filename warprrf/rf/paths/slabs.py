@@ -18,6 +18,8 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.fresnel import slab_transmission
 from warprrf.rows import Rows
 
+MOST_SLABS = 8
+"""Most that may be asked for on one way: five partitions stand between the ends of links on a floor of offices."""
 THICKEST_M = 1.0
 """Thicker solids are taken to be hollow, a cabinet's or a room's: two sheets."""
 

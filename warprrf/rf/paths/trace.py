@@ -23,7 +23,7 @@ from warprrf.rf.paths.edge_paths import EdgeFinder, EdgePaths
 from warprrf.rf.paths.images import MOST_CHAINS, MirrorImages
 from warprrf.rf.paths.mirror_paths import MirrorPaths, exact_paths
 from warprrf.rf.paths.path_set import Paths
-from warprrf.rf.paths.slabs import Walls
+from warprrf.rf.paths.slabs import MOST_SLABS, Walls
 from warprrf.rf.paths.specular import OUTPUTS, SpecularPaths, fixed_parameters
 from warprrf.rf.positions import Ends, check_positions, question_unit, warn_of_unmodelled
 
@@ -66,7 +66,7 @@ def trace_paths(
         transmitter, receivers: Positions [m], shapes ``(3,)`` or ``(R, 3)``, row by row.
         frequency_hz: Carrier frequency [Hz].
         mirror_order: Most reflections on one path: 0 and up.
-        transmissions: Most slabs that one path passes, 0 to 3. Of a bare mesh nothing is known to let through.
+        transmissions: Most slabs that one path passes, 0 to 8. Of a bare mesh nothing is known to let through.
         diffractions: Most edges on one path, 0 or 1.
         gas: Absorption of the air in every gain: see :meth:`Paths.with_gas`.
         progress: Called with the stages ``"patches"``, in which the mesh's planes are found, and ``"mirrors"``.
@@ -170,7 +170,7 @@ def _checked_question(
         warn_of_unmodelled(mesh, source, points, frequency_hz=frequency, device=device, **modelled)
     order = check_count("mirror_order", mirror_order, 0)
     most = {
-        "transmissions": check_count("transmissions", transmissions, 0, 3),
+        "transmissions": check_count("transmissions", transmissions, 0, MOST_SLABS),
         "diffractions": check_count("diffractions", diffractions, 0, 1),
     }
     return ends, frequency, order, most

@@ -17,6 +17,7 @@ from warprrf.checks import Expected, check_array, check_arrays, check_count, che
 from warprrf.kernels.radio.records import EXCESS_COLUMN, MIRRORED_COLUMN, THROUGH_COLUMN
 from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.em.materials import NARROWEST_LOBE
+from warprrf.rf.paths.slabs import MOST_SLABS
 
 LOBES = (0, 2, 5, 12, 30)
 """Exponents of the lobe mix; 0 is Lambertian."""
@@ -34,7 +35,7 @@ class Effects:
             metre.
         mirror_scatter: whether mirrors light surfaces that scatter.
         scatter_mirror: whether lit surfaces are seen in mirrors, and through slabs. Sionna RT has no such paths.
-        transmissions: most slabs that a path passes, 0 to 3.
+        transmissions: most slabs that a path passes, 0 to 8.
         diffractions: most edges on a path, 0 or 1; beside one mirror at most, and no scattering.
         residual: whether what surfaces scatter differs within their group.
 
@@ -55,7 +56,7 @@ class Effects:
     def __post_init__(self) -> None:
         check_count("mirrors", self.mirrors, 0, 3)
         check_count("scatterings", self.scatterings, 0, 3)
-        check_count("transmissions", self.transmissions, 0, 3)
+        check_count("transmissions", self.transmissions, 0, MOST_SLABS)
         check_count("diffractions", self.diffractions, 0, 1)
 
 
