@@ -419,8 +419,10 @@ def _train(
         listed = list_responses(gaussians, seen, ds.range_db, progress=progress)
         seen = listed.transport
     factor = blank._factor(np.stack([own.total for own in blank._lengths(seen, blank.transmitter)]))
-    beams = [blank._beam(receiver, blank.transmitter) for receiver in seen.receivers]
-    extra = np.stack([np.zeros(blank.shape) if beam is None else beam for beam in beams])
+    extra = None
+    if options.line_of_sight == "explicit":
+        beams = [blank._beam(receiver, blank.transmitter) for receiver in seen.receivers]
+        extra = np.stack([np.zeros(blank.shape) if beam is None else beam for beam in beams])
     problem = Problem(seen, batch=options.batch, seed=options.seed, device=device)
     plan, gain_unit, delay_unit = targets(options, ds, images, problem, factor, extra)
     channel_steps = 100  # of each delay and AoD channel: they start at means that are nearly right

@@ -154,19 +154,21 @@ class Layer:
     def _data(self, receivers: np.ndarray) -> _BatchTarget:
         """The target of some receivers."""
         p, target, shape = self.problem, self.target, (len(receivers), *self.problem.transport.shape)
+        count = len(receivers) * p.pixels
 
-        def part(values: np.ndarray | None, default: float) -> np.ndarray:
-            own = np.full(shape, default) if values is None else values[receivers]
-            return np.asarray(own, p.precision)
+        def uploaded(values: np.ndarray | None, default: float) -> wp.array:
+            if values is None:
+                return wp.full(count, p.real(default), dtype=p.real, device=p.device)
+            return p.upload(values[receivers].ravel())
 
-        factor, extra = (p.upload(part(*own).ravel()) for own in ((target.factor, 1.0), (target.extra, 0.0)))
-        image = part(target.image, 0.0)
+        factor, extra = uploaded(target.factor, 1.0), uploaded(target.extra, 0.0)
+        image = np.asarray(target.image[receivers], p.precision)
         if target.mask is not None:
-            mask = part(target.mask, 1.0)
-            count = max(float(mask.sum(dtype=np.float64)), 1.0)
-            return _BatchTarget(p.upload(image.ravel()), factor, extra, p.upload(mask.ravel()), None, count)
+            mask = target.mask[receivers]
+            counted = max(float(mask.sum(dtype=np.float64)), 1.0)
+            return _BatchTarget(p.upload(image.ravel()), factor, extra, p.upload(mask.ravel()), None, counted)
         plane = self.loss.plane(image, shape)
-        return _BatchTarget(plane, factor, extra, None, self.loss.moments(plane, shape), image.size)
+        return _BatchTarget(plane, factor, extra, None, self.loss.moments(plane, shape), count)
 
     def _size(self, pixels: wp.array) -> tuple[int, ...]:
         """Receivers, rows and columns of the images that ``pixels`` are."""
@@ -304,13 +306,13 @@ def targets(
     images: np.ndarray,
     problem: Problem,
     factor: np.ndarray,
-    extra: np.ndarray,
+    extra: np.ndarray | None,
 ) -> tuple[dict[str, Target], float, float]:
     """What to fit the spectra ``images`` (R, H, W) of ``ds`` with.
 
     Args:
         factor: what multiplies a pixel's blended gain, shape ``(R, H, W)``.
-        extra: power of an explicit line of sight, shape ``(R, H, W)``.
+        extra: power of an explicit line of sight, shape ``(R, H, W)``; None for none.
 
     Returns:
         Targets of the layers in order: ``gain`` first, then ``delay``, ``aod_x``, ``aod_y``, ``aod_z`` for ``rf3dgs``;
@@ -322,17 +324,18 @@ def targets(
     """
     floor = float(ds.floor)
     blended = factor * problem.transport.pixel_weight
-    above = (images - extra > floor) & (blended > 0)
+    met = blended > 0
+    power = images if extra is None else images - extra
+    above = (power > floor) & met
     if not above.any():
         raise ValueError(
             "ds: got no pixel above the floor where a ray meets a Gaussian; expected spectra with power and "
             "geometry around the receivers"
         )
-    gain_unit = float(np.median((images - extra)[above] / blended[above]))
+    gain_unit = float(np.median(power[above] / blended[above]))
     # Each Gaussian starts from the mean gain, in dB, of the pixels that see it: shadows lie 14 nepers below the median.
-    met = blended > 0
     dark = 0.1  # a pixel below the floor counts as this share of it where logarithms are averaged
-    floored = np.maximum(images - extra, dark * floor)
+    floored = np.maximum(power, dark * floor)
     relative = np.log(floored / np.where(met, blended * gain_unit, np.nan))
     start = np.nan_to_num(problem.weighted_means(relative))
     exponential = options.gain == "exp"
@@ -346,7 +349,7 @@ def targets(
             unit=None if exponential else np.exp(start),
             # in units of the floor, so that float32 works near one
             factor=factor * (gain_unit / floor),
-            extra=extra / floor,
+            extra=None if extra is None else extra / floor,
             low=low - 10 * np.log10(floor),
             high=high - 10 * np.log10(floor),
         )
