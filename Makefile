@@ -24,6 +24,8 @@ BIN := $(abspath $(VENV))/bin
 RUN := $(BIN)/python
 # Python compiles what is imported when it is: a small part of what is installed.
 INSTALL := $(RUN) -m pip install -q --no-compile
+# Two workers have a core each: threads of BLAS would wait for one another.
+PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(RUN) -m pytest -n 2 --dist loadfile
 ARGS ?=
 
 # Compiled kernels are kept in the checkout, so that they survive from one command to the next.
@@ -79,10 +81,10 @@ docs: $(VENV)/.test
 
 test: $(VENV)/.test
 	$(MAKE) --output-sync -j 2 lint docs
-	$(RUN) -m pytest -n 2 --dist loadfile $(ARGS)
+	$(PYTEST) $(ARGS)
 
 quick: $(VENV)/.test
-	$(RUN) -m pytest -n 2 --dist loadfile @tests/quick.txt $(ARGS)
+	$(PYTEST) @tests/quick.txt $(ARGS)
 
 gpu: $(VENV)/.test
 	@$(RUN) -m benchmarks gpu $(ARGS)
