@@ -25,18 +25,6 @@ GEOMETRY = "runs/lobby/reconstruction"
 GAUSSIANS = 40_000  # that stand for a mesh
 TRUTHS = tuple(FILES)
 
-VERSIONS = {
-    "geometry": 1,
-    "metrics": 1,
-    "sionna": 1,
-    "bistatic": 4,
-    "harmonic": 1,
-    "lookups": 1,
-    "networks": 1,
-}
-"""Count one up by hand when the library or a baseline computes something else there: results of before are then made
-again. The figures of a method depend on its own number and that of the metrics."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class DataOptions:

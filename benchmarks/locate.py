@@ -19,16 +19,20 @@ from benchmarks.measurements import OTHERS, POINTINGS, RANGE_DB
 from benchmarks.report import Row
 from benchmarks.runner import option
 from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT
+from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
 from warprrf.rf.maps.placing import OBJECTIVES, best_set
 from warprrf.rf.positions import is_free
+from warprrf.rf.spectra.readings import tap_share
 from warprrf.rf.spectra.spectrum import directions_from_angles, pixel_directions
 
 HELP = """\
 A field of the lobby is fitted to 50 of Sionna RT's spectra, on the reconstruction of `make lobby`, or on the true mesh where there
 is none. Test receivers, which no fit has seen, are located: from their spectrum; from a horn's pointings at three elevations, of
-unknown gain and zero of azimuth, with noise; from the powers of six transmitters, which the exact engine gives. Beside it stands
-the place whose measurement is most alike: of Sionna's training receivers, or, for powers, of 400 that the exact engine gives; for
-powers also multilateration, as if all six were in sight. Then transmitters are chosen among 200 places under the
+unknown gain and zero of azimuth, with noise; from profiles of delay of three transmitters, under a clock of unknown zero, of
+Sionna RT's paths with noise; from the powers of six transmitters, which the exact engine gives. Beside it stands
+the place whose measurement is most alike: of Sionna's training receivers, or, for powers and profiles, of 400 that the exact
+engine gives; for these also multilateration, as if all were in sight: by powers, or by first arrivals at the receiver's true
+height, which three of them need. Then transmitters are chosen among 200 places under the
 ceiling, by maps of single bounces in cells of a metre. Each receiver is kept as soon as it is found.
 
 examples:
@@ -36,13 +40,20 @@ examples:
   python -m benchmarks locate --every 10 --field field.safetensors     a first look, with a field that was fitted before
 """
 TRAIN = 50
+PARTS = "spectrum", "horn", "profiles", "powers", "place"
 HORN_DEG, NOISE_DB, CHAIN_DB, ZERO_DEG = 10.0, 1.0, -23.7, 143.0
 PER_DEG = 1.0 / np.sqrt(
     8.0 * np.log(2.0)
 )  # standard deviation of a Gaussian over its full width at half maximum
 TURNS = 72  # zeros of azimuth that the nearest measurement is sought under
+BANDWIDTH_HZ, TAPS, LATE_S = 2e9, 160, 137e-9
+"""Of profiles: taps half as far apart as they are long, by a clock that is late."""
+PROFILE_SAMPLES = 200_000  # of Sionna RT's rays
+FIRST_DB = 15.0  # below the strongest tap of a transmitter is its first arrival at the least
 MORE = (7.5, 1.5, 2.6), (7.5, 10.5, 2.6)
 """Transmitters [m] beside those of the data set and of the benchmark of measurements."""
+NEAR = [0, 1, 2]  # transmitters that profiles are of
+STORES = {"profiles": "maps-of-three.nc", "powers": "maps-of-six.nc"}
 POWER_SHAPE = 30, 60  # of the spectra whose sums are powers
 CEILING_M, PLACES, PER_METRE = 2.9, 200, {"cell": 1.0, "shape": (10, 20)}
 """Height and number of candidates, and options of their maps."""
@@ -79,9 +90,9 @@ class Options(FitOptions):
     counts: tuple[int, ...] = option((TRAIN,), "spectra that the field is fitted to")
     field: str | None = option(None, "a field's file that was fitted before")
     parts: tuple[str, ...] = option(
-        ("spectrum", "horn", "powers", "place"),
+        PARTS,
         "what is done",
-        choices=("spectrum", "horn", "powers", "place"),
+        choices=PARTS,
     )
     prints: int = option(400, "places with whose powers those of six transmitters are compared")
 
@@ -141,6 +152,36 @@ def multilaterated(one: wr.Readings, bounds: np.ndarray) -> np.ndarray:
     return np.asarray(min(found, key=lambda one: one.cost).x)
 
 
+def first_arrivals(one: wr.Readings) -> tuple[np.ndarray, np.ndarray]:
+    """Transmitters (T, 3) of profiles and the length to each by its first tap, a clock's zero left in [m] (T,)."""
+    sources, own = np.unique(one.transmitters, axis=0, return_inverse=True)
+    strong = [one.power * (own.reshape(-1) == k) for k in range(len(sources))]
+    first = [np.asarray(one.delay_s)[p > p.max() * 10.0 ** (-FIRST_DB / 10.0)].min() for p in strong]
+    return sources, SPEED_OF_LIGHT * np.array(first)
+
+
+def clocked(one: wr.Readings, bounds: np.ndarray, height_m: float) -> np.ndarray:
+    """Place within ``bounds`` (2, 3) at a known height whose distances differ as first arrivals do [m]."""
+    sources, length = first_arrivals(one)
+
+    def missed(at: np.ndarray) -> np.ndarray:
+        far = np.linalg.norm(sources - [*at, height_m], axis=1) - length
+        return far - far.mean()
+
+    low, high = bounds[:, :2]
+    starts = low + (high - low) * np.array([(x, y) for x in (0.2, 0.5, 0.8) for y in (0.2, 0.5, 0.8)])
+    found = [least_squares(missed, start, bounds=(low, high)) for start in starts]
+    return np.array([*min(found, key=lambda one: one.cost).x, height_m])
+
+
+def aligned(power: np.ndarray) -> np.ndarray:
+    """Profiles (..., T, N) in decibels below the strongest tap, which comes first: whatever the clock's zero and the gain."""
+    strongest = power.reshape(*power.shape[:-2], -1).argmax(axis=-1) % power.shape[-1]
+    turn = (np.arange(power.shape[-1]) + strongest[..., None, None]) % power.shape[-1]
+    db = NEPER * np.log(np.maximum(np.take_along_axis(power, turn, axis=-1), 1e-300))
+    return np.asarray(np.maximum(db - db.max(axis=(-2, -1), keepdims=True), -RANGE_DB))
+
+
 class Question:
     """What receivers are located from, and what stands beside.
 
@@ -162,6 +203,8 @@ class Question:
             return self.test.subset([k])
         if part == "horn":
             return horn_of(self.test, k, self.job.seed)
+        if part == "profiles":
+            return self.profiles(k)
         power, at = (
             self.powers["test"][k] * noise(len(self.sources), self.job.seed, k),
             self.test.receivers[k],
@@ -178,12 +221,48 @@ class Question:
             rival = nearest_spectrum(self.test, k, self.pool)
         elif part == "horn":
             rival = self.pool.receivers[nearest_horn(asked, self.turned)]
+        elif part == "profiles":
+            alike = np.abs(self.profile_prints - aligned(asked.power.reshape(len(NEAR), TAPS)))
+            rival = self.print_places[int(alike.mean(axis=(1, 2)).argmin())]
+            found = clocked(asked, self.scene.mesh.bounds, float(true[2]))
+            more["lateration_m"] = float(np.linalg.norm(found - true))
         else:
             off = np.abs(np.log(self.powers["prints"]) - np.log(asked.power)).mean(axis=1)
             rival = self.print_places[int(off.argmin())]
             found = multilaterated(asked, self.scene.mesh.bounds)
             more["lateration_m"] = float(np.linalg.norm(found - true))
         return {"nearest_m": float(np.linalg.norm(rival - true)), **more}
+
+    def profiles(self, k: int) -> wr.Readings:
+        """Taps of three transmitters at test receiver ``k`` by Sionna RT's paths, with noise."""
+        test, taps, power = self.test, np.arange(TAPS) / (2.0 * BANDWIDTH_HZ), []
+        for source in self.sources[NEAR]:
+            engine = SionnaEngine(
+                self.scene, transmitter=source, frequency_hz=test.frequency_hz, shape=test.shape,
+                sampling=Sampling(samples=PROFILE_SAMPLES, seed=self.job.seed),
+            )  # fmt: skip
+            paths = engine.solve(test.receivers[k])
+            share = tap_share(BANDWIDTH_HZ * (taps[:, None] - paths.tau), "hann")
+            power.append(share @ paths.power)
+        read = np.concatenate(power) * noise(len(NEAR) * TAPS, self.job.seed, k)
+        floor = 10.0 ** (-RANGE_DB / 10.0) * read.max()
+        return wr.Readings(
+            np.repeat(self.sources[NEAR], TAPS, axis=0), test.receivers[k], np.maximum(read, floor), test.frequency_hz, floor,
+            delay_s=np.tile(taps + LATE_S, len(NEAR)), bandwidth_hz=BANDWIDTH_HZ, window="hann", std_db=NOISE_DB,
+            clock_known=False,
+        )  # fmt: skip
+
+    @cached_property
+    def profile_prints(self) -> np.ndarray:
+        """Profiles of three transmitters at fingerprints by the exact engine, see :func:`aligned`, shape ``(R, 3, N)``."""
+        taps, found = np.arange(TAPS) / (2.0 * BANDWIDTH_HZ), []
+        for source in self.sources[NEAR]:
+            ds = self.simulated(source, self.print_places, POWER_SHAPE)
+            late = np.nan_to_num(ds.delay_s).reshape(len(ds), 1, -1)
+            share = (tap_share(BANDWIDTH_HZ * (taps[:, None] - one), "hann") for one in late)
+            every = zip(share, ds.path_gain.reshape(len(ds), -1), strict=True)
+            found.append(np.stack([s @ gain for s, gain in every]))
+        return aligned(np.stack(found, axis=1))
 
     @cached_property
     def sources(self) -> np.ndarray:
@@ -266,14 +345,13 @@ def rows(options: Options, fits: Fits) -> Iterator[Row]:
     field = wr.RadioField.load(known) if known else fits.fit(room, train)
     pool = truth.data.subset(truth.data.role == "train")
     question = Question(options, fits, test, pool)
-    ask: dict[str, Any] = {"store": fits.job.out / "map.nc", "progress": fits.job.progress}
+    ask: dict[str, Any] = {"progress": fits.job.progress}
     for part in options.parts:
         if part == "place":
             for row in fits.row("place", lambda: {"rows": placed(field, fits.job)}, known or name)["rows"]:
                 yield {"part": part, **row}
             continue
-        if part == "powers":
-            ask["store"] = fits.job.out / "maps.nc"
+        ask["store"] = fits.job.out / STORES.get(part, "map.nc")
         field.locate(question.asked(part, 0), **ask)  # makes the map, which does not count
         found = []
         for k in range(len(test)):

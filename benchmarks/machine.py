@@ -1,4 +1,5 @@
-"""What figures were measured on: processor, cores, versions; the workers of a cluster, and the memory that a run took."""
+"""What figures were measured with: the code and what it computes, processor, cores, versions; the workers of a cluster, and
+the memory that a run took."""
 
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ from typing import Any
 import warp as wp
 
 from warprrf.device import require, resolve, threads
+from warprrf.steps import digest
 
 PACKAGES = (
     "warprrf",
@@ -31,6 +33,44 @@ PACKAGES = (
     "sionna-rt",
     "distributed",
 )
+
+VERSIONS = {
+    "geometry": 2,
+    "renderer": 1,
+    "metrics": 1,
+    "exact": 2,
+    "sionna": 1,
+    "bistatic": 5,
+    "harmonic": 1,
+    "lookups": 1,
+    "networks": 1,
+}
+"""Count one up when the library or a baseline computes something else there: results of before are then stale. The figures
+of a method depend on its own number and that of the metrics, other result files on what :data:`DEPENDS` names."""
+DEPENDS = {
+    "arrays": ("bistatic",),
+    "bare_mesh": ("bistatic",),
+    "beams": ("geometry", "exact", "bistatic"),
+    "bistatic": ("geometry", "bistatic"),
+    "edited": ("exact", "bistatic"),
+    "engine": ("renderer",),
+    "filmed": ("geometry",),
+    "gpu": ("renderer",),
+    "lobby": ("geometry", "bistatic", "harmonic"),
+    "lobby_seeds": ("geometry", "bistatic", "harmonic"),
+    "locate": ("bistatic",),
+    "map": ("geometry", "bistatic"),
+    "measured_flat": ("bistatic",),
+    "measurements": ("geometry", "bistatic"),
+    "office": ("bistatic",),
+    "outside": ("bistatic",),
+    "relevance": ("exact",),
+    "suggest": ("geometry", "bistatic"),
+    "truths": ("exact",),
+}
+"""What the figures of a file in ``benchmarks/results`` depend on. Those of ``paper.json`` say it run by run; others hold facts, or
+are settled."""
+HERE = Path(__file__).parent
 
 
 def processor_name() -> str:
@@ -49,7 +89,7 @@ def commit() -> str | None:
     asked = [
         "git",
         "-C",
-        str(Path(__file__).parent),
+        str(HERE),
         "describe",
         "--always",
         "--abbrev=12",
@@ -63,7 +103,7 @@ def commit() -> str | None:
 
 
 def machine(device: Any = None) -> dict[str, Any]:
-    """What the figures were measured on: version of the code, processor, cores, system, versions."""
+    """What figures were measured with: commit, hashes and :data:`VERSIONS` of the code, processor, cores, system, packages."""
     processor, on = processor_name(), resolve(device)
     versions = {}
     for package in PACKAGES:
@@ -73,6 +113,11 @@ def machine(device: Any = None) -> dict[str, Any]:
             continue
     return {
         "commit": commit(),
+        "code": {
+            folder.name: digest(*sorted(folder.rglob("*.py")))[:12]
+            for folder in (HERE.parent / "warprrf", HERE)
+        },
+        "computes": VERSIONS,
         "processor": processor,
         "cores": threads(),
         "device": f"{on} ({on.name})" if on.is_cuda else str(on),

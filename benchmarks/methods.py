@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 import warprrf as wr
-from benchmarks.data import VERSIONS, Geometry
+from benchmarks.data import Geometry
+from benchmarks.machine import VERSIONS
 from benchmarks.report import Row
 from warprrf.device import Progress
 from warprrf.files import write_atomically
@@ -112,7 +113,7 @@ class Method:
 
     Attributes:
         fit: learns from a task.
-        code: which of :data:`~benchmarks.data.VERSIONS` its figures depend on, with that of the metrics.
+        code: which of :data:`~benchmarks.machine.VERSIONS` its figures depend on, with that of the metrics.
         variants: of which the better one counts.
         network: whether it is a network, which trains for as many steps as it is given.
         untaught: whether it sees no spectrum: one run for all numbers of training receivers.

@@ -185,7 +185,12 @@ def test_each_file_of_measurements_has_its_own_settings(tmp_path, monkeypatch, c
     given = {"receivers": np.ones((1, 3)), "transmitter": np.zeros(3), "frequency_hz": 3e11}
     np.savez(tmp_path / "s.npz", path_gain=np.full((1, 4, 8), 1e-9), beam_sigma_rad=0.1, **given)
     seen = {}
-    report = {"azimuth_zero_deg": {"corner": 7.5}, "noise_db": {"power": 1.5}, "unexplained": {"corner": [0]}}
+    report = {
+        "azimuth_zero_deg": {"corner": 7.5},
+        "clock_offset_s": {"taps": -3e-9},
+        "noise_db": {"power": 1.5},
+        "unexplained": {"corner": [0]},
+    }
     report |= {"chains": {}, "position_offset_m": {"corner": [([7, 4, 1.5], [0.02, 0, -0.01])]}}
 
     def fit(geometry, data, **options):
@@ -197,12 +202,18 @@ def test_each_file_of_measurements_has_its_own_settings(tmp_path, monkeypatch, c
     run(
         "fit {scene} {spectra} s.npz horn.csv receive-pattern=10,-25 azimuth=unknown name=corner position-std=0.03 "
         "power.csv samples=1 noise-floor-db=-140 taps.csv window=hann receive-pattern=gains.csv transmit-pattern=20 "
-        "bandwidth=2e9 -o f.safetensors --frequency 300e9 --noise-floor-db -120 --option lobes=[0,12] "
+        "bandwidth=2e9 clock=unknown -o f.safetensors --frequency 300e9 --noise-floor-db -120 --option lobes=[0,12] "
         '--effects {{"mirrors":2,"residual":false}}',
         tmp_path,
     )  # fmt: skip
     said = capsys.readouterr().out
-    told = ("corner: add 7.50 degrees", "off by 0.02,0,-0.01 m", "power: readings are 1.50 dB", "from 0: 0")
+    told = (
+        "corner: add 7.50 degrees",
+        "taps: add -3.00 ns",
+        "off by 0.02,0,-0.01 m",
+        "power: readings are 1.50 dB",
+        "from 0: 0",
+    )
     assert [line for line in told if line not in said] == []
     horn, power, taps, angle = seen["corner"], seen["power"], seen["taps"], np.linspace(0.0, np.pi, 9)
     np.testing.assert_allclose(
@@ -213,6 +224,7 @@ def test_each_file_of_measurements_has_its_own_settings(tmp_path, monkeypatch, c
     assert (power.samples, power.azimuth_known, power.frequency_hz) == (1, True, 300e9)
     assert (horn.floor[0], power.floor[0]) == (pytest.approx(1e-12), pytest.approx(1e-14))
     assert (taps.window, taps.bandwidth_hz, horn.bandwidth_hz) == ("hann", 2e9, None)
+    assert (taps.clock_known, horn.clock_known) == (False, True)
     np.testing.assert_allclose(taps.receive_pattern.gain_off_boresight(angle[::4]), [1.0, 0.5, 0.0])
     np.testing.assert_allclose(
         taps.transmit_pattern.gain_off_boresight(angle), wr.horn(np.radians(20)).gain_off_boresight(angle)

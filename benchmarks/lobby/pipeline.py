@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 
 import warprrf as wr
-from benchmarks.data import VERSIONS, Geometry
+from benchmarks.data import Geometry
 from benchmarks.lobby import report as page
 from benchmarks.lobby.photos import noise_psnr_db, read_poses
 from benchmarks.lobby.score import score_cameras, score_mesh
 from benchmarks.lobby.spectra import FILES as TRUTHS
-from benchmarks.machine import machine
+from benchmarks.machine import VERSIONS, machine
 from benchmarks.methods import METHODS, Effort, Task, score
 from benchmarks.report import Report
 from benchmarks.runner import Benchmark, Job, option

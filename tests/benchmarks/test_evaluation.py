@@ -9,8 +9,8 @@ from small_room import small_room
 
 import warprrf as wr
 from benchmarks import evaluation, newrf
-from benchmarks.data import VERSIONS
 from benchmarks.evaluation import COLUMNS, COMPARED, margins, region_held_out, summarise, unpacked
+from benchmarks.machine import VERSIONS
 from benchmarks.methods import METHODS, Effort
 from benchmarks.runner import Job, execute
 from warprrf.geometry.mesh_files import write_mesh

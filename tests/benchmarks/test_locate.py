@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 import warprrf as wr
-from benchmarks.locate import multilaterated, nearest_horn
+from benchmarks.locate import aligned, clocked, multilaterated, nearest_horn
 from benchmarks.measurements import POINTINGS
 
 SOURCES = np.array(
@@ -31,3 +31,21 @@ def test_the_nearest_scan_is_found_under_any_gain_and_turn():
         chain=["horn"] * len(POINTINGS), azimuth_known=False,
     )  # fmt: skip
     assert nearest_horn(one, known) == 4
+
+
+def test_first_arrivals_tell_the_place_whatever_the_clock():
+    taps = np.arange(160) / 4e9
+    distance = np.linalg.norm(SOURCES[:3] - THERE, axis=1)
+    power = np.sinc(2e9 * (taps - distance[:, None] / 299792458.0)) ** 2
+    one = wr.Readings(
+        np.repeat(SOURCES[:3], 160, axis=0), THERE + 1.0, np.maximum(power, 1e-3).ravel(), CARRIER_HZ, 1e-4,
+        delay_s=np.tile(taps + 1e-7, 3), bandwidth_hz=2e9, clock_known=False,
+    )  # fmt: skip
+    assert np.linalg.norm(clocked(one, BOUNDS, THERE[2]) - THERE) < 0.15  # half a tap is 7 cm
+
+
+def test_profiles_are_compared_whatever_the_clock_and_the_gain():
+    power = 10.0 ** np.random.default_rng(0).uniform(-12.0, -9.0, (4, 3, 50))
+    late = 0.02 * np.roll(power, 17, axis=-1)
+    np.testing.assert_allclose(aligned(late), aligned(power), atol=1e-9)
+    assert np.abs(aligned(power)[0] - aligned(power)[1]).mean() > 1.0

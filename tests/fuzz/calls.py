@@ -91,7 +91,7 @@ def _names(module: ModuleType, prefix: str) -> Iterator[tuple[str, Any]]:
             yield prefix + name, value
 
 
-def _signature(name: str) -> Iterator[inspect.Parameter]:
+def signature(name: str) -> Iterator[inspect.Parameter]:
     """Arguments of a public call; a field's methods are those of the bistatic one that is asked."""
     method = name.removeprefix("RadioField.")
     call = public()[name]
@@ -108,7 +108,7 @@ def example(name: str, place: Place) -> dict[str, Any]:
     owner, _, method = name.rpartition(".")
     known = f"RadioField.{method}" if name not in EXAMPLES and owner == "HarmonicField" else name
     given = dict(EXAMPLES.get(known, lambda p: {})(place))
-    for one in _signature(name):
+    for one in signature(name):
         if one.name in given:
             continue
         if one.kind == one.VAR_KEYWORD:
@@ -126,9 +126,7 @@ def example(name: str, place: Place) -> dict[str, Any]:
 def parameters(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """Arguments of a public call that are mutated, with their value in the example or by default."""
     kinds = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
-    by_default = {
-        p.name: p.default for p in _signature(name) if p.kind not in kinds and p.name not in IGNORED
-    }
+    by_default = {p.name: p.default for p in signature(name) if p.kind not in kinds and p.name not in IGNORED}
     return {k: v for k, v in (by_default | dict(given)).items() if k != "self"}
 
 
@@ -187,7 +185,7 @@ CLASSES: dict[str, Callable[[Place], Any]] = {
     "interop.Twin": lambda p: wr.interop.Twin(Path("scene.xml"), 300e9, (), ()),
     "splats.Blending": lambda p: wr.splats.Blending(),
     "splats.BlendWeights": lambda p: wr.splats.blend_weights(p.gaussians, p.camera, top_k=4),
-    "splats.GaussianRays": lambda p: wr.splats.GaussianRays(p.gaussians, device="cpu"),
+    "splats.GaussianRays": lambda p: wr.splats.GaussianRays(p.gaussians, device=p.device),
     "splats.Rasterizer": lambda p: p.raster,
     "lookups.Lookup": lambda p: wr.lookups.nearest(p.train),
 }
@@ -266,7 +264,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
         "objects": {"box": wr.Mesh(p.mesh.vertices * 0.05 + POINTS[0], p.mesh.faces)}, "materials": {"box": "skin"},
     },
     "RadioField.fit": lambda p: {
-        "effects": wr.Effects(mirrors=1, residual=False), "lobes": (0, 4), "sub_pixels": 1, "device": "cpu",
+        "effects": wr.Effects(mirrors=1, residual=False), "lobes": (0, 4), "sub_pixels": 1, "device": p.device,
         "relevance": p.relevance,
     },
     "BistaticField.view": lambda p: {"receivers": POINTS[0]},
@@ -277,7 +275,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     },
     "RadioField.spectra": lambda p: {"client": None},
     "RadioField.links": lambda p: {"shape": (8, 16), "client": None},
-    "RadioField.load": lambda p: {"path": p.folder / "bistatic.safetensors", "device": "cpu"},
+    "RadioField.load": lambda p: {"path": p.folder / "bistatic.safetensors", "device": p.device},
     "RadioField.on_grid": lambda p: {"shape": (8, 16)},
     "RadioField.paths": lambda p: {"client": None},
     "RadioField.radio_map": lambda p: {"cell": 1.0},

@@ -41,10 +41,11 @@ class Place:
 
     Args:
         folder: where its files lie; :meth:`make` writes them.
+        device: where what is made for one lies.
     """
 
-    def __init__(self, folder: str | os.PathLike[str]) -> None:
-        self.folder = Path(folder)
+    def __init__(self, folder: str | os.PathLike[str], device: str = "cpu") -> None:
+        self.folder, self.device = Path(folder), device
 
     def __getattr__(self, name: str) -> Any:
         """What :data:`GIVEN` has by that name, or :data:`MADE`, made when first asked for."""
@@ -121,12 +122,12 @@ def _stop(stage: str, done: int, total: int) -> None:
 def _uploaded(p: Place) -> dict[str, Any]:
     """Parameters of Gaussians on the device, and colours."""
     means, quaternions, scales, opacities = p.raster.upload(p.gaussians)
-    sh = wp.array(p.gaussians.sh, dtype=float, device="cpu")
+    sh = wp.array(p.gaussians.sh, dtype=float, device=p.device)
     features = p.raster.colors(means, sh, p.camera)
     return {
         "means": means, "quaternions": quaternions, "scales": scales, "opacities": opacities, "sh": sh,
         "features": features, "out": wp.zeros_like(features, requires_grad=True),
-        "origin": wp.array([p.camera.position], dtype=wp.vec3, device="cpu"),
+        "origin": wp.array([p.camera.position], dtype=wp.vec3, device=p.device),
         "prepared": p.raster.prepare(means, quaternions, scales, opacities, p.camera),
     }  # fmt: skip
 
@@ -168,6 +169,6 @@ MADE: dict[str, Callable[[Place], Any]] = {
     "path_gain": lambda p: np.asarray(p.spectra.path_gain[0], dtype=float),
     "prediction": lambda p: wr.metrics.unit_image(p.path_gain, p.spectra.floor, p.spectra.range_db),
     "truth": lambda p: p.prediction[::-1].copy(),
-    "raster": lambda p: wr.splats.Rasterizer(device="cpu"),
+    "raster": lambda p: wr.splats.Rasterizer(device=p.device),
     "uploaded": _uploaded,
 }

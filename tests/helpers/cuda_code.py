@@ -38,7 +38,7 @@ HOT = {
         "blend(float32, 4)", "blend_adjoint(float32, 4)", "strongest(float32)",
     ),
     "warprrf.kernels.rays.gaussians": ("collect", "collect_adjoint", "transmit", "transmit_adjoint"),
-    "warprrf.kernels.rays.mesh": ("cast_rays",),
+    "warprrf.kernels.rays.mesh": ("cast_rays", "see"),
     "warprrf.kernels.radio.beam": ("gather_beams",),
     "warprrf.kernels.radio.harmonics": ("predict(float32)", "coefficient_adjoint(float32)"),
 }  # fmt: skip

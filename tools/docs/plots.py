@@ -57,7 +57,7 @@ def _name(method: str) -> str:
     return NAMES[method].replace("*", "")
 
 
-@entry("psnr", "PSNR of held-out receivers over the number of training spectra")
+@entry("psnr", "PSNR at held-out receivers against the number of training spectra")
 def _psnr() -> Any:
     places = {t: name for (t, split), name in PLACES.items() if split == "random" and paper(t, split)}
     figure, axes = plt.subplots(1, len(places), figsize=(4.5 * len(places), 3.4), sharey=True)
@@ -76,7 +76,9 @@ def _psnr() -> Any:
     return figure
 
 
-@entry("speed", "Error over the time of one spectrum and over training time, 100 spectra of the exact engine")
+@entry(
+    "speed", "Error against the time of one spectrum and against training time, 100 spectra of our own engine"
+)
 def _speed() -> Any:
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True)
     rows = paper("exact", "random", 100)
@@ -100,7 +102,7 @@ def _speed() -> Any:
     return figure
 
 
-@entry("learning", "Loss of the networks over their training time")
+@entry("learning", "Training loss of the networks against their training time")
 def _learning() -> Any:
     rows = read("networks")["rows"]
     truths = {truth: f"C{k}" for k, truth in enumerate(TRUTHS)}
@@ -112,9 +114,7 @@ def _learning() -> Any:
             style = {700: "-", 100: "--", 10: ":"}[r["count"]]
             label = f"{TRUTHS[r['truth']]}, {r['count']} spectra"
             ax.plot(minutes, curve, style, color=truths[r["truth"]], label=label)
-        ax.set(
-            title=_name(method), xlabel="training time [min]", ylabel="loss over that of the first fortieth"
-        )
+        ax.set(title=_name(method), xlabel="training time [min]", ylabel="loss / loss of the first fortieth")
         ax.set_yscale("log")
         ax.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.15))
     return figure
@@ -143,7 +143,7 @@ def _knobs() -> Any:
     return figure
 
 
-@entry("ablation", "What each part of the bistatic model is worth, ten spectra")
+@entry("ablation", "PSNR with ten spectra, one part of the bistatic field changed at a time")
 def _ablation() -> Any:
     rows = read("bistatic")["ablation"]
     names = [n for n in dict.fromkeys(r["model"] for r in rows) if not n.startswith("RF-3DGS")]

@@ -1,7 +1,6 @@
-"""What Sphinx does not do alone: reference pages, tables and plots from result files, equations as MathML.
+"""What Sphinx does not do alone: reference pages, plots from result files, equations as MathML.
 
-A page names a table by ``<!-- table: NAME -->`` and a figure by ``<!-- figure: NAME -->``; see :mod:`tables` and
-:mod:`plots`.
+A page names a figure by ``<!-- figure: NAME -->``; see :mod:`plots`. Tables stand in the pages already (:mod:`results`).
 """
 
 from __future__ import annotations
@@ -13,21 +12,20 @@ from typing import Any
 
 import plots
 import reference
-import tables
 from docutils import nodes
 from latex2mathml.converter import convert
 from sphinx.domains.python import PyObject
 
 FIELD = re.compile(r"^:(?:param|ivar) \w+(?:, \w+)+:")
 MARK = "(no type)"
-MADE = re.compile(r"<!-- (table|figure): ([\w-]+) -->")
+FIGURE = re.compile(r"<!-- figure: ([\w-]+) -->")
 
 
 def setup(app: Any) -> dict[str, bool]:
     """Called by Sphinx."""
     next(field for field in PyObject.doc_field_types if field.name == "variable").label = "Attributes"
     app.connect("builder-inited", make_files)
-    app.connect("source-read", put_tables)
+    app.connect("source-read", put_figures)
     app.connect("autodoc-process-docstring", whole_sentences, priority=400)  # before napoleon
     app.connect("autodoc-process-docstring", escape_bars)
     app.add_html_math_renderer(
@@ -48,15 +46,10 @@ def make_files(app: Any) -> None:
             file.write_text(text)
 
 
-def put_tables(app: Any, name: str, source: list[str]) -> None:
-    """Put tables and figures where a page names them."""
+def put_figures(app: Any, name: str, source: list[str]) -> None:
+    """Put figures where a page names them."""
     up = "../" * name.count("/")
-
-    def put(found: re.Match[str]) -> str:
-        kind, what = found.groups()
-        return tables.table(what) if kind == "table" else f"![{plots.CAPTIONS[what]}]({up}figures/{what}.svg)"
-
-    source[0] = MADE.sub(put, source[0])
+    source[0] = FIGURE.sub(lambda f: f"![{plots.CAPTIONS[f[1]]}]({up}figures/{f[1]}.svg)", source[0])
 
 
 def whole_sentences(app: Any, what: str, name: str, found: Any, options: Any, lines: list[str]) -> None:

@@ -110,6 +110,7 @@ def add_measured_options(parser: Any) -> None:
     own.add_argument(
         "--azimuth", choices=("known", "unknown"), help="whether azimuths count from a known zero"
     )
+    own.add_argument("--clock", choices=("known", "unknown"), help="whether delays count from a known zero")
     own.add_argument("--position-std", type=float, metavar="M", help="how far off receivers may have stood")
     own.add_argument("--length-std", type=float, metavar="M", help="how well an array's mesh knows lengths")
     own.add_argument("--name", help="by which the report tells the readings (default the file's)")
@@ -121,7 +122,7 @@ OF_TABLES = {
 }  # fmt: skip
 OF_ARRAYS = {"frequency": "frequency_hz", "length_std": "length_std_m", "name": "name"}
 TAKEN = {
-    "table": (*OF_TABLES, "noise_floor_db", "azimuth"), "array": tuple(OF_ARRAYS), "spectra": ("train",), "thing": (),
+    "table": (*OF_TABLES, "noise_floor_db", "azimuth", "clock"), "array": tuple(OF_ARRAYS), "spectra": ("train",), "thing": (),
 }  # fmt: skip
 """Options by the kind of file that they say something of, and what the library calls those that are passed on."""
 
@@ -172,7 +173,8 @@ def _table(path: Path, args: argparse.Namespace) -> wr.Readings:
     settings = {"name": path.stem} | _passed_on(args, OF_TABLES)
     settings |= {name: read_pattern(text) for name, text in settings.items() if name.endswith("pattern")}
     floor = 10.0 ** (args.noise_floor_db / 10.0)
-    return wr.Readings.load(path, floor=floor, azimuth_known=args.azimuth != "unknown", **settings)
+    zeros = {"azimuth_known": args.azimuth != "unknown", "clock_known": args.clock != "unknown"}
+    return wr.Readings.load(path, floor=floor, **zeros, **settings)
 
 
 def _array(path: Path, args: argparse.Namespace) -> wr.channel.ArraySpectra:

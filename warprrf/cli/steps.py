@@ -342,9 +342,14 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
         lines.append(f"gain of {name}: {chain['gain_db']:.2f} +- {chain['std_db']:.2f} dB")
     for name, rows in wrong.items():
         lines.append(f"{name}: left out as wrong, counted from 0: {', '.join(map(str, rows))}")
-    fitted = {name: field.report.get(name) for name in ("noise_db", "azimuth_zero_deg", "position_offset_m")}
+    fitted = {
+        name: field.report.get(name)
+        for name in ("noise_db", "azimuth_zero_deg", "clock_offset_s", "position_offset_m")
+    }
     for name, zero in (fitted["azimuth_zero_deg"] or {}).items():
         lines.append(f"{name}: add {zero:.2f} degrees to its azimuths")
+    for name, zero in (fitted["clock_offset_s"] or {}).items():
+        lines.append(f"{name}: add {1e9 * zero:.2f} ns to its delays")
     for name, moved in (fitted["position_offset_m"] or {}).items():
         for place, offset in np.round(moved, 4):
             lines.append(f"{name}: the receiver at {_rows([place])} stood off by {_rows([offset])} m")
@@ -437,7 +442,7 @@ def _locate(args: argparse.Namespace, out: Output) -> None:
     """Where a receiver is, by what it read.
 
     Where the files say that it stood is not looked at. Gains of the chains that a table names are found too, and with
-    `--azimuth unknown` the zero that its azimuths count from.
+    `--azimuth unknown` or `--clock unknown` the zero that its azimuths or delays count from.
 
     examples:
       warprrf locate field.safetensors spectra.nc --receiver 3
@@ -460,6 +465,7 @@ def _locate(args: argparse.Namespace, out: Output) -> None:
         for name in ("position", "covariance", "candidates", "likelihoods", "known", "misfit")
     }
     result |= {"gains_db": dict(found.gains_db), "azimuth_zeros": dict(found.azimuth_zeros)}
+    result |= {"clock_offsets_s": dict(found.clock_offsets_s)}
     if args.out:
         write_json(args.out, plain(result))
     said = "known" if found.known else "not known: see candidates"

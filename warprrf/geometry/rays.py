@@ -28,6 +28,7 @@ from warprrf.kernels.rays.mesh import (
     pack_rays,
     pack_segments,
     place_hits,
+    see,
 )
 
 BACKENDS = ("auto", "warp", "embree")
@@ -212,8 +213,23 @@ class RaySearch:
             ValueError: if a point is not finite, or on an unknown back end, or Embree on a GPU.
         """
         count = max(len(a), len(b)) if min(len(a), len(b)) else 0
+        if choose_backend(backend, device, count) == "embree" and count:
+            return self._free_embree(a, b, count, clearance, device)
+        mesh, planes = self.on_device(device)
+        seen = wp.empty(count, dtype=wp.int8, device=device)
+        ends = _given(a, wp.vec3d, device), _given(b, wp.vec3d, device)
+        _device.launch(see, count, [mesh.id, *self._frame, planes, clearance, *ends, seen], device=device)
+        free = seen.numpy()
+        if free.min(initial=0) == BAD:
+            _refuse(("a", a), ("b", b))
+        return free.astype(bool)
+
+    def _free_embree(
+        self, a: np.ndarray, b: np.ndarray, count: int, clearance: float, cpu: wp.Device
+    ) -> np.ndarray:
+        """As :meth:`free`. Most segments are free, and to find out that nothing is met at all takes half as long as what is
+        met."""
         rays, length = np.empty((count, 6), dtype=np.float32), np.empty(count)
-        cpu = _device.resolve("cpu")
         inputs = [
             *self._frame, clearance, _LONGEST, _given(a, wp.vec3d, cpu), _given(b, wp.vec3d, cpu),
             _given(rays.reshape(-1, 3), wp.vec3, cpu), _given(length, wp.float64, cpu),
@@ -221,15 +237,12 @@ class RaySearch:
         _device.launch(pack_segments, count, inputs, device=cpu)
         if not np.isfinite(length).all():
             _refuse(("a", a), ("b", b))
-        free, which = np.ones(count, dtype=bool), np.flatnonzero(length > 2.0 * clearance)
-        chosen = choose_backend(backend, device, count)
-        if chosen == "embree" and len(which):
-            # Most segments are free, and to find out that nothing is met at all takes half as long as what is met.
-            which = np.flatnonzero(self._embree.blocked(rays))
+        free, which = np.ones(count, dtype=bool), np.flatnonzero(self._embree.blocked(rays))
+        if len(which) == 0:
+            return free
         inner, (start, end) = length[which] - clearance, rays_of(a, b, 1, which)
-        t, _ = self.nearest(
-            start, end - start, reach=inner, clearance=clearance, device=device, backend=chosen
-        )
+        way = end - start
+        t, _ = self.nearest(start, way, reach=inner, clearance=clearance, device=cpu, backend="embree")
         free[which] = t >= inner
         return free
 

@@ -192,10 +192,11 @@ class Scene:
         )
 
     def to_sionna(self, *, frequency_hz: float = 3.5e9) -> Any:
-        """The scene as a ``sionna.rt.Scene``, with scattering patterns, transmitters and receivers.
+        """The scene as a ``sionna.rt.Scene``, with scattering patterns, transmitters, receivers and their antennas.
 
         Objects keep their names (with ``_`` for ``.``) and are not merged; one of several materials becomes one object
-        for each. Antennas stay here: Sionna has one array for all transmitters. Materials follow ``frequency`` of what comes back.
+        for each. Materials follow ``frequency`` of what comes back. Where the transmitters have one array, each turned in its way,
+        that is ``tx_array``, of any pattern, interpolated between half degrees; and so for receivers.
 
         Args:
             frequency_hz: carrier frequency [Hz]; Sionna RT's own default if none is given.
@@ -204,8 +205,11 @@ class Scene:
             ImportError: if Sionna RT is missing, or only an LLVM that aborts it is installed.
             ValueError: if a material is not known at this frequency, is infinitely thick, or scatters in a lobe that
                 is too narrow for Sionna's single precision.
+
+        Warns:
+            UserWarning: of antennas that are left out, because they differ, or have no polarisation.
         """
-        return to_sionna_scene(self._parts(), self.transmitters, self.receivers, frequency_hz)
+        return to_sionna_scene(self._parts(), self.transmitters, self.receivers, self.antennas, frequency_hz)
 
     def _parts(self) -> list[ScenePart]:
         """One part for each object and material."""

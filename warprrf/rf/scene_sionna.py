@@ -2,7 +2,7 @@
 
 Sionna RT holds one radio material an object, in single precision, for one frequency. Materials of ITU-R P.2040 and
 constant ones are read for all frequencies; one with a law of its own in Python for the frequency that the scene has.
-Radio devices are read as positions, and as the scene's array turned as each stands.
+Radio devices are positions, and the scene's array turned as each stands.
 
 Here too is how Sionna RT and Mitsuba are imported, on an LLVM and a variant that they can use. Dr.Jit takes any LLVM on a
 CPU: 15 and 16 abort the process, 14 is too old, so the choice isn't left to it.
@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from warprrf.checks import checked, users_level
 from warprrf.device import require
@@ -28,14 +29,16 @@ from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.materials import Band, Material, itu_material
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.scene_parts import MaterialChoice, ScenePart
-from warprrf.rf.spectra.antenna import PATTERNS, SLANTS_RAD, Antenna
-from warprrf.rf.spectra.spectrum import pixel_directions
+from warprrf.rf.spectra.antenna import PATTERNS, SLANTS_RAD, Antenna, as_antenna
+from warprrf.rf.spectra.spectrum import directions_from_angles, pixel_directions
 
 _FOLDERS = (
     "/usr/lib/*-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/local/lib", "/usr/lib/llvm-*/lib", "/opt/homebrew/opt/llvm*/lib",
 )  # fmt: skip
 
 Positions = dict[str, np.ndarray]
+GRID = 361, 721
+"""Zeniths and azimuths, half a degree apart, at which an antenna's fields are handed to Sionna RT."""
 
 
 def parts_of(rt_scene: Any, choice: MaterialChoice) -> tuple[list[ScenePart], dict[str, Any]]:
@@ -197,9 +200,10 @@ def to_sionna_scene(
     parts: Sequence[ScenePart],
     transmitters: Mapping[str, np.ndarray],
     receivers: Mapping[str, np.ndarray],
+    antennas: Mapping[str, PlanarArray],
     frequency_hz: float,
 ) -> Any:
-    """A ``sionna.rt.Scene`` of these objects and devices; see :meth:`Scene.to_sionna`."""
+    """A ``sionna.rt.Scene`` of these objects, devices and antennas; see :meth:`Scene.to_sionna`."""
     frequency = check_frequency(frequency_hz)
     rt = sionna_rt()
     mi = select_variant()
@@ -233,10 +237,78 @@ def to_sionna_scene(
     scene.frequency = frequency
     for key, material in materials.items():  # not before: a new scene has Sionna's default frequency
         _follow_frequency(radio[key], material)
-    for kind, places in ((rt.Transmitter, transmitters), (rt.Receiver, receivers)):
+    ends = (rt.Transmitter, transmitters, "tx_array"), (rt.Receiver, receivers, "rx_array")
+    for kind, places, common in ends:
         for name, position in places.items():
-            scene.add(kind(name, position=np.asarray(position, float).tolist()))
+            turn = antennas[name].rotation if name in antennas else np.eye(3)
+            angles = Rotation.from_matrix(turn).as_euler("ZYX").tolist()
+            scene.add(kind(name, position=np.asarray(position, float).tolist(), orientation=angles))
+        own = [antennas[name] for name in places if name in antennas]
+        if own and (array := _common_array(rt, own, common)) is not None:
+            setattr(scene, common, array)
     return scene
+
+
+def _common_array(rt: Any, arrays: Sequence[PlanarArray], common: str) -> Any:
+    """The array of Sionna's that ``arrays`` are, each turned; None, with a warning, where there is none."""
+    plain = [as_antenna(a.pattern, a.polarisation) for a in arrays]
+    if not all(antenna.polarised for antenna in plain):
+        why = "got an antenna without polarisation, which Sionna RT's need"
+    elif len({_told_apart(*pair) for pair in zip(arrays, plain, strict=True)}) > 1:
+        why = "got antennas that differ in more than their orientation, and Sionna RT has one array for all"
+    else:
+        return rt.AntennaArray(_sionna_pattern(rt, plain[0]), _unturned(arrays[0]).T.tolist())
+    warnings.warn(f"antennas: {why}; {common} is left to be set", UserWarning, stacklevel=users_level())
+    return None
+
+
+def _unturned(array: PlanarArray) -> np.ndarray:
+    """Elements in wavelengths, in the array's own axes, shape ``(N, 3)``."""
+    return array.positions(1.0) @ array.rotation
+
+
+def _told_apart(array: PlanarArray, element: Antenna) -> bytes:
+    """Equal for arrays that differ in orientation alone."""
+    fields = np.asarray(element.field(pixel_directions((45, 90))), complex)
+    return bytes(np.round(_unturned(array), 9) + 0.0) + bytes(fields)
+
+
+def _sionna_pattern(rt: Any, antenna: Antenna) -> Any:
+    """A ``sionna.rt.AntennaPattern`` of an antenna: its fields on a grid of :data:`GRID`, between which they are interpolated."""
+    mi, dr = select_variant(), require("drjit", extra="sionna")
+    rows, columns = GRID
+    zenith, azimuth = np.linspace(0.0, np.pi, rows), np.linspace(-np.pi, np.pi, columns)
+    fields = antenna.field(directions_from_angles(*np.meshgrid(zenith, azimuth, indexing="ij")))
+
+    def port(field: np.ndarray) -> Any:
+        planes = [
+            mi.Float(np.ascontiguousarray(part.ravel(), np.float32))
+            for end in np.moveaxis(np.asarray(field, complex), -1, 0)
+            for part in (end.real, end.imag)
+        ]
+
+        def towards(theta: Any, phi: Any) -> Any:
+            row, column = theta / np.pi * (rows - 1), (phi / (2.0 * np.pi) + 0.5) * (columns - 1)
+            i, j = (mi.UInt32(dr.clip(a, 0, n - 2)) for a, n in ((row, rows), (column, columns)))
+            u, v = row - mi.Float(i), column - mi.Float(j)
+
+            def at(plane: Any) -> Any:
+                corner = [
+                    [dr.gather(mi.Float, plane, (i + a) * columns + j + b) for b in (0, 1)] for a in (0, 1)
+                ]
+                above, below = (one + v * (other - one) for one, other in corner)
+                return above + u * (below - above)
+
+            along, across = (mi.Complex2f(at(re), at(im)) for re, im in (planes[:2], planes[2:]))
+            return along, across
+
+        return towards
+
+    class Sampled(rt.AntennaPattern):  # type: ignore[misc]
+        def __init__(self) -> None:
+            self.patterns = [port(field) for field in fields]
+
+    return Sampled()
 
 
 def _radio_material(rt: Any, material: Material, name: str, frequency: float) -> Any:

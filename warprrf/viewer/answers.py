@@ -193,10 +193,10 @@ def reading_errors(field: RadioField, readings: Readings, progress: Progress | N
     The gain of a measuring chain is not known: each chain's median error is taken off.
 
     Raises:
-        ValueError: for azimuths that count from an unknown zero, or a place that ``field`` does not hold at.
+        ValueError: for azimuths or delays that count from an unknown zero, or a place that ``field`` does not hold at.
     """
-    if not readings.azimuth_known:
-        raise ValueError("readings: their azimuths count from an unknown zero, expected azimuth_known=True")
+    if not readings.zero_known:
+        raise ValueError("readings: their azimuths or delays count from an unknown zero, expected known ones")
     power, steady = np.empty((2, len(readings)))
     ends = np.column_stack([readings.transmitters, readings.receivers])
     links, own = np.unique(ends, axis=0, return_inverse=True)

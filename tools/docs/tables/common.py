@@ -13,6 +13,8 @@ ROOT = Path(__file__).resolve().parents[3]
 FOLDER = ROOT / "benchmarks" / "results"
 sys.path.append(str(ROOT))  # for what the benchmarks compute of their results
 
+from benchmarks.machine import DEPENDS, VERSIONS  # noqa: E402
+
 NAMES = {
     "bistatic": "**bistatic**",
     "bistatic-quick": "**bistatic, quick fit**",
@@ -33,7 +35,7 @@ NAMES = {
     "zero": "our geometry, no spectra",
     "transmitter": "point at the transmitter",
 }
-TRUTHS = {"exact": "exact engine", "sionna": "Sionna RT, depth 3"}
+TRUTHS = {"exact": "our own engine, single bounces", "sionna": "Sionna RT, depth 3"}
 Row = dict[str, Any]
 TABLES: dict[str, Callable[[], str]] = {}
 
@@ -99,15 +101,23 @@ def show(value: Any, form: str = "{:.1f}") -> str:
     return "" if value is None else form.format(value)
 
 
+def older(name: str) -> list[str]:
+    """What the code computes otherwise today than when a result file was made: of :data:`VERSIONS` those that it depends on."""
+    then = read(name).get("machine", {}).get("computes", {})
+    kind = "gpu" if name.startswith("gpu") else name
+    return [what for what in DEPENDS.get(kind, ()) if then.get(what) != VERSIONS[what]]
+
+
 def _machine(name: str) -> str:
-    found = read(name)
-    m = found["machine"]
-    device = "" if m["device"] == "cpu" else f", {m['device']}"
-    versions = m["versions"]
-    return (
-        f"Measured on {m['processor']}, {m['cores']} cores{device}, Python {m['python']}, Warp {versions['warp-lang']}; "
-        f"every figure is in `{_file(name).relative_to(ROOT)}`."
-    )
+    m = read(name)["machine"]
+    text = f"Every figure is in `{_file(name).relative_to(ROOT)}`."
+    if "processor" in m:
+        device = "" if m["device"] == "cpu" else f", {m['device']}"
+        on = f"{m['processor']}, {m['cores']} cores{device}, Python {m['python']}, Warp {m['versions']['warp-lang']}"
+        text = f"Measured on {on}. {text}"
+    if old := older(name):
+        text += f" **Not run since these changed: {', '.join(old)}.** Today's code gives other figures."
+    return text
 
 
 def find(rows: list[Row], **wanted: Any) -> Row | None:

@@ -94,7 +94,9 @@ def _engine_rays() -> str:
         ]
         for r in read("engine")["rays"]
     ]  # fmt: skip
-    head = ("mesh", "faces", "rays", "million a second", "by Warp's hierarchy", "over bare Embree")
+    head = (
+        "mesh", "faces", "rays", "million rays/s", "by Warp's hierarchy: million rays/s", "ratio to bare Embree",
+    )  # fmt: skip
     return markdown(head, lines)
 
 
@@ -106,9 +108,23 @@ def _gpu() -> str:
     parts = []
     for file in files:
         found = json.loads(file.read_text())
-        lines = [[name, f"{value:.4g}"] for name, value in _leaves(found) if "kernels" not in name]
+        lines = [_in_unit(name, value) for name, value in _leaves(found) if "kernels" not in name]
         parts += [f"**{found['machine']['device']}**", markdown(("figure", "value"), lines)]
     return "\n\n".join(parts)
+
+
+def _in_unit(name: str, value: float) -> list[str]:
+    """A figure with the unit that its name ends in."""
+    units = (
+        (" per s", 1e-6, "million a second"),
+        (" s", 1e3, "ms"),
+        (": seconds", 1e3, "ms"),
+        (" m", 1.0, "m"),
+    )
+    for end, scale, unit in units:
+        if name.endswith(end):
+            return [name.removesuffix(end), f"{scale * value:.4g} {unit}"]
+    return [name, str(value) if isinstance(value, int) else f"{value:.3g}"]
 
 
 def _leaves(found: Row, prefix: str = "") -> Iterable[tuple[str, float]]:
@@ -123,8 +139,8 @@ def _leaves(found: Row, prefix: str = "") -> Iterable[tuple[str, float]]:
 @entry("truths")
 def _truths() -> str:
     head = (
-        "engine", "processor seconds of a spectrum", "noise, rms [dB]", "total over the first row's [dB]",
-        "least time at its noise, over its",
+        "engine", "processor seconds of a spectrum", "noise, rms [dB]", "total power relative to the first row [dB]",
+        "least time at the exact engine's noise, over its time",
     )  # fmt: skip
     lines = [
         [

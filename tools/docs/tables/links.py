@@ -14,7 +14,10 @@ def _map() -> str:
         lines.append([f"field, {r['rays']} rays a cell, up to {r['mirrors']} mirrors{mean}", *_map_errors(r)])
     for r in found["sionna"]:
         lines.append([f"RadioMapSolver, {r['samples']:.0e} samples", *_map_errors(r)])
-    return markdown(("map", "rms [dB]", "median [dB]", "line of sight", "blocked", "core seconds"), lines)
+    head = (
+        "map", "error, rms [dB]", "median [dB]", "line of sight: rms [dB]", "blocked: rms [dB]", "core seconds",
+    )  # fmt: skip
+    return markdown(head, lines)
 
 
 def _map_errors(r: Row) -> list[str]:
@@ -95,22 +98,7 @@ def _city_paths() -> str:
         for r in found["scenes"]
         if r["gain_apart"]
     ]
-    return "\n\n".join(
-        [markdown(head, lines), *apart, *_roofs([r["roofs"] for r in found["scenes"] if r.get("roofs")])]
-    )
-
-
-def _roofs(cities: list[dict[str, int]]) -> list[str]:
-    """What share of places the library takes for places in a building; nothing without cities."""
-    if not cities:
-        return []
-    roofed, indoors, under_sky, wrong = (
-        sum(city[key] for city in cities) for key in ("roofed", "roofed_refused", "open", "open_refused")
-    )
-    return [
-        f"Of {roofed} places below a roof in {len(cities)} scenes with streets {100 * indoors / roofed:.1f} % are taken for "
-        f"places in a building (others are passages), of {under_sky} under the sky {100 * wrong / under_sky:.2f} %."
-    ]
+    return "\n\n".join([markdown(head, lines), *apart])
 
 
 @entry("city-verbs")
@@ -172,8 +160,8 @@ def _person() -> str:
         "person",
         (
             ("x", "from the transmitter [m]", "{:g}"), ("deepest_db", "deepest [dB]", "{:.1f}"),
-            ("screen_db", "P.526 [dB]", "{:.1f}"),
-            ("shadow_rms_db", "in the shadow: rms [dB]", "{:.2f}"), ("shadow_most_db", "largest [dB]", "{:.2f}"),
+            ("screen_db", "P.526: deepest [dB]", "{:.1f}"),
+            ("shadow_rms_db", "difference in the shadow: rms [dB]", "{:.2f}"), ("shadow_most_db", "largest [dB]", "{:.2f}"),
         ),
     )  # fmt: skip
 

@@ -12,7 +12,7 @@ def _lobby_geometry() -> str:
     rows = [
         ("photos posed", f"{g['posed']} of {g['photos']}"),
         ("PSNR of photos held out", f"{r['photo_psnr_db']:.1f} dB"),
-        ("the same of two renderings of one photo with other noise", f"{r['photo_noise_psnr_db']:.1f} dB"),
+        ("PSNR of two renderings of one photo with other noise", f"{r['photo_noise_psnr_db']:.1f} dB"),
         (
             f"camera positions, rms error, scale from {g['surveyed']} surveyed ones",
             f"{1e3 * r['camera_rms_m']:.1f} mm",
@@ -30,11 +30,11 @@ def _lobby_geometry() -> str:
 
 SCORES = (
     ("psnr_db", "PSNR [dB]", "{:.1f}"),
-    ("psnr_db_blocked", "blocked", "{:.1f}"),
+    ("psnr_db_blocked", "PSNR, blocked [dB]", "{:.1f}"),
     ("ssim", "SSIM", "{:.2f}"),
     ("rmse_db", "RMSE [dB]", "{:.1f}"),
     ("direction_within_3deg", "within 3°", "{:.0%}"),
-    ("direction_within_3deg_blocked", "blocked", "{:.0%}"),
+    ("direction_within_3deg_blocked", "within 3°, blocked", "{:.0%}"),
     ("beam_gain_loss_db", "beam loss [dB]", "{:.1f}"),
     ("tof_error_median_ns", "delay [ns]", "{:.2g}"),
 )
@@ -49,7 +49,7 @@ def _scored(found: dict[str, Row]) -> str:
         ]
         for m, row in found.items()
     ]
-    return markdown(("model", *(h for _, h, _ in SCORES), "a spectrum [ms]"), rows)
+    return markdown(("model", *(h for _, h, _ in SCORES), "time of a spectrum [ms]"), rows)
 
 
 def _name(method: str) -> str:
@@ -71,15 +71,26 @@ def _lobby_sionna() -> str:
 @entry("lobby-stages")
 def _lobby_stages() -> str:
     r = read("lobby")
-    rows = [(name, f"{stage['seconds']:.0f}") for name, stage in r["stages"].items()]
+    rows = [(_stage(name), f"{stage['seconds']:.0f}") for name, stage in r["stages"].items()]
     return markdown(("step", "seconds"), [*rows, ("**all**", f"**{r['pipeline_time_s']:.0f}**")])
+
+
+def _stage(name: str) -> str:
+    """Name of a stage, in full where it is a METHOD COUNT, TRUTH."""
+    work, _, truth = name.partition(", ")
+    method, _, count = work.rpartition(" ")
+    return f"{NAMES[method].strip('*')}, {count} spectra, {TRUTHS[truth]}" if truth else name
 
 
 @entry("lobby-seeds")
 def _lobby_seeds() -> str:
     found = read("lobby_seeds")
+    words = {"psnr_db": "PSNR [dB]", "psnr_db_blocked": "PSNR, blocked [dB]"}
     lines = [
-        [r["figure"], *(show(r[k], "{:.4g}") for k in ("mean", "spread", "least", "most"))]
+        [
+            ": ".join(words.get(w, w) for w in r["figure"].split(": ")),
+            *(show(r[k], "{:.4g}") for k in ("mean", "spread", "least", "most")),
+        ]
         for r in found["rows"]
         if not r["key"].startswith("methods")
         and not r["key"].endswith("time_s")  # what a machine decides, not a seed
@@ -87,7 +98,7 @@ def _lobby_seeds() -> str:
         and "psnr" in r["key"]
     ]
     return markdown(
-        (f"seeds {', '.join(map(str, found['seeds']))}", "mean", "spread", "least", "most"), lines
+        (f"seeds {', '.join(map(str, found['seeds']))}", "mean", "standard deviation", "least", "most"), lines
     )
 
 
@@ -107,7 +118,7 @@ def _ablation() -> str:
             words.get(model, model),
             *(show((found := find(rows, truth=t, model=model)) and found["psnr_db"]) for t in TRUTHS),
         ])  # fmt: skip
-    return markdown(("model, ten spectra", *(f"{n} [dB]" for n in TRUTHS.values())), lines)
+    return markdown(("model, ten spectra", *(f"{n}: PSNR [dB]" for n in TRUTHS.values())), lines)
 
 
 @entry("uncertainty")
@@ -146,7 +157,10 @@ def _transmitter() -> str:
         ]
         for r in read("transmitter")["second"]
     ]  # fmt: skip
-    head = ("model, ten spectra", "fitted transmitter [dB]", "another one [dB]", "within 3°", "blocked")
+    head = (
+        "model, ten spectra", "PSNR, fitted transmitter [dB]", "PSNR, another one [dB]", "its within 3°",
+        "its within 3°, blocked",
+    )  # fmt: skip
     return markdown(head, lines)
 
 
@@ -154,8 +168,8 @@ def _transmitter() -> str:
 def _filmed() -> str:
     found = read("filmed")
     rows = {
-        "distance": "mesh to reference", "back": "reference to mesh", "laid_on_distance": "mesh to reference, laid on it",
-        "laid_on_back": "reference to mesh, laid on it",
+        "distance": "mesh to reference", "back": "reference to mesh", "laid_on_distance": "mesh to reference, aligned by surface",
+        "laid_on_back": "reference to mesh, aligned by surface",
     }  # fmt: skip
     lines = [
         [
@@ -165,4 +179,5 @@ def _filmed() -> str:
         ]
         for key, name in rows.items()
     ]
-    return markdown(("distance", "median [cm]", "90th percentile [cm]", "within 5 cm"), lines)
+    off = f"Camera positions differ from the reference's by {100 * found['camera_rms_m']:.0f} cm rms."
+    return f"{markdown(('distance', 'median [cm]', '90th percentile [cm]', 'within 5 cm'), lines)}\n\n{off}"

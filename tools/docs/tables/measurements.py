@@ -1,4 +1,4 @@
-"""What a field is fitted to: readings, arrays, meshes without names, links of a flat; walls; which effects a scene needs."""
+"""What a field is fitted to (readings, arrays, meshes without names, links of a flat), walls, limits, and effects of a scene."""
 
 from __future__ import annotations
 
@@ -11,11 +11,51 @@ def _measurements() -> str:
     columns = (
         ("psnr_db", "PSNR [dB]", "{:.1f}"), ("direction_within_3deg_blocked", "blocked: within 3 degrees", "{:.0%}"),
         ("beam_gain_loss_db", "beam loss [dB]", "{:.2f}"), ("total_rms_db", "total power, rms [dB]", "{:.2f}"),
-        ("total_rms_db_blocked", "blocked", "{:.2f}"), ("gain_error_db", "chain's gain off [dB]", "{:+.2f}"),
-        ("zero_error_deg", "zero off [degrees]", "{:+.1f}"), ("named", "named", "{}"),
+        ("total_rms_db_blocked", "blocked: total power, rms [dB]", "{:.2f}"),
+        ("gain_error_db", "error of the chain's gain [dB]", "{:+.2f}"),
+        ("zero_error_deg", "error of the azimuths' zero [degrees]", "{:+.1f}"), ("named", "wrong readings named", "{}"),
     )  # fmt: skip
-    lines = [[r["readings"], *(show(r.get(key), form) for key, _, form in columns)] for r in found["rows"]]
+    lines = [
+        [r["readings"].replace("asked", "scored"), *(show(r.get(key), form) for key, _, form in columns)]
+        for r in found["rows"]
+    ]
     return markdown(("fitted to", *(title for _, title, _ in columns)), lines)
+
+
+@entry("headline-less")
+def _headline_less() -> str:
+    rows = read("measurements")["rows"]
+    one, horn, power = (
+        next(r for r in rows if r["readings"] == name) for name in ("1 spectrum, mean of 20", "horn", "power")
+    )
+    at = read("locate")["rows"]
+    lines = [
+        ["one spectrum, of 60 x 120 pixels", f"spectra: PSNR {one['psnr_db']:.1f} dB"],
+        ["a horn's readings at ten places, its gain unknown", f"spectra: PSNR {horn['psnr_db']:.1f} dB"],
+        ["total power at 50 places, the meter's gain unknown", f"total power: {power['total_rms_db']:.1f} dB rms"],
+        *(
+            [f"{', '.join(['50 spectra', *given])}; of the new receiver: {seen}",
+             f"its position: error {r['median_cm']:.0f} cm (median), {r['p90_cm']:.0f} cm (90th percentile)"]
+            for r, (seen, *given) in ((r, r["measured"].split(", ")) for r in at)
+        ),
+    ]  # fmt: skip
+    return markdown(("known", "predicted for receivers held out"), lines)
+
+
+@entry("headline-measured")
+def _headline_measured() -> str:
+    found, lines = read("measured_flat"), []
+    for held_out in dict.fromkeys(r["held_out"] for r in found["rows"]):
+        rows = [r for r in found["rows"] if r["held_out"] == held_out]
+        field = find(rows, model="field")
+        others = [r for r in rows if not r["model"].startswith(("field", "traced"))]
+        best = min(others, key=lambda r: r["rms_db"])
+        noise = found["noise"]["all"]["halves_by_time"]
+        rival = f"{best['rms_db']:.1f} ({best['model']})"
+        lines.append(
+            [f"Bluetooth, one {held_out} held out", show(field and field["rms_db"]), rival, show(noise)]
+        )
+    return markdown(("error [dB rms]", "radio field", "best simple model", "noise of the measurement"), lines)
 
 
 @entry("suggest")
@@ -29,21 +69,18 @@ def _suggest() -> str:
         for r in found["rows"]
     ]  # fmt: skip
     wanted = "blocked: within 3 degrees", "beam loss [dB]", "total power, rms [dB]"
-    return markdown(("spectra of", "draws", "PSNR [dB]", "spread", *wanted), lines)
+    return markdown(("spectra of", "draws", "PSNR [dB]", "spread [dB]", *wanted), lines)
 
 
 @entry("locate")
 def _locate() -> str:
     head = (
-        "located from",
-        "receivers",
-        "median [cm]",
-        "90th percentile",
-        "blocked: median",
-        "90th percentile",
-    )
+        "located from, room", "receivers", "error, median [cm]", "90th percentile [cm]", "blocked: median [cm]",
+        "blocked: 90th percentile [cm]",
+    )  # fmt: skip
     further = (
-        "beyond 30 cm", "within 95 % ellipsoid", "core seconds each", "nearest measurement [cm]", "multilateration",
+        "beyond 30 cm", "within the 95 % ellipsoid", "core seconds each", "nearest measurement: median [cm]",
+        "multilateration: median [cm]",
     )  # fmt: skip
     keys = ("median_cm", "p90_cm", "blocked_median_cm", "blocked_p90_cm")
     lines = [
@@ -59,7 +96,9 @@ def _locate() -> str:
 
 @entry("place")
 def _place() -> str:
-    head = "transmitters", "of candidates", "chosen: worst tenth [dB]", "one added at a time", "core seconds"
+    head = (
+        "transmitters", "candidates", "best set: worst tenth [dB]", "one added at a time: worst tenth [dB]", "core seconds",
+    )  # fmt: skip
     lines = [
         [
             str(r["n"]),
@@ -75,11 +114,15 @@ def _place() -> str:
 @entry("flat")
 def _flat() -> str:
     found = read("measured_flat")
-    head = ("held out", "model", "rms [dB]", "in sight", "behind walls", "worst held out")
+    head = ("held out", "model", "error, rms [dB]", "in sight", "behind walls", "worst anchor or room")
     keys = ("rms_db", "seen_db", "behind_db", "worst_db")
     lines = [
-        [f"one {r['held_out']}", r["model"], *(show(r[key], "{:.2f}") for key in keys)] for r in found["rows"]
-    ]
+        [
+            f"one {r['held_out']}", r["model"].replace("either", "diffraction and transmission"),
+            *(show(r[key], "{:.2f}") for key in keys),
+        ]
+        for r in found["rows"]
+    ]  # fmt: skip
     return markdown(head, lines)
 
 
@@ -94,13 +137,16 @@ def _flat_noise() -> str:
         ]
         for name, r in ((n, found[n]) for n in ("all", "in sight", "behind walls"))
     ]
-    return markdown(("links", "means", "noise of a mean [dB]", "without drift", "of a single reading"), lines)
+    head = (
+        "links", "means", "noise of a mean, halves by time [dB]", "halves by chance (no drift)", "of a single reading",
+    )  # fmt: skip
+    return markdown(head, lines)
 
 
 @entry("office")
 def _office() -> str:
     columns = (
-        ("psnr_db", "PSNR [dB]", "{:.1f}"), ("perfect_db", "of a model without error", "{:.1f}"),
+        ("psnr_db", "PSNR [dB]", "{:.1f}"), ("perfect_db", "PSNR of a model without error [dB]", "{:.1f}"),
         ("total_rms_db", "total power, rms [dB]", "{:.2f}"), ("direction_within_3deg", "within 3 degrees", "{:.0%}"),
     )  # fmt: skip
     lines = [
@@ -115,6 +161,27 @@ def _office() -> str:
     return markdown(("carrier [GHz]", "spectra", "receivers", *(title for _, title, _ in columns)), lines)
 
 
+@entry("reciprocal")
+def _reciprocal() -> str:
+    rows, lines = read("reciprocal")["rows"], []
+    keys = "psnr_db", "psnr_db_reciprocal", "psnr_db_blocked", "psnr_db_blocked_reciprocal"
+    for geometry, truth in dict.fromkeys((r["geometry"], r["truth"]) for r in rows):
+        cells = []
+        for count in (10, 50):
+            all_, own, blocked, blocked_own = (
+                show(find(rows, geometry=geometry, truth=truth, n_train=count)[k]) for k in keys
+            )
+            cells.append(f"{all_} / {own} ({blocked} / {blocked_own})")
+        lines.append([geometry, truth, *cells])
+    return markdown(("geometry", "truth", "10 spectra", "50 spectra"), lines)
+
+
+@entry("limits")
+def _limits() -> str:
+    lines = [[r["what"], f"{r['figure']} {r['unit']}", r["date"]] for r in read("limits")["rows"]]
+    return markdown(("what", "figure", "stated on"), lines)
+
+
 @entry("arrays")
 def _arrays() -> str:
     found = read("arrays")
@@ -126,7 +193,7 @@ def _arrays() -> str:
         ]
         for r in found["rows"]
     ]
-    head = ("carrier [GHz]", "prediction", "PSNR [dB]", "over the nearest [dB]", "where blocked [dB]")
+    head = ("carrier [GHz]", "prediction", "PSNR [dB]", "over the nearest [dB]", "PSNR, blocked [dB]")
     return markdown(head, lines)
 
 
@@ -134,7 +201,7 @@ def _arrays() -> str:
 def _bare_mesh() -> str:
     found = read("bare_mesh")
     meshes = {"named": "names", "bare": "no names, no colours", "scan": "the same, scanned"}
-    head = ("room", "truth", "spectra", "mesh", "PSNR [dB]", "lost [dB]", "where blocked [dB]")
+    head = ("room", "truth", "spectra", "mesh", "PSNR [dB]", "lost [dB]", "PSNR, blocked [dB]")
     lines = []
     for r in found["rows"]:
         figures = (show(r["psnr_db"]), show(r["lost_db"], "{:.2f}"), show(r["psnr_db_blocked"]))

@@ -69,12 +69,6 @@ class PhotoLoss:
             rows[:, kernels.MARGIN : kernels.MARGIN + count] = image
         return wp.array(rows.reshape(-1), dtype=self.real, device=self.device)
 
-    def values(self, plane: wp.array, shape: tuple[int, ...]) -> np.ndarray:
-        """The image ``(*shape, 3)``, or panorama ``(*shape, 1)``, of a plane."""
-        rows = plane.numpy().reshape(math.prod(shape[:-1]), -1)
-        first = kernels.MARGIN + self.wrapped
-        return rows[:, first : first + self.channels * shape[-1]].reshape(*shape, self.channels)
-
     def moments(self, photo: wp.array, shape: tuple[int, ...]) -> tuple[wp.array, wp.array]:
         """Window averages of a photo and its square, of ``shape``."""
         columns = self._room(shape).averages

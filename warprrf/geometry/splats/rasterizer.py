@@ -28,7 +28,9 @@ from warprrf.kernels.raster.view import EXPONENTIAL, PINHOLE, PRODUCT, SPHERICAL
 PARTS = 8  # partial sums of gradients on a CPU, one writer each: the thread count changes nothing
 MOST_WEIGHTS = 1 << 16  # of a pixel that can be asked for
 GRAIN = 32  # a tile is work enough for few of them to be worth a thread
-PIXEL_TILE = 16  # pixels: side of a tile where each pixel has a thread of its own
+PIXEL_TILE = (
+    8  # pixels: side of a tile where each pixel has a thread of its own: it walks what any of them may see
+)
 
 RULES = {"product": PRODUCT, "exp": EXPONENTIAL}
 Parameters = tuple[wp.array, wp.array, wp.array, wp.array]

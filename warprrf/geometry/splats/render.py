@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,7 +12,7 @@ from warprrf.checks import check_array, check_count, checked, one_line
 from warprrf.device import DeviceLike, resolve
 from warprrf.geometry.splats.camera import Camera, check_camera
 from warprrf.geometry.splats.gaussians import Gaussians
-from warprrf.geometry.splats.rasterizer import RADIO, Blending, Parameters, Rasterizer
+from warprrf.geometry.splats.rasterizer import RADIO, Blending, Rasterizer
 
 
 @dataclass(frozen=True)
@@ -115,23 +114,9 @@ def blend_weights(
         TypeError, ValueError: naming the argument that does not fit.
     """
     _check(g, cam)
-    return next(blend_weights_of_each(g, [cam], top_k=top_k, blending=blending, device=device))
-
-
-def blend_weights_of_each(
-    g: Gaussians, cameras: Iterable[Camera], *, top_k: int, blending: Blending, device: DeviceLike = None
-) -> Iterator[BlendWeights]:
-    """:func:`blend_weights` of one camera after the other; the Gaussians go to the device once."""
     check_count("top_k", top_k)
     raster = Rasterizer(device=device, blending=blending)
-    parameters = raster.upload(g)
-    for cam in cameras:
-        yield _seen(raster, parameters, cam, int(top_k))
-
-
-def _seen(raster: Rasterizer, parameters: Parameters, cam: Camera, top_k: int) -> BlendWeights:
-    """Blending weights of one camera's pixels."""
-    found = raster.strongest(raster.prepare(*parameters, cam), top_k)
+    found = raster.strongest(raster.prepare(*raster.upload(g), cam), int(top_k))
     indices, weights, ranges, alpha = (array.numpy() for array in found)
     best = np.argmax(weights, axis=2)
     dominant = np.take_along_axis(indices, best[..., None], axis=2)[..., 0]

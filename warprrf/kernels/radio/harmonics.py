@@ -1,8 +1,9 @@
 """Fitting spherical harmonics to spectra on cached blending weights: forward, loss, hand-written adjoint.
 
 A pair is one Gaussian seen in one pixel of one receiver, with its blending weight ``w``. Pairs are stored Gaussian by
-Gaussian; a row is one Gaussian's stretch of them. Every sum has one owner, so that a launch split over threads gives
-the same bits as one thread: rows own their contributions and gradients, pixels own their power and loss.
+Gaussian; a row is one Gaussian's stretch of them, which may be empty. Every sum has one owner, so that a launch split
+over threads gives the same bits as one thread: rows own their contributions and gradients, pixels own their power and
+loss.
 
     row:    c_e = w_e u_g A(b_p . a_g)           A = exp, max(0, .), or the identity (delay and angle channels), u: unit
     pixel:  P_p = F_p sum_e c_e + X_p            F: solid angle and spreading loss, X: explicit line of sight
@@ -36,7 +37,7 @@ def build(real: type) -> SimpleNamespace:
     """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     types = {"vec3": wp.types.vector(3, real), "vec16": wp.types.vector(COEFFICIENTS, real)}
     forward, adjoint = _forward(real), _adjoints(real)
-    return SimpleNamespace(**types, **forward, **adjoint, evaluate_basis=_basis(real))
+    return SimpleNamespace(**types, **forward, **adjoint, **_sums(real), evaluate_basis=_basis(real))
 
 
 def _basis(real: type) -> wp.Kernel:
@@ -72,7 +73,6 @@ def _forward(real: type) -> dict[str, Any]:
     def contributions(
         offset: int,
         kind: int,
-        row_gaussian: wp.array(dtype=int),
         row_start: wp.array(dtype=int),
         pair_direction: wp.array(dtype=int),
         pair_weight: wp.array(dtype=real),
@@ -83,8 +83,8 @@ def _forward(real: type) -> dict[str, Any]:
     ):
         """``w_e u_g A(b_p . a_g)`` of every pair of a row."""
         row = offset + wp.tid()
-        a = coefficients[row_gaussian[row]]
-        u = unit[row_gaussian[row]]
+        a = coefficients[row]
+        u = unit[row]
         for e in range(row_start[row], row_start[row + 1]):
             contribution[e] = pair_weight[e] * u * gain(wp.dot(a, basis[pair_direction[e]]), kind)
 
@@ -208,7 +208,6 @@ def _adjoints(real: type) -> dict[str, Any]:
     def coefficient_adjoint(
         offset: int,
         kind: int,
-        row_gaussian: wp.array(dtype=int),
         row_start: wp.array(dtype=int),
         pair_pixel: wp.array(dtype=int),
         pair_direction: wp.array(dtype=int),
@@ -219,9 +218,9 @@ def _adjoints(real: type) -> dict[str, Any]:
         pixel_adjoint: wp.array(dtype=real),
         gradient: wp.array(dtype=vec16),
     ):
-        """``dL/da_g`` of the row's Gaussian: no other row of the batch has the same one."""
+        """``dL/da_g`` of the row's Gaussian, zero if the batch does not see it."""
         row = offset + wp.tid()
-        u = unit[row_gaussian[row]]
+        u = unit[row]
         total = vec16(real(0.0))
         for e in range(row_start[row], row_start[row + 1]):
             slope = pair_weight[e] * u
@@ -230,10 +229,70 @@ def _adjoints(real: type) -> dict[str, Any]:
             elif kind == CLAMPED and contribution[e] <= real(0.0):
                 slope = real(0.0)
             total += (pixel_adjoint[pair_pixel[e]] * slope) * basis[pair_direction[e]]
-        gradient[row_gaussian[row]] = total
+        gradient[row] = total
 
     return {
         "loss_adjoint": loss_adjoint,
         "absolute_adjoint": absolute_adjoint,
         "coefficient_adjoint": coefficient_adjoint,
     }
+
+
+def _sums(real: type) -> dict[str, Any]:
+    """What pairs and pixels carry, put in order and added up."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def put_in_order(
+        offset: int,
+        first: int,
+        pair_of_pixel: wp.array(dtype=int),
+        values: wp.array(dtype=wp.float32),
+        out: wp.array(dtype=real),
+    ):
+        """Values of a receiver's pairs, pixel by pixel from pair ``first`` on, where their Gaussians have them."""
+        e = offset + wp.tid()
+        out[pair_of_pixel[first + e]] = real(values[e])
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add_to_means(
+        offset: int,
+        row_start: wp.array(dtype=int),
+        pair_pixel: wp.array(dtype=int),
+        pair_weight: wp.array(dtype=real),
+        values: wp.array(dtype=wp.float64),
+        total: wp.array(dtype=wp.float64),
+        summed: wp.array(dtype=wp.float64),
+    ):
+        """Add a row's weights, and these times the values of their pixels; a value of NaN does not count."""
+        row = offset + wp.tid()
+        weight = wp.float64(0.0)
+        product = wp.float64(0.0)
+        for e in range(row_start[row], row_start[row + 1]):
+            value = values[pair_pixel[e]]
+            if not wp.isnan(value):
+                weight += wp.float64(pair_weight[e])
+                product += wp.float64(pair_weight[e]) * value
+        total[row] = total[row] + weight
+        summed[row] = summed[row] + product
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def row_errors(
+        offset: int,
+        width: int,
+        stride: int,
+        wrapped: int,
+        absolute: wp.array(dtype=real),
+        score: wp.array(dtype=real),
+        out: wp.array(dtype=wp.vec2d),
+    ):
+        """Sums over a row of an image: of ``|u - t|``, and of the plane of similarities, if that is not empty."""
+        row = offset + wp.tid()
+        error = wp.float64(0.0)
+        similarity = wp.float64(0.0)
+        for x in range(width):
+            error += wp.float64(absolute[row * width + x])
+            if score.shape[0] > 0:
+                similarity += wp.float64(score[row * stride + wp.static(MARGIN) + wrapped + x])
+        out[row] = wp.vec2d(error, similarity)
+
+    return {"put_in_order": put_in_order, "add_to_means": add_to_means, "row_errors": row_errors}

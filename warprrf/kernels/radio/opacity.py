@@ -7,6 +7,8 @@ A pixel's pairs lie front to back in ``pair_of_pixel``. With response ``r_e`` of
 and, with contributions ``c_e = w_e u_g A_e`` to the pixel's sum C and v = dL/dC,
 
     dL/do_g = sum_e v r_e (c_e / alpha_e - (C - C_<=e) / (1 - alpha_e)),      zero where alpha is clamped.
+
+Opacities are moved by their logits, between two limits.
 """
 
 from types import SimpleNamespace
@@ -67,4 +69,51 @@ def build(real: type) -> SimpleNamespace:
                 slope = response * (contribution[e] / alpha - behind / (real(1.0) - alpha))
             pair_adjoint[e] = pixel_adjoint[p] * slope
 
-    return SimpleNamespace(blend=blend, blend_adjoint=blend_adjoint)
+    @wp.kernel(module="unique", enable_backward=False)
+    def add_rows(
+        offset: int,
+        row_start: wp.array(dtype=int),
+        pair_adjoint: wp.array(dtype=real),
+        gradient: wp.array(dtype=real),
+    ):
+        """``dL/do_g``: the sum over the Gaussian's pairs."""
+        row = offset + wp.tid()
+        total = real(0.0)
+        for e in range(row_start[row], row_start[row + 1]):
+            total += pair_adjoint[e]
+        gradient[row] = total
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def to_logits(offset: int, opacity: wp.array(dtype=real), gradient: wp.array(dtype=real)):
+        """The derivative by an opacity becomes that by its logit."""
+        row = offset + wp.tid()
+        gradient[row] = gradient[row] * opacity[row] * (real(1.0) - opacity[row])
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def activate(
+        offset: int, low: real, high: real, logits: wp.array(dtype=real), opacity: wp.array(dtype=real)
+    ):
+        """Opacities from logits, which are held between ``low`` and ``high``."""
+        row = offset + wp.tid()
+        logit = wp.clamp(logits[row], low, high)
+        logits[row] = logit
+        opacity[row] = real(1.0) / (real(1.0) + wp.exp(-logit))
+
+    return SimpleNamespace(
+        blend=blend, blend_adjoint=blend_adjoint, add_rows=add_rows, to_logits=to_logits, activate=activate
+    )
+
+
+@wp.kernel(enable_backward=False)
+def owners(offset: int, row_start: wp.array(dtype=int), pair_gaussian: wp.array(dtype=int)):
+    """The row that each pair is of."""
+    row = offset + wp.tid()
+    for e in range(row_start[row], row_start[row + 1]):
+        pair_gaussian[e] = row
+
+
+@wp.kernel(enable_backward=False)
+def count_up(offset: int, out: wp.array(dtype=int)):
+    """0, 1, 2, ..."""
+    i = offset + wp.tid()
+    out[i] = i

@@ -19,6 +19,7 @@ from typing import Any
 import warp as wp
 
 from warprrf.cache import once
+from warprrf.kernels.radio import slabs
 
 MOST = 7
 """Interactions on a record at most."""
@@ -37,6 +38,7 @@ def build(real: type) -> Any:
     """Kernels in precision ``real``: power of each record, its slopes summed by bins, and sums by group and component."""
     vec2, vec3 = wp.types.vector(2, real), wp.types.vector(3, real)
     mat2 = wp.types.matrix((2, 2), real)
+    slab_field = slabs.build(real).slab
 
     @wp.struct
     class Materials:
@@ -100,50 +102,16 @@ def build(real: type) -> Any:
         return vec2(te, tm)
 
     @wp.func
-    def times(a: vec2, b: vec2):
-        """Product of complex numbers (real, imaginary)."""
-        return vec2(a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0])
-
-    @wp.func
-    def over(a: vec2, b: vec2):
-        """Quotient of complex numbers."""
-        return times(a, vec2(b[0], -b[1])) / wp.length_sq(b)
-
-    @wp.func
-    def slab(eta: vec2, thickness: real, c: real, through: int):
-        """Size of the reflection (TE, TM) of a slab of ``thickness`` wavelengths, or of what it lets ``through``. ITU-R P.2040-4,
-        eqs. (37), (43), (44)."""
-        a = eta - vec2(real(1.0) - c * c, real(0.0))
-        size = wp.length(a)
-        root = vec2(
-            wp.sqrt(real(0.5) * wp.max(size + a[0], real(0.0))),
-            wp.sqrt(real(0.5) * wp.max(size - a[0], real(0.0))),
-        )
-        if a[1] < real(0.0):
-            root = vec2(root[0], -root[1])
-        once = vec2(real(0.0), real(0.0))  # nothing comes back from, or through, a half-space
-        if not wp.isinf(thickness):
-            q = real(6.283185307179586) * thickness * root
-            once = wp.exp(q[1]) * vec2(wp.cos(q[0]), -wp.sin(q[0]))
-        echo = times(once, once)
-        one = vec2(real(1.0), real(0.0))
-        found = vec2()
-        for k in range(2):
-            near = vec2(c, real(0.0))
-            if k == 1:
-                near = c * eta
-            face = over(near - root, near + root)
-            wave = times(face, one - echo)
-            if through == 1:
-                wave = times(one - times(face, face), once)
-            found[k] = wp.length(over(wave, one - times(times(face, face), echo)))
-        return found
+    def slab(eta: vec2, thickness: real, c: real, mirrors: wp.bool):
+        """Size of what a slab of ``thickness`` wavelengths reflects of (TE, TM), or lets through."""
+        te, tm, _longer = slab_field(eta, thickness, c, mirrors)
+        return vec2(wp.length(te), wp.length(tm))
 
     @wp.func
     def reflection(m: Materials, x: real, row: int, c: real):
         """Reflection (TE, TM) of a material: of a half-space with its sign; of a slab its size, as one mirror needs."""
         if m.slab == 1:
-            return slab(m.permittivity[row], m.thickness[row], c, 0)
+            return slab(m.permittivity[row], m.thickness[row], c, True)
         return half_space(x, c)
 
     @wp.func
@@ -163,7 +131,7 @@ def build(real: type) -> Any:
             thickness = m.thickness[row]
             if through == 1 and angle[2] > real(0.0):
                 thickness = angle[2]
-            return slab(m.permittivity[row], thickness, angle[0], through)
+            return slab(m.permittivity[row], thickness, angle[0], through == 0)
         r = half_space(x, angle[0])
         if through == 1:
             r = vec2(real(1.0) - r[0] * r[0], real(1.0) - r[1] * r[1])

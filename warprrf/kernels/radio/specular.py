@@ -14,7 +14,10 @@ element written once: the adjoint of a loop reads it there, and would not know a
 
 import warp as wp
 
+from warprrf.kernels.radio import slabs
+
 real = wp.float64
+times, spun, slab = (getattr(slabs.build(real), name) for name in ("times", "spun", "slab"))
 SPEED_OF_LIGHT = wp.constant(real(299_792_458.0))
 VACUUM_PERMITTIVITY = wp.constant(real(8.8541878128e-12))  # [F/m]
 TURN = wp.constant(real(6.283185307179586))
@@ -48,77 +51,6 @@ class Sequences:
     material: wp.array2d(dtype=wp.int32)
     solid_m: wp.array2d(dtype=real)
     frequency_hz: real
-
-
-@wp.func
-def times(a: wp.vec2d, b: wp.vec2d):
-    """Product of complex numbers (real, imaginary)."""
-    return wp.vec2d(a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0])
-
-
-@wp.func
-def over(a: wp.vec2d, b: wp.vec2d):
-    """Quotient of complex numbers; ``a`` where ``b`` is 0."""
-    found = a
-    if b[0] != real(0.0) or b[1] != real(0.0):
-        found = times(a, wp.vec2d(b[0], -b[1])) / wp.dot(b, b)
-    return found
-
-
-@wp.func
-def root_of(a: wp.vec2d):
-    """Square root of a complex number, its real part positive."""
-    size = wp.dot(a, a)
-    found = wp.vec2d(real(0.0), real(0.0))
-    if size > real(0.0):
-        large = wp.sqrt(real(0.5) * (wp.sqrt(size) + wp.abs(a[0])))
-        small = real(0.5) * a[1] / large
-        found = wp.vec2d(large, small)
-        if a[0] < real(0.0):
-            found = wp.vec2d(wp.abs(small), wp.where(a[1] > real(0.0), large, -large))
-    return found
-
-
-@wp.func
-def spun(angle: real):
-    """exp(-j angle)."""
-    return wp.vec2d(wp.cos(angle), -wp.sin(angle))
-
-
-@wp.func
-def shared(wave: wp.vec2d, face: wp.vec2d, echo: wp.vec2d, none: wp.vec2d):
-    """``wave`` over 1 - face^2 echo; ``none`` where that is 0, as at grazing of a slab without thickness."""
-    below = wp.vec2d(real(1.0), real(0.0)) - times(times(face, face), echo)
-    found = none
-    if below[0] != real(0.0) or below[1] != real(0.0):
-        found = over(wave, below)
-    return found
-
-
-@wp.func
-def slab(eta: wp.vec2d, thickness_m: real, wavelength_m: real, c: real, mirrors: wp.bool):
-    """What a slab makes of a field at cosine ``c``: (TE, TM) that it reflects, or lets through less the phase of the way
-    through, and by how much that way is longer than in air [m]. ITU-R P.2040-4, eqs. (37a), (37b), (43a), (43b), (44)."""
-    one = wp.vec2d(real(1.0), real(0.0))
-    root = root_of(eta - (real(1.0) - c * c) * one)
-    once = real(0.0) * one  # nothing comes back from, or through, a half-space
-    faded = real(0.0) * one
-    longer = real(0.0)
-    if not wp.isinf(thickness_m):
-        turns = TURN * thickness_m / wavelength_m
-        faded = wp.exp(turns * root[1]) * one
-        once = times(faded, spun(turns * root[0]))
-        longer = thickness_m * (root[0] - c)
-    echo = times(once, once)
-    before = c * one
-    te = over(before - root, before + root)
-    tm = over(c * eta - root, c * eta + root)
-    te_out = shared(times(te, one - echo), te, echo, real(0.0) * one)
-    tm_out = shared(times(tm, one - echo), tm, echo, real(0.0) * one)
-    if not mirrors:
-        te_out = shared(times(one - times(te, te), faded), te, echo, faded)
-        tm_out = shared(times(one - times(tm, tm), faded), tm, echo, faded)
-    return te_out, tm_out, longer
 
 
 @wp.func
@@ -260,7 +192,8 @@ def follow_paths(
             thick = thickness_m[m]
             if not mirrors and not wp.isnan(paths.solid_m[i, j]):
                 thick = paths.solid_m[i, j]
-            te, tm, longer = slab(eta, thick, wavelength_m, cosine, mirrors)
+            te, tm, longer = slab(eta, thick / wavelength_m, cosine, mirrors)
+            longer = wavelength_m * longer
             if mirrors:
                 longer = real(0.0)
                 rough = TURN * roughness_m[m] / wavelength_m  # 8 (pi sigma_h / lambda)^2 is twice its square

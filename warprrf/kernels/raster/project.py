@@ -17,7 +17,9 @@ gradients of mean, quaternion and scale. In the turned coordinates of the linear
 ``y = (-|M m| (g1^2 + g2^2), |M m| g0 g1, |M m| g0 g2)/|g|^2``.
 
 Bounds of the tiles that an ellipsoid can touch never leave one out: a plane through the ray origin with normal l touches
-it where l^T C l = 0, with its half axes the columns of A, its centre m, and C = A A^T - m m^T.
+it where l^T C l = 0, with its half axes the columns of A, its centre m, and C = A A^T - m m^T. They are float32, as only
+tiles are to be told from them: no difference is taken of numbers that are nearly alike, and bounds reach further by what
+rounding may err.
 """
 
 from typing import Any
@@ -27,23 +29,24 @@ import warp as wp
 from warprrf.cache import once
 from warprrf.kernels.raster.view import PINHOLE, Rules, View, rotation_matrix
 
-PI = wp.constant(wp.float64(3.141592653589793))
+PI = wp.constant(3.141592653589793)
+ON_ONE_SIDE = 0.02
+"""A plane passes an ellipsoid if its distance from the centre, squared, exceeds the half width's by this share: less, and
+float32 would err by more than the slack."""
+SLACK, SLACK_A_PIXEL = (
+    0.01,
+    2.0e-5,
+)  # pixels, and of each of an image's: seven roundings of 2^-24, over ON_ONE_SIDE
+SLACK_ANGLE = 1.0e-5  # radians
 
 
 @wp.func
-def tangent_interval(c11: wp.float64, c13: wp.float64, c33: wp.float64):
-    """Roots of ``c33 x^2 - 2 c13 x + c11``: where image lines x = const touch the silhouette (c33 < 0)."""
-    root = wp.sqrt(wp.max(c13 * c13 - c11 * c33, wp.float64(0.0)))
-    return wp.vec2d((c13 + root) / c33, (c13 - root) / c33)
-
-
-@wp.func
-def tile_span(lo: wp.float64, hi: wp.float64, pixels: int, tile: int):
+def tile_span(lo: float, hi: float, pixels: int, tile: int):
     """First and last tile with a pixel centre in [lo, hi] (pixel coordinates); (0, -1) where there is none."""
-    slack = wp.float64(1.0e-3)  # pixels: covers the rounding of the bounds
-    beyond = wp.float64(pixels + 1)
-    first = int(wp.ceil(wp.clamp(lo - slack, wp.float64(-1.0), beyond) - wp.float64(0.5)))
-    last = int(wp.floor(wp.clamp(hi + slack, wp.float64(-1.0), beyond) - wp.float64(0.5)))
+    slack = wp.static(SLACK) + wp.static(SLACK_A_PIXEL) * float(pixels)
+    beyond = float(pixels + 1)
+    first = int(wp.ceil(wp.clamp(lo - slack, -1.0, beyond) - 0.5))
+    last = int(wp.floor(wp.clamp(hi + slack, -1.0, beyond) - 0.5))
     first = wp.max(first, 0)
     last = wp.min(last, pixels - 1)
     if first > last:
@@ -52,67 +55,75 @@ def tile_span(lo: wp.float64, hi: wp.float64, pixels: int, tile: int):
 
 
 @wp.func
-def covered_in_photo(view: View, m: wp.vec3d, distance: wp.float64, c: wp.mat33d, cap: wp.float64):
-    """:func:`covered_tiles` of a pinhole camera; ``cap`` is the angle round the mean that holds the ellipsoid."""
-    if c[1, 1] < wp.float64(0.0):  # the ellipsoid lies on one side of the camera plane
-        if m[1] <= wp.float64(0.0):
+def covered_in_photo(view: View, m: wp.vec3, axes: wp.mat33, cap: float):
+    """:func:`covered_tiles` of a pinhole camera; ``cap`` is the angle round the mean that holds the ellipsoid.
+
+    Where it lies on one side of the camera plane, lines x = const touch the silhouette at the roots of
+    c11 x^2 - 2 c01 x + c00, C = axes axes^T - m m^T. Their distance is that of the same without the determinant of
+    axes axes^T, which makes it larger and needs no difference of large numbers.
+    """
+    depth = m[1] * m[1]
+    c11 = wp.dot(axes[1], axes[1]) - depth
+    if c11 < -wp.static(ON_ONE_SIDE) * depth:
+        if m[1] <= 0.0:
             return wp.vec4i(0, 0, 0, 0)
-        x = tangent_interval(c[0, 0], c[0, 1], c[1, 1])
-        y = tangent_interval(c[2, 2], c[1, 2], c[1, 1])
-        tx = tile_span(view.fx * x[0] + view.cx, view.fx * x[1] + view.cx, view.width, view.tile)
-        ty = tile_span(view.fy * y[0] + view.cy, view.fy * y[1] + view.cy, view.height, view.tile)
+        fx, fy, cx, cy = float(view.fx), float(view.fy), float(view.cx), float(view.cy)
+        x = fx * (wp.dot(axes[0], axes[1]) - m[0] * m[1]) / c11 + cx
+        y = fy * (wp.dot(axes[2], axes[1]) - m[2] * m[1]) / c11 + cy
+        wide = -fx * wp.length(m[1] * axes[0] - m[0] * axes[1]) / c11
+        high = -fy * wp.length(m[1] * axes[2] - m[2] * axes[1]) / c11
+        tx = tile_span(x - wide, x + wide, view.width, view.tile)
+        ty = tile_span(y - high, y + high, view.height, view.tile)
         return wp.vec4i(tx[0], tx[1] - tx[0] + 1, ty[0], ty[1] - ty[0] + 1)
-    corner = wp.vec2d(
-        wp.max(view.cx, wp.float64(view.width) - view.cx) / view.fx,
-        wp.max(view.cy, wp.float64(view.height) - view.cy) / view.fy,
+    corner = wp.vec2(
+        float(wp.max(view.cx, wp.float64(view.width) - view.cx) / view.fx),
+        float(wp.max(view.cy, wp.float64(view.height) - view.cy) / view.fy),
     )
-    off_axis = wp.acos(wp.clamp(m[1] / distance, wp.float64(-1.0), wp.float64(1.0)))
-    if off_axis > cap + wp.atan(wp.length(corner)):
+    off_axis = wp.atan2(wp.length(wp.vec2(m[0], m[2])), m[1])
+    if off_axis > cap + wp.atan(wp.length(corner)) + wp.static(SLACK_ANGLE):
         return wp.vec4i(0, 0, 0, 0)
     return wp.vec4i(0, view.tiles_x, 0, view.tiles_y)
 
 
 @wp.func
-def azimuth_interval(m: wp.vec3d, c: wp.mat33d):
-    """Azimuths relative to that of the mean between which the silhouette lies, seen along the pole axis: the same
-    conic in the horizontal plane. (-pi, pi) where the pole axis meets the ellipse or it reaches behind it sideways."""
-    c11 = c[0, 0]
-    c12 = c[0, 1]
-    c22 = c[1, 1]
-    # In the frame whose first axis points at the mean: l = (-sin p, cos p), and tan p solves a quadratic.
+def azimuth_interval(m: wp.vec3, axes: wp.mat33):
+    """Azimuths relative to that of the mean between which the silhouette lies, seen along the pole axis: in the frame
+    whose first axis points at the mean, tan p solves d11 t^2 - 2 d12 t + d22 = 0, with D = axes axes^T - m m^T in the
+    horizontal plane. (-pi, pi) where the ellipse meets the pole axis or reaches behind it sideways."""
     rho = wp.sqrt(m[0] * m[0] + m[1] * m[1])
     cp = m[0] / rho
     sp = m[1] / rho
-    d11 = cp * cp * c11 + wp.float64(2.0) * cp * sp * c12 + sp * sp * c22
-    d12 = -cp * sp * c11 + (cp * cp - sp * sp) * c12 + cp * sp * c22
-    d22 = sp * sp * c11 - wp.float64(2.0) * cp * sp * c12 + cp * cp * c22
-    if c11 * c22 - c12 * c12 < wp.float64(0.0) and d11 < wp.float64(0.0):
-        t = tangent_interval(d22, d12, d11)
-        return wp.vec2d(wp.atan(t[0]), wp.atan(t[1]))
-    return wp.vec2d(-PI, PI)
+    along = cp * axes[0] + sp * axes[1]
+    across = cp * axes[1] - sp * axes[0]
+    d11 = wp.dot(along, along) - rho * rho
+    d12 = wp.dot(along, across)
+    if d11 < -wp.static(ON_ONE_SIDE) * rho * rho:
+        root = wp.sqrt(d12 * d12 - d11 * wp.dot(across, across))
+        return wp.vec2(wp.atan((d12 + root) / d11), wp.atan((d12 - root) / d11))
+    return wp.vec2(-PI, PI)
 
 
 @wp.func
-def covered_in_panorama(view: View, m: wp.vec3d, distance: wp.float64, c: wp.mat33d, cap: wp.float64):
+def covered_in_panorama(view: View, m: wp.vec3, axes: wp.mat33, cap: float):
     """:func:`covered_tiles` of a spherical camera; columns wrap."""
-    per_radian = wp.float64(view.height) / PI
-    zenith = wp.acos(wp.clamp(m[2] / distance, wp.float64(-1.0), wp.float64(1.0)))
+    per_radian = float(view.height) / PI
+    zenith = wp.atan2(wp.length(wp.vec2(m[0], m[1])), m[2])
     ty = tile_span((zenith - cap) * per_radian, (zenith + cap) * per_radian, view.height, view.tile)
     rows = ty[1] - ty[0] + 1
-    half = azimuth_interval(m, c)
+    half = azimuth_interval(m, axes)
     if half[1] == PI:
         return wp.vec4i(0, view.tiles_x, ty[0], rows)
     azimuth = wp.atan2(m[1], m[0])
-    w = wp.float64(view.width)
-    lo = (azimuth + half[0] + PI) * w / (wp.float64(2.0) * PI)
-    hi = (azimuth + half[1] + PI) * w / (wp.float64(2.0) * PI)
-    if lo < wp.float64(0.0):
+    w = float(view.width)
+    lo = (azimuth + half[0] + PI) * w / (2.0 * PI)
+    hi = (azimuth + half[1] + PI) * w / (2.0 * PI)
+    if lo < 0.0:
         lo += w
         hi += w
     tx = tile_span(lo, wp.min(hi, w), view.width, view.tile)
     if hi <= w:
         return wp.vec4i(tx[0], tx[1] - tx[0] + 1, ty[0], rows)
-    rest = tile_span(wp.float64(0.0), hi - w, view.width, view.tile)
+    rest = tile_span(0.0, hi - w, view.width, view.tile)
     if tx[1] < tx[0]:
         return wp.vec4i(rest[0], rest[1] - rest[0] + 1, ty[0], rows)
     if rest[1] < rest[0]:
@@ -121,7 +132,7 @@ def covered_in_panorama(view: View, m: wp.vec3d, distance: wp.float64, c: wp.mat
 
 
 @wp.func
-def covered_tiles(view: View, m: wp.vec3d, axes: wp.mat33d, extent: wp.float64, inside: bool):
+def covered_tiles(view: View, m: wp.vec3, axes: wp.mat33, extent: float, inside: bool):
     """Tiles that an ellipsoid can touch: first column, columns, first row, rows; columns wrap on a sphere.
 
     Its half axes are the columns of ``axes``, the longest one ``extent``, its centre ``m``, in the view's axes.
@@ -129,14 +140,13 @@ def covered_tiles(view: View, m: wp.vec3d, axes: wp.mat33d, extent: wp.float64, 
     """
     if inside:
         return wp.vec4i(0, view.tiles_x, 0, view.tiles_y)
-    c = axes * wp.transpose(axes) - wp.outer(m, m)
-    distance = wp.length(m)
     cap = PI  # a long ellipsoid close by reaches more than 90 degrees from its mean
-    if extent < distance:
-        cap = wp.asin(extent / distance)
+    share = extent * wp.static(1.0 + SLACK_ANGLE) / wp.length(m)
+    if share < 1.0:
+        cap = wp.asin(share)
     if view.kind == wp.static(PINHOLE):
-        return covered_in_photo(view, m, distance, c, cap)
-    return covered_in_panorama(view, m, distance, c, cap)
+        return covered_in_photo(view, m, axes, cap)
+    return covered_in_panorama(view, m, axes, cap)
 
 
 CHANNELS = 4  # feature channels blended by one launch
@@ -236,9 +246,8 @@ def build_project(real: type) -> Any:
         length = wp.length(a)
         steepness = length / smin
         radius = wp.sqrt(cut)
-        tiles = covered_tiles(
-            view, m, r * wp.diag(radius * s), radius * wp.max(s), steepness * steepness <= cut
-        )
+        axes = wp.mat33(r * wp.diag(radius * s))
+        tiles = covered_tiles(view, wp.vec3(m), axes, float(radius * wp.max(s)), steepness * steepness <= cut)
         if tiles[1] * tiles[3] == 0:
             return
         span[i] = tiles

@@ -143,6 +143,37 @@ def cast_rays(
 
 
 @wp.kernel(enable_backward=False)
+def see(
+    offset: int,
+    mesh: wp.uint64,
+    center: wp.vec3d,
+    radius: wp.float64,
+    planes: wp.array(dtype=wp.vec4d),
+    clearance: wp.float64,
+    a: wp.array(dtype=wp.vec3d),
+    b: wp.array(dtype=wp.vec3d),
+    free: wp.array(dtype=wp.int8),
+):
+    """1 where nothing lies between ``a`` and ``b`` but within ``clearance`` [m] of an end, else 0; BAD where a point is not
+    finite."""
+    i = offset + wp.tid()
+    start = a[wp.min(i, a.shape[0] - 1)]
+    way = b[wp.min(i, b.shape[0] - 1)] - start
+    size = wp.length(way)
+    if not wp.isfinite(size):
+        free[i] = wp.int8(BAD)
+        return
+    free[i] = wp.int8(1)
+    if size > wp.float64(2.0) * clearance:
+        origin = start - center
+        inner = size - clearance
+        scale = rounding_scale(origin, radius)
+        t, _ = search(mesh, planes, origin, way, size, scale, clearance, inner)
+        if t < inner:
+            free[i] = wp.int8(0)
+
+
+@wp.kernel(enable_backward=False)
 def pack_rays(
     offset: int,
     center: wp.vec3d,

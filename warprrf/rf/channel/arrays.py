@@ -180,16 +180,6 @@ def plane_wave_error(
     )
 
 
-def _largest_phase(array: PlanarArray, distance_m: float, wavelength_m: float, unit: np.ndarray) -> float:
-    """Largest phase error [rad], not wrapped: r_n - (r - u . d) for elements at d."""
-    place = array.positions(wavelength_m)
-    along = place @ unit
-    each = np.linalg.norm(distance_m * unit - place, axis=1)
-    across = (place**2).sum(axis=1) - along**2  # r_n^2 = (r - u . d)^2 + across
-    extra = across / (each + np.abs(distance_m - along))
-    return float(2.0 * np.pi / wavelength_m * extra.max())
-
-
 ISOTROPIC = PlanarArray(1, 1)
 """One isotropic element without polarisation."""
 

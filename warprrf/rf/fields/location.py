@@ -24,6 +24,7 @@ class Location:
         misfit: root mean square error of what was read, over what the field and the readings state: about 1.
         gains_db: of measuring chains of unknown gain, by name [dB].
         azimuth_zeros: what was added to azimuths of an unknown zero, by table's name [rad].
+        clock_offsets_s: what was added to delays of an unknown zero, by table's name [s].
     """
 
     __repr__ = one_line
@@ -36,6 +37,7 @@ class Location:
     misfit: float
     gains_db: Mapping[str, float]
     azimuth_zeros: Mapping[str, float]
+    clock_offsets_s: Mapping[str, float]
 
     @property
     def std_m(self) -> float:

@@ -125,6 +125,8 @@ class Readings(PowerTable):
         name: by which a report tells these readings from others; several of one name are numbered in the order given.
         azimuth_known: False where azimuths of ``arrival`` count from an unknown zero, one for all: a fit then finds it
             from line of sight and mirrors. Give readings whose zeros differ as several data sets.
+        clock_known: False where ``delay_s`` counts from an unknown zero, one for all, found likewise; one of the two zeros
+            has to be known.
         position_std_m: standard deviation of each coordinate of the receivers [m]; above 0 a fit finds where they stood.
 
     Raises:
@@ -150,6 +152,7 @@ class Readings(PowerTable):
     air: Air | None = None
     name: str = "readings"
     azimuth_known: bool = True
+    clock_known: bool = True
     position_std_m: float = 0.0
 
     _rows = (*PowerTable._rows, "floor", "arrival", "departure", "delay_s", "chain", "std_db")
@@ -178,6 +181,11 @@ class Readings(PowerTable):
         check_type("azimuth_known", self.azimuth_known, bool)
         if not self.azimuth_known and self.arrival is None:
             raise ValueError("azimuth_known: got False without arrival, whose zero is to be found")
+        check_type("clock_known", self.clock_known, bool)
+        if not self.clock_known and self.delay_s is None:
+            raise ValueError("clock_known: got False without delay_s, whose zero is to be found")
+        if not self.clock_known and not self.azimuth_known:
+            raise ValueError("clock_known: got False, and azimuth_known too; expected one zero known")
         check_number("position_std_m", self.position_std_m, 0.0, 1.0)
         if self.position_std_m > 0 and self.total:
             raise ValueError(
@@ -207,6 +215,11 @@ class Readings(PowerTable):
     def total(self) -> bool:
         """Whether each holds all power of its place: no directions, no delays."""
         return self.arrival is None and self.departure is None and self.delay_s is None
+
+    @property
+    def zero_known(self) -> bool:
+        """Whether azimuths and delays count from known zeros."""
+        return self.azimuth_known and self.clock_known
 
     def without_side_lobes(self) -> Readings:
         """The same of antennas with nothing but their main lobes; see :func:`main_lobe`."""
@@ -438,7 +451,7 @@ def _path_weights(
             once, own = np.unique(turned[rows], axis=0, return_inverse=True)
             weight *= turned_gain(as_antenna(pattern), once, path)[own.reshape(-1)]
     if r.delay_s is not None and r.bandwidth_hz is not None:
-        weight *= _tap(r.bandwidth_hz * (r.delay_s[rows, None] - delay_s), r.window)
+        weight *= tap_share(r.bandwidth_hz * (r.delay_s[rows, None] - delay_s), r.window)
     return weight
 
 
@@ -465,7 +478,7 @@ def antenna_of(name: str, pattern: Pattern) -> Antenna:
     return found
 
 
-def _tap(place: np.ndarray, window: str) -> np.ndarray:
+def tap_share(place: np.ndarray, window: str) -> np.ndarray:
     """Share of a path's power in a tap ``place`` (in units of 1 / bandwidth) from it; over all taps they add up to 1."""
     if window == "rectangular":
         return np.asarray(np.sinc(place) ** 2)

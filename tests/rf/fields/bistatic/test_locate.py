@@ -8,7 +8,9 @@ import pytest
 from furnished import RECEIVERS
 
 import warprrf as wr
+from warprrf.rf.fields.bistatic.field_map import maps_of
 from warprrf.rf.fields.bistatic.locate import Question, as_data
+from warprrf.rf.spectra.spectrum import directions_from_angles, pixel_solid_angles, sub_pixel_directions
 from warprrf.rf.tracing.render import path_gains
 
 UNSEEN = np.array([[3.9, 2.0, 1.4], [1.7, 3.1, 1.2]])
@@ -67,11 +69,65 @@ def test_a_horn_of_unknown_gain_and_azimuth_finds_all_three(field, horn):
     assert abs(np.angle(np.exp(1j * (found.azimuth_zeros["scan"] - TURN)))) < np.radians(2.0)
 
 
+def profiles(field, place, late_s):
+    """Taps of 2 GHz from three transmitters at ``place``, as the field has them; the clock is ``late_s`` late."""
+    sources, taps, power = [field.transmitter, *OTHERS[:2]], np.arange(0.0, 60e-9, 0.4e-9), []
+    for source in sources:
+        paths = field.paths(place, source)
+        power.append(np.sinc(2e9 * (taps[:, None] - paths.tau)) ** 2 @ paths.power)
+    return wr.Readings(
+        np.repeat(sources, len(taps), axis=0), place, np.concatenate(power), field.frequency_hz, 1e-3 * np.max(power),
+        delay_s=np.tile(taps + late_s, 3), bandwidth_hz=2e9, clock_known=False, name="profiles",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("k", [0, 1])
+def test_profiles_of_delay_tell_the_place_and_how_late_their_clock_is(field, k):
+    found = field.locate(profiles(field, UNSEEN[k], 137e-9))
+    assert np.linalg.norm(found.position - UNSEEN[k]) < 0.05
+    assert found.clock_offsets_s["profiles"] == pytest.approx(-137e-9, abs=0.2e-9)
+    assert found.known and not found.azimuth_zeros
+
+
+def test_pointings_of_the_transmitting_antenna_tell_the_place(field):
+    """Of two transmitters; one alone tells a receiver's direction, and little of its distance."""
+    angles = np.array([(np.pi / 2 - up, az) for up in (-0.5, 0.0, 0.5) for az in np.arange(-3.1, 3.1, 0.15)])
+    pattern, power = wr.horn(np.radians(10.0)), []
+    sources = [field.transmitter, OTHERS[0]]
+    for source in sources:
+        paths = field.paths(UNSEEN[0], source)
+        toward = directions_from_angles(*angles.T) @ paths.departure.T
+        power.append(pattern.gain_off_boresight(np.arccos(np.clip(toward, -1.0, 1.0))) @ paths.power)
+    found = field.locate(
+        wr.Readings(
+            np.repeat(sources, len(angles), axis=0), UNSEEN[0], np.concatenate(power), field.frequency_hz,
+            1e-3 * np.max(power), departure=np.tile(angles, (2, 1)), transmit_pattern=pattern,
+        )
+    )  # fmt: skip
+    assert np.linalg.norm(found.position - UNSEEN[0]) < 0.15
+
+
+def test_a_map_s_departures_are_those_of_paths_that_met_one_surface(field):
+    m = maps_of(field, [field.transmitter])[field.transmitter.tobytes()]
+    p = int(np.linalg.norm(m.places - UNSEEN[0], axis=1).argmin())
+    found = m.departures(field.transmitter)[p].reshape(*m.image.shape[1:], 3)
+    hit = field.mesh.cast(m.places[p], sub_pixel_directions(m.image.shape[1:], 1)[0])
+    out = hit.point - field.transmitter
+    diffuse = np.abs(np.linalg.norm(out, axis=1) + hit.t - m.length[p].ravel()) < 1e-3
+    out /= np.linalg.norm(out, axis=1, keepdims=True)
+    assert diffuse.mean() > 0.5
+    np.testing.assert_allclose(found.reshape(-1, 3)[diffuse], out[diffuse], atol=1e-3)
+    line = m.places[p] - field.transmitter
+    sight = np.unravel_index(m.image[p].argmax(), m.image.shape[1:])
+    assert m.length[p][sight] == pytest.approx(np.linalg.norm(line), rel=1e-6)
+    np.testing.assert_allclose(found[sight], line / np.linalg.norm(line), atol=1e-3)
+
+
 def test_what_cannot_be_located_is_refused(scene, field, horn):
     ds = furnished.spectra(scene, UNSEEN)
     for what, text in (
         (ds, "spectra of 2 receivers"), (replace(ds.subset([0]), frequency_hz=140e9), "at_frequency"),
-        (replace(horn, departure=horn.arrival, transmit_pattern=horn.receive_pattern), "by departure"), (3, "int"),
+        (replace(horn, departure=horn.arrival, transmit_pattern=horn.receive_pattern), "beside departures"), (3, "int"),
     ):  # fmt: skip
         with pytest.raises((TypeError, ValueError), match=text):
             as_data(field, what)
@@ -112,6 +168,14 @@ def test_receivers_traced_at_once_get_what_each_gets_alone(field):
         np.testing.assert_array_equal(found.view.receivers, alone.view.receivers)
         np.testing.assert_array_equal(found.view.hits.face, alone.view.hits.face)
         np.testing.assert_allclose(found.view.paths.arrival, alone.view.paths.arrival, atol=1e-12)
+
+
+def test_squares_of_pixels_count_by_solid_angle(scene, field):
+    one = furnished.spectra(scene, UNSEEN[:1])
+    even = replace(one, path_gain=np.full_like(one.path_gain, 1e-12))
+    (weight,) = Question(field, as_data(field, even)).weights
+    share = weight.reshape(one.shape) ** 2 / pixel_solid_angles(one.shape)[:, None]
+    np.testing.assert_allclose(share, share.mean(), rtol=1e-6)
 
 
 def test_slopes_hold_near_where_they_were_taken(scene, field):

@@ -12,6 +12,7 @@ from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import training
 from warprrf.rf.fields.bistatic.observations import Target
+from warprrf.rf.paths.trace import trace_paths
 from warprrf.rf.positions import is_free
 from warprrf.rf.spectra.antenna import horn
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -157,6 +158,24 @@ def test_a_rotator_whose_zero_is_unknown_is_turned_to_the_room(scene, turned):
     assert zero["away"] == pytest.approx(137.0, abs=1.0)
     with pytest.raises(ValueError, match="azimuth_known: got False without arrival"):
         replace(turned, arrival=None, receive_pattern=None, azimuth_known=False)
+
+
+def test_a_clock_whose_zero_is_unknown_is_set_by_line_of_sight_and_mirrors(scene):
+    taps, count = np.arange(0.0, 60e-9, 0.5e-9), 4
+    paths = trace_paths(scene, transmitter=TX, receivers=RECEIVERS[:count], frequency_hz=F)
+    power = [
+        np.sinc(2e9 * (taps[:, None] - tau[own])) ** 2 @ gain[own]
+        for tau, gain, own in zip(paths.tau, paths.power, paths.valid, strict=True)
+    ]
+    late = Readings(
+        TX, np.repeat(RECEIVERS[:count], len(taps), axis=0), np.concatenate(power), F, 1e-4 * np.max(power),
+        delay_s=np.tile(taps, count) + 37.1e-9, bandwidth_hz=2e9, clock_known=False, name="late",
+    )  # fmt: skip
+    report = RadioField.fit(scene, late, quick=True, iterations=2).report
+    assert report["clock_offset_s"]["late"] == pytest.approx(-37.1e-9, abs=0.1e-9)
+    assert not report["azimuth_zero_deg"]
+    with pytest.raises(ValueError, match="clock_known: got False without delay_s"):
+        replace(late, delay_s=None, bandwidth_hz=None)
 
 
 def test_receivers_that_stood_elsewhere_are_found(scene, turned):

@@ -288,7 +288,9 @@ def test_rf3dgs_refuses_a_transmitter_that_it_does_not_know(room, truth):
         fixed.spectrum(VISIBLE, transmitter=[1.0, 3.0, 1.0])
 
 
-def test_transport_of_other_receivers_is_refused(room, spectra):
-    other = transport(room.gaussians, BLOCKED[None], SHAPE, range_db=RANGE_DB)
-    with pytest.raises(ValueError, match="transport"):
-        HarmonicField.fit(room, spectra, transport=other)
+def test_transport_of_other_receivers_or_gaussians_is_refused(room, spectra):
+    fewer = discs_on_mesh(Mesh(*ROOM), 100, seed=1)
+    for gaussians, receivers in ((room.gaussians, BLOCKED[None]), (fewer, spectra.receivers)):
+        other = transport(gaussians, receivers, SHAPE, range_db=spectra.range_db)
+        with pytest.raises(ValueError, match="transport"):
+            HarmonicField.fit(room, spectra, transport=other)

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import warp as wp
 from path_makers import random_directions
 from scipy.special import factorial, lpmv
 
@@ -15,7 +16,7 @@ from warprrf.rf.fields.harmonic.fitting import Layer, Target, fit_layer
 from warprrf.rf.fields.harmonic.opacity import Listed, OpacityTraining, list_responses
 from warprrf.rf.fields.harmonic.options import Rates
 from warprrf.rf.fields.harmonic.problem import Problem
-from warprrf.rf.fields.harmonic.transport import Transport, transport
+from warprrf.rf.fields.harmonic.transport import Rows, Transport, transport
 from warprrf.rf.spectra.spectrum import pixel_directions
 
 SHAPE = (12, 24)
@@ -25,19 +26,34 @@ GAUSSIANS = 9
 def synthetic_transport(receivers=3, seed=0):
     """Random sparse weights: zero to four Gaussians a pixel, indices with gaps."""
     rng = np.random.default_rng(seed)
-    pixels = receivers * SHAPE[0] * SHAPE[1]
-    counts = rng.integers(0, 5, pixels)
-    gaussian = np.concatenate([rng.choice(GAUSSIANS, n, replace=False) * 3 for n in counts]).astype(np.int32)
-    return Transport(
-        shape=SHAPE,
-        receivers=rng.random((receivers, 3)),
-        start=np.concatenate([[0], np.cumsum(counts)]),
-        gaussian=gaussian,
-        weight=rng.uniform(0.1, 0.9, len(gaussian)).astype(np.float32),
-        dominant=np.where(counts > 0, 0, -1).reshape(receivers, *SHAPE).astype(np.int32),
-        expected_range=np.ones((receivers, *SHAPE), np.float32),
-        rule="product",
-    )
+    pixels, views = SHAPE[0] * SHAPE[1], []
+    for _ in range(receivers):
+        counts = rng.integers(0, 5, pixels)
+        gaussian = np.concatenate([rng.choice(GAUSSIANS, n, replace=False) * 3 for n in counts])
+        views.append(
+            Rows(
+                start=wp.array(np.concatenate([[0], np.cumsum(counts)]), dtype=int),
+                gaussian=wp.array(gaussian, dtype=int),
+                weight=wp.array(rng.uniform(0.1, 0.9, len(gaussian)), dtype=float),
+                dominant=wp.array(np.where(counts > 0, 0, -1), dtype=int),
+                expected_range=wp.ones(pixels, dtype=wp.float64),
+            )
+        )
+    return Transport(SHAPE, rng.random((receivers, 3)), tuple(views), 3 * GAUSSIANS, "product")
+
+
+def pairs_of(seen):
+    """Pixel, counted through all receivers, Gaussian and weight of every pair."""
+    pixels = SHAPE[0] * SHAPE[1]
+    each = [
+        (
+            k * pixels + np.repeat(np.arange(pixels), np.diff(v.start.numpy())),
+            v.gaussian.numpy(),
+            v.weight.numpy(),
+        )
+        for k, v in enumerate(seen.views)
+    ]
+    return (np.concatenate(parts) for parts in zip(*each, strict=True))
 
 
 def gain_target(problem, seed=1, unit=None):
@@ -74,15 +90,14 @@ def harmonics(d):
 
 def loss_by_hand(problem, target, kind, table):
     """The documented loss in NumPy: dense loops, no kernels."""
-    t = problem.transport
     basis = harmonics(pixel_directions(SHAPE).reshape(-1, 3))
-    local = np.searchsorted(problem.seen, t.gaussian)
-    pixel = np.repeat(np.arange(len(t.start) - 1), np.diff(t.start))
+    pixel, gaussian, weight = pairs_of(problem.transport)
+    local = np.searchsorted(problem.seen, gaussian)
     x = np.einsum("ek,ek->e", table[local], basis[pixel % (SHAPE[0] * SHAPE[1])])
     gain = {"exp": np.exp, "linear": lambda v: np.maximum(v, 0), "signed": lambda v: v}[kind](x)
     if target.unit is not None:
         gain = gain * target.unit[local]
-    total = np.bincount(pixel, weights=t.weight.astype(np.float64) * gain, minlength=len(t.start) - 1)
+    total = np.bincount(pixel, weights=weight.astype(np.float64) * gain, minlength=target.image.size)
     if target.mask is not None:
         return float((target.mask.ravel() * np.abs(total - target.image.ravel())).sum() / target.mask.sum())
     power = target.factor.ravel() * total + target.extra.ravel()
@@ -181,7 +196,8 @@ def test_the_ridge_holds_a_gaussian_at_its_start():
 
 def test_a_pixels_weight_is_the_sum_of_its_pairs_and_zero_without_any():
     seen = synthetic_transport()
-    expected = np.bincount(seen.pixel, seen.weight, 3 * SHAPE[0] * SHAPE[1]).reshape(3, *SHAPE)
+    pixel, _, weight = pairs_of(seen)
+    expected = np.bincount(pixel, weight, 3 * SHAPE[0] * SHAPE[1]).reshape(3, *SHAPE)
     assert np.allclose(seen.pixel_weight, expected, rtol=1e-12, atol=0)
 
 
@@ -203,7 +219,8 @@ def test_listed_responses_give_the_weights_that_the_rasteriser_gives():
     receivers = np.array([[0.0, 0.0, 0.0], [0.3, -0.2, 0.1]])
     seen = transport(gaussians, receivers, SHAPE, range_db=RANGE_DB, top_k=64)
     listed = list_responses(gaussians, seen, RANGE_DB, top_k=64)
-    assert len(listed.response) > 1.05 * len(seen.gaussian)  # what hides behind is listed too
+    pairs = [sum(len(view.gaussian) for view in found.views) for found in (listed.transport, seen)]
+    assert pairs[0] > 1.05 * pairs[1]  # what hides behind is listed too
     assert np.allclose(listed.transport.pixel_weight, seen.pixel_weight, atol=2e-3)
     other = replace(gaussians, opacities=(0.6 * gaussians.opacities).astype(np.float32))
     thinner = transport(other, receivers, SHAPE, range_db=RANGE_DB, top_k=64)
@@ -216,7 +233,8 @@ def test_listed_responses_give_the_weights_that_the_rasteriser_gives():
 def test_gradient_by_opacity_against_finite_differences(with_unit):
     rng = np.random.default_rng(1)
     blank = synthetic_transport(receivers=2)
-    listed = Listed(blank, rng.uniform(0.2, 1.0, len(blank.gaussian)).astype(np.float32), 1 - 1e-6)
+    responses = [wp.array(rng.uniform(0.2, 1.0, len(v.gaussian)), dtype=float) for v in blank.views]
+    listed = Listed(blank, tuple(responses), 1 - 1e-6)
     opacities = rng.uniform(0.2, 0.8, 3 * GAUSSIANS)
     problem = Problem(listed.with_opacities(opacities), batch=2, precision=np.float64)
     unit = rng.uniform(0.5, 2.0, len(problem.seen)) if with_unit else None
@@ -227,7 +245,7 @@ def test_gradient_by_opacity_against_finite_differences(with_unit):
         everyone = np.zeros(3 * GAUSSIANS)
         everyone[problem.seen] = values
         layer = Layer(problem, target, OpacityTraining(problem, listed, everyone))
-        return layer.step(0, coefficients), layer.opacity_gradient
+        return layer.step(0, coefficients), layer.opacity.gradient.numpy()
 
     start = opacities[problem.seen]
     gradient = loss(start)[1]

@@ -1,7 +1,7 @@
 """What a field gives at every place of a lattice in the air, once for all that is searched there later.
 
-Each place holds all power that arrives, by direction and by length, between isotropic antennas: whatever a receiver weighs
-directions or delays by is linear in one of the two. It is rough: few rays, single mirrors, no beam.
+Each place holds all power that arrives between isotropic antennas by direction, and how long the strongest path in each is:
+from both follows where that left. It is rough: few rays, single mirrors, no beam.
 """
 
 from __future__ import annotations
@@ -19,13 +19,15 @@ from warprrf.device import Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.netcdf_files import Variable
 from warprrf.rf.channel.array_spectra import ArraySpectra
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import Measured
 from warprrf.rf.fields.batches import Batch
 from warprrf.rf.positions import Ends, is_free
+from warprrf.rf.spectra.antenna import as_antenna, turned_gain
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.readings import Readings, path_weights
-from warprrf.rf.spectra.spectrum import pixel_directions, pixel_of
+from warprrf.rf.spectra.readings import Readings, path_weights, tap_share
+from warprrf.rf.spectra.spectrum import pixel_directions, pixel_of, sub_pixel_directions
 from warprrf.rf.tracing.render import path_gains
 
 SHAPE = (30, 60)
@@ -37,8 +39,13 @@ BLUR_RAD = np.radians(7.0)
 """Of the beam through which spectra are compared: sharp peaks become wide valleys. Half the spacing at 3 m is 5 degrees."""
 TURNS = 120  # azimuths' zeros that are tried
 MOST_DIRECTIONS = 400  # of an array's spectrum
+COARSE_HZ, COARSE_DB = 0.5e9, 30.0  # bandwidth and range of profiles: a tap is 60 cm long
+MOST_POINTINGS = 24  # of antennas, where delays or departures are told apart
 CLEARANCE_M = 0.1  # of its places from surfaces
-VARIABLES = {"image": Variable(("receiver", "zenith", "azimuth"), "1")}
+VARIABLES = {
+    "image": Variable(("receiver", "zenith", "azimuth"), "1"),
+    "length": Variable(("receiver", "zenith", "azimuth"), "m"),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,19 +55,19 @@ class FieldMap:
     Attributes:
         places: in the air [m], shape ``(P, 3)``.
         image: path gain by direction of arrival, shape ``(P, H, W)`` float32.
+        length: of the strongest path from there [m], 0 for none, shape ``(P, H, W)`` float32.
     """
 
     places: np.ndarray
     image: np.ndarray
+    length: np.ndarray
     _read: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
 
     def decibels(self, key: Hashable, read: Callable[[], np.ndarray]) -> np.ndarray:
         """What ``read`` makes of the map, readings at every place ``(P, N)``, in decibels, float32; kept by ``key``."""
 
         def made() -> np.ndarray:
-            power = read()
-            least = 1e-12 * max(float(power.max(initial=0.0)), 1e-300)
-            return np.asarray(10.0 * np.log10(np.maximum(power, least)), np.float32)
+            return _decibels(read())
 
         return self._read.get(key, made)
 
@@ -68,6 +75,27 @@ class FieldMap:
         """Readings at every place [dB], shape ``(P, N)``, of which ``weights`` (N, H W) say what each takes of ``image``."""
         power = self.image.reshape(len(self.places), -1)
         return self.decibels(weights.tobytes(), lambda: power @ weights.T.astype(np.float32))
+
+    @property
+    def strongest(self) -> np.ndarray:
+        """Length of each place's strongest path [m], shape ``(P,)``."""
+        count = len(self.places)
+        best = self.image.reshape(count, -1).argmax(axis=1)
+        return np.asarray(self.length.reshape(count, -1)[np.arange(count), best])
+
+    def departures(self, transmitter: np.ndarray) -> np.ndarray:
+        """Unit vectors from ``transmitter`` (3,) in which paths left if they met one surface at most, shape ``(P, H W, 3)``."""
+        toward, out = sub_pixel_directions(SHAPE, 1)[0], self.places - transmitter
+        length = self.length.reshape(len(out), -1)
+        # |out + r toward| = length - r, r the distance to where the surface was met.
+        more = np.maximum(length**2 - (out**2).sum(axis=1)[:, None], 0.0)
+        met = out[:, None] + (more / np.maximum(2.0 * (length + out @ toward.T), 1e-9))[..., None] * toward
+        return np.asarray(met / np.maximum(np.linalg.norm(met, axis=2, keepdims=True), 1e-9))
+
+
+def _decibels(power: np.ndarray) -> np.ndarray:
+    least = 1e-12 * max(float(power.max(initial=0.0)), 1e-300)
+    return np.asarray(10.0 * np.log10(np.maximum(power, least)), np.float32)
 
 
 def maps_of(
@@ -80,7 +108,9 @@ def maps_of(
     places = lattice(bistatic.mesh, bistatic.transmitter, bistatic.device)
     every = np.tile(places, (len(transmitters), 1)), np.repeat(transmitters, len(places), axis=0)
     batch = Batch("map", Ends.of(*every), store, None, progress)
-    found = batch.gather(partial(_mapped, bistatic), VARIABLES, {}, bistatic._known_by(batch, SHAPE))
+    found = batch.gather(
+        partial(_mapped, bistatic), VARIABLES, {}, bistatic._known_by(batch, SHAPE, list(VARIABLES))
+    )
     parts = [
         np.asarray(found[name]).reshape(len(transmitters), len(places), *found[name].shape[1:])
         for name in VARIABLES
@@ -100,7 +130,7 @@ def lattice(mesh: Mesh, transmitter: np.ndarray, device: Any, spacing_m: float =
 
 
 def _mapped(bistatic: Any, part: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
-    """Path gain by direction at receivers (K, 3) under a transmitter (3,)."""
+    """Path gain and length by direction at receivers (K, 3) under a transmitter (3,)."""
     receivers, transmitter = part
     tracer, count = bistatic.tracer(transmitter), len(receivers)
     model = bistatic.state
@@ -110,7 +140,13 @@ def _mapped(bistatic: Any, part: tuple[np.ndarray, np.ndarray]) -> dict[str, np.
     paths, rays = view.paths, gains.by_ray()
     pixel = np.ravel_multi_index((paths.receiver, *pixel_of(paths.arrival, SHAPE)), (count, *SHAPE))
     image = rays + np.bincount(pixel, gains.specular, len(rays))
-    return {"image": image.reshape(count, *SHAPE).astype(np.float32)}
+    met = view.hits.points(np.arange(len(rays))) - transmitter
+    length = np.where(rays > 0, np.linalg.norm(met, axis=1) + view.hits.range_m, 0.0)
+    stronger = np.flatnonzero(gains.specular > rays[pixel])
+    stronger = stronger[np.argsort(gains.specular[stronger], kind="stable")]
+    length[pixel[stronger]] = paths.delay_m[stronger]
+    found = {"image": image, "length": length}
+    return {name: own.reshape(count, *SHAPE).astype(np.float32) for name, own in found.items()}
 
 
 def best_on_map(
@@ -119,11 +155,12 @@ def best_on_map(
     """How well the places of a lattice suit a data set: mean absolute error [dB] ``(P,)`` under the turn and the gains of chains
     that suit each best, that turn ``(P,)`` [rad] and these ``(P, C)`` [dB]."""
     read: Callable[..., Rough] = (
-        _spectrum if isinstance(one, SpectrumDataset) else _array if isinstance(one, ArraySpectra) else _table
-    )
+        _spectrum if isinstance(one, SpectrumDataset) else _array if isinstance(one, ArraySpectra) else
+        _table if one.departure is None and one.delay_s is None else _profiles
+    )  # fmt: skip
     power, floor, chain, parts, columns, turns = read(one, maps, chains)
-    floor_db, places = 10.0 * np.log10(floor), len(parts[0][1])
-    db = np.maximum(10.0 * np.log10(np.maximum(power, 1e-300)), floor_db)
+    floor_db, places = (10.0 * np.log10(floor)).astype(np.float32), len(parts[0][1])
+    db = np.maximum(10.0 * np.log10(np.maximum(power, 1e-300)), floor_db).astype(np.float32)
     known, heard = np.full(len(db), -1) if chain is None else chain, db > floor_db
     least, turn, gains = np.full(places, np.inf), np.zeros(places), np.zeros((places, len(chains) + 1))
     for by, own in zip(turns, columns, strict=True):
@@ -133,7 +170,9 @@ def best_on_map(
         for c in np.unique(known[heard & (known >= 0)]):
             gain[:, c] = (db - found)[:, (known == c) & heard].mean(axis=1)
             found[:, known == c] += gain[:, c, None]
-        error = np.abs(np.maximum(found, floor_db) - db).mean(axis=1)
+        np.maximum(found, floor_db, out=found)
+        found -= db
+        error = np.abs(found, out=found).mean(axis=1)
         better = error < least
         least[better], turn[better], gains[better] = error[better], by, gain[better]
     return least, turn, gains[:, : len(chains)]
@@ -192,8 +231,7 @@ def _array(one: ArraySpectra, maps: dict[bytes, FieldMap], chains: Sequence[str]
 
 def _table(one: Readings, maps: dict[bytes, FieldMap], chains: Sequence[str]) -> Rough:
     one = one.subset(np.isfinite(one.power))
-    index = {name: c for c, name in enumerate(chains)}
-    chain = np.array([index.get(str(name), -1) for name in np.asarray(one.chain)])
+    chain = _chains_of(one, chains)
     toward, ask = pixel_directions(SHAPE).reshape(-1, 3), dict[str, Any]()
     turns: np.ndarray = np.zeros(1)
     columns = np.zeros((1, len(one)), int)
@@ -219,3 +257,82 @@ def _table(one: Readings, maps: dict[bytes, FieldMap], chains: Sequence[str]) ->
         rows = np.flatnonzero((one.transmitters == source).all(axis=1))
         parts.append((rows, maps[source.tobytes()].weighed(weights)))
     return one.power, np.asarray(one.floor), chain, parts, columns, turns
+
+
+def coarse(one: Measured) -> Measured:
+    """Profiles of delay as a sounder of :data:`COARSE_HZ` reads them, half a tap apart, with a Hann window and
+    :data:`COARSE_DB` of range; anything else as it is.
+
+    Taps of gigahertz are shorter than a lattice's spacing: a place's neighbours would be no more like it than any other.
+    """
+    if (
+        not isinstance(one, Readings)
+        or one.delay_s is None
+        or float(one.bandwidth_hz or 0.0) < 2.0 * COARSE_HZ
+    ):
+        return one
+    one = one.subset(np.isfinite(one.power))
+    delay, wider = np.asarray(one.delay_s), float(one.bandwidth_hz or 0.0) / COARSE_HZ
+    power, floor, kept = np.empty(len(one)), np.empty(len(one)), list[np.ndarray]()
+    own = _pointing(one, np.unique(np.asarray(one.chain), return_inverse=True)[1].reshape(-1))
+    for rows in (np.flatnonzero(own == k) for k in range(own.max() + 1)):
+        near = tap_share(COARSE_HZ * (delay[rows, None] - delay[rows]), "hann")
+        near *= wider / near.sum(axis=1, keepdims=True)
+        power[rows], floor[rows] = near @ one.power[rows], near @ np.asarray(one.floor)[rows]
+        kept.append(rows[np.unique(np.round(2.0 * COARSE_HZ * delay[rows]), return_index=True)[1]])
+    some = np.sort(np.concatenate(kept))
+    least = np.maximum(floor, 10.0 ** (-COARSE_DB / 10.0) * power.max())[some]
+    told: dict[str, Any] = {"power": np.maximum(power[some], least), "floor": least}
+    return replace(one.subset(some), **told, bandwidth_hz=COARSE_HZ, window="hann")
+
+
+def _pointing(one: Readings, *more: np.ndarray) -> np.ndarray:
+    """Equal for readings of one transmitter and one turn of the antennas, shape ``(N,)``, from 0."""
+    turned = [a for a in (one.transmitters, one.arrival, one.departure) if a is not None]
+    return np.unique(np.column_stack([*turned, *more]), axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _profiles(one: Readings, maps: dict[bytes, FieldMap], chains: Sequence[str]) -> Rough:
+    """Readings by departure, or by delay, those of some of the pointings."""
+    one = one.subset(np.isfinite(one.power))
+    pointing = _pointing(one)
+    few = np.isin(pointing, np.linspace(0, pointing.max(), MOST_POINTINGS).astype(int))
+    one, pointing = one.subset(few), pointing[few]
+    used = [maps[source.tobytes()] for source in np.unique(one.transmitters, axis=0)]
+    toward, step = pixel_directions(SHAPE).reshape(-1, 3), 0.25 * SPACING_M
+    taps = step * (np.arange(int(max(float(m.length.max()) for m in used) / step) + 1) + 0.5)
+    turns: np.ndarray = np.zeros(1)
+    columns, window = np.zeros((1, len(one)), int), None
+    if one.delay_s is not None and one.bandwidth_hz is not None:
+        per_m = one.bandwidth_hz / SPEED_OF_LIGHT
+        window = tap_share(per_m * (taps - taps[:, None]), one.window).astype(np.float32)
+        length = SPEED_OF_LIGHT * one.delay_s
+        if not one.clock_known:  # the strongest tap is some place's strongest path
+            latest = max(float(m.strongest.max()) for m in used)
+            turns = np.arange(0.0, latest, 0.5 * SPACING_M) - length[one.power.argmax()]
+        columns = np.clip((length + turns[:, None]) / step, 0, len(taps) - 1).astype(int)
+    parts = []
+    for rows in (np.flatnonzero(pointing == k) for k in np.unique(pointing)):
+        source = one.transmitters[rows[0]]
+        m = maps[source.tobytes()]
+        count = len(m.places)
+        power = m.image.reshape(count, -1)
+        if one.arrival is not None and one.receive_pattern is not None:
+            power = power * turned_gain(as_antenna(one.receive_pattern), one.arrival[rows[:1]], toward)
+        if one.departure is not None and one.transmit_pattern is not None:
+            out = m.departures(source).reshape(-1, 3)
+            gain = turned_gain(as_antenna(one.transmit_pattern), one.departure[rows[:1]], out)
+            power = power * gain.reshape(power.shape)
+        table = power.sum(axis=1, keepdims=True)
+        if window is not None:
+            tap = (m.length.reshape(count, -1) / step).astype(int) + len(taps) * np.arange(count)[:, None]
+            late = np.bincount(tap.ravel(), power.ravel(), len(taps) * count).reshape(count, -1)
+            table = late.astype(np.float32) @ window
+        parts.append((rows, _decibels(table)))
+    return one.power, np.asarray(one.floor), _chains_of(one, chains), parts, columns, turns
+
+
+def _chains_of(one: Readings, chains: Sequence[str]) -> np.ndarray:
+    """Index of each reading's chain, -1 for one of known gain, shape ``(N,)``."""
+    index = {name: c for c, name in enumerate(chains)}
+    return np.array([index.get(str(name), -1) for name in np.asarray(one.chain)])

@@ -26,7 +26,7 @@ from warprrf.rf.fields.bistatic.merging import BY_SHAPE, Merging, merge
 from warprrf.rf.fields.bistatic.needs import RARE, evenly
 from warprrf.rf.fields.bistatic.observations import Place, as_list, frame_of, places_of
 from warprrf.rf.fields.bistatic.options import FitOptions
-from warprrf.rf.fields.bistatic.placing import moved, position_offset, with_azimuths
+from warprrf.rf.fields.bistatic.placing import moved, position_offset, with_zeros
 from warprrf.rf.fields.bistatic.report import covariance_of, left_out, report_of, warn
 from warprrf.rf.fields.bistatic.residual import fit_residual, shares_of
 from warprrf.rf.fields.bistatic.training import (
@@ -115,9 +115,7 @@ def fit(
         t.names[k]: [(place.receiver.tolist(), offset.tolist()) for place, offset in own]
         for k, own in offsets.items()
     }
-    return replace(
-        found, report=found.report | {"azimuth_zero_deg": zeros, "position_offset_m": places_moved}
-    )
+    return replace(found, report=found.report | zeros | {"position_offset_m": places_moved})
 
 
 def _learned(
@@ -127,8 +125,8 @@ def _learned(
     options: FitOptions,
     views: TrainingViews | None,
     progress: Progress | None,
-) -> tuple[Training, FitResult, dict[str, float]]:
-    """All steps of a fit: what it learned from, what it found, and zeros of azimuth by data set [degrees].
+) -> tuple[Training, FitResult, dict[str, dict[str, float]]]:
+    """All steps of a fit: what it learned from, what it found, and what :func:`with_zeros` found.
 
     With many receivers some decide about effects and materials; what the others see is traced with those effects alone.
     """
@@ -139,7 +137,7 @@ def _learned(
         sought = candidates[0] if len(candidates) == 1 else None
         decides = options.effects == "auto" and options.relevance is None
         views = look(data, only=split.deciding, effects=sought, decides=decides)
-    data, zeros = with_azimuths(data, views.places, views.views)
+    data, zeros = with_zeros(data, views.places, views.views)
     t, rays = Training.of(views, split, data, options, rng, progress), views.tracer.grid.sub_pixels
     del views  # and with them records, once the training has none
     started = time.perf_counter()

@@ -20,37 +20,41 @@ from scipy.ndimage import uniform_filter
 from threadpoolctl import threadpool_limits
 
 from warprrf.device import Progress
-from warprrf.rf.em.waves import NEPER
+from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT
 from warprrf.rf.fields.base import Measured
-from warprrf.rf.fields.bistatic.field_map import SPACING_M, FieldMap, best_on_map, maps_of
+from warprrf.rf.fields.bistatic.field_map import SPACING_M, FieldMap, best_on_map, coarse, maps_of
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, Place, as_list, huber, kinds_of, places_of
+from warprrf.rf.fields.bistatic.placing import from_zero
 from warprrf.rf.fields.bistatic.uncertainty import bins
 from warprrf.rf.fields.location import Location
 from warprrf.rf.positions import beside, quotients
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings
-from warprrf.rf.spectra.spectrum import Spectrum
+from warprrf.rf.spectra.spectrum import Spectrum, pixel_solid_angles
 from warprrf.rf.tracing.render import PathGains, path_gains
 from warprrf.rf.tracing.tracer import Tracer
 
 STARTS = 2  # places of the lattice that are searched from; in a lobby the best one is within it of the truth
 STEPS = 4, 3  # most Gauss-Newton steps, first with single mirrors, then with all effects
+LONGER = 1.6
+"""Times a Gauss-Newton step, which goes about half the way where most errors count linearly; twice would be the most."""
 LONGEST_M, SHORTEST_M = 0.35, 3e-3  # steps: none is longer, and shorter ones are the last
 FIRST_DIFFERENCE_M, DIFFERENCE_M = 0.1, 0.04
 """First and least: half of the last step between. Over shorter ones the noise of few rays looks like slopes."""
-TURN_RAD = 0.005  # difference of azimuths
+TURN_RAD, CLOCK_M = 0.005, 0.01  # differences of the zeros of azimuths and of clocks
 SUB_PIXELS = (
     1,
     2,
 )  # square root of the rays a pixel, first and to the end: the noise of few rays moves the least loss
 SMOOTH = 3  # pixels of a spectrum that slopes are means over, along each axis: noise of slopes would pass for curvature
-HUBER = 3.0  # standard deviations
-LEAST_STD_DB = 0.3  # of a pixel: no field is so exact that tenths of a decibel tell places apart
+HUBER = 1.0  # standard deviations
+LEAST_STD_DB = 2.0
+"""Of a pixel: where an edge stands some centimetres off, pixels that are known to tenths are wrong by ten decibels."""
 BLOCKS = 12
 """Along each axis of a spectrum, whose errors hang together: what one edge in the wrong place spoils."""
-SPREAD = 1.8
+SPREAD = 4.0
 """Of a spectrum's covariance: blocks are not all that hangs together. By 20 receivers of a lobby, none of them fitted to or tested:
-half of their squared errors, and 95 of 100, were 1.7 and 1.9 times what blocks say."""
+half of their squared errors were 4 times what blocks say."""
 GIVEN_UP = 2.0  # times the least loss of an earlier start: others are left where they leave more
 FOLLOWED = 1.4  # times the least loss: candidates are followed below
 SAME_M = 0.1  # candidates nearer than this are one
@@ -82,9 +86,9 @@ def as_data(field: Any, measured: Any) -> list[Measured]:
                 f"measured: got {of:g} GHz, expected {told:g}; field.at_frequency(hz) is of another carrier"
             )
         if isinstance(one, Readings):
-            if one.departure is not None or one.delay_s is not None:
+            if not one.azimuth_known and (one.departure is not None or one.delay_s is not None):
                 raise ValueError(
-                    "measured: got readings by departure or by delay, expected by arrival, or power alone"
+                    "measured: got azimuths of an unknown zero beside departures or delays, expected one without the other"
                 )
         elif len(one) != 1:
             raise ValueError(
@@ -128,8 +132,8 @@ class Found:
 class Question:
     """What was read at one place, which is sought in a field.
 
-    Unknowns are its position [m], the azimuths' zero of each table that does not know it [rad], and ln of each measuring
-    chain's gain.
+    Unknowns are its position [m], the zero of each table that does not know it, of azimuths [rad] or of a clock [m], and ln of
+    each measuring chain's gain.
 
     Args:
         field: a bistatic field.
@@ -138,30 +142,36 @@ class Question:
 
     def __init__(self, field: Any, data: Sequence[Measured]) -> None:
         self.field, self.data = field, data
+        self.coarse = [coarse(one) for one in data]
         self.places = places_of(data, None, field.device)
+        self.coarse_places = places_of(self.coarse, None, field.device)
         self.transmitters = list(np.unique([place.transmitter for place in self.places], axis=0))
         self.chains = sorted({place.chain for place in self.places} - {""})
-        self.turned = [k for k, one in enumerate(data) if isinstance(one, Readings) and not one.azimuth_known]
+        self.turned = [k for k, one in enumerate(data) if isinstance(one, Readings) and not one.zero_known]
         self.spectra = all(isinstance(one, SpectrumDataset) for one in data)
         self.weights = [self._weight(one) for one in data]
         self._tracers: dict[Any, Tracer] = {}
 
+    @property
+    def alike(self) -> bool:
+        """Whether what is searched quickly is what is searched to the end."""
+        return all(a is b for a, b in zip(self.coarse, self.data, strict=True))
+
     def _weight(self, one: Measured) -> np.ndarray | None:
-        """By what errors of a spectrum's pixels are multiplied before they count as those of readings do."""
+        """By what errors of a spectrum's pixels are multiplied before they count as those of readings do: where rows crowd
+        at the poles, many pixels have one error, so that squares count by solid angle."""
         if not isinstance(one, SpectrumDataset):
             return None
         db = NEPER * np.log1p(np.nan_to_num(one.path_gain[0].astype(float)) / one.floor)
-        known = self.field.errors
-        return (
-            NOISE_DB
-            / (np.maximum(known.table[bins(db)], LEAST_STD_DB) if known else np.full(db.shape, NOISE_DB))
-        ).ravel()
+        known, area = self.field.errors, pixel_solid_angles(db.shape)[:, None]
+        std = np.maximum(known.table[bins(db)], LEAST_STD_DB) if known else np.full(db.shape, NOISE_DB)
+        return np.asarray(NOISE_DB / std * np.sqrt(area / area.mean())).ravel()
 
     def starts(self, maps: dict[bytes, FieldMap]) -> np.ndarray:
         """Unknowns at the places of a lattice that suit best and lie apart, shape ``(S, U)``."""
         places = next(iter(maps.values())).places
         cost, gains, turn = np.zeros(len(places)), np.zeros((len(places), len(self.chains))), []
-        for k, one in enumerate(self.data):
+        for k, one in enumerate(self.coarse):
             least, own, gain = best_on_map(one, maps, self.chains)
             cost, gains = cost + least, gains + gain
             turn += [own] if k in self.turned else []
@@ -174,11 +184,11 @@ class Question:
                 break
         return every[chosen]
 
-    def moved(self, unknown: np.ndarray) -> list[Measured]:
-        """The data with azimuths put right."""
-        found: list[Any] = list(self.data)
+    def moved(self, unknown: np.ndarray, *, quick: bool) -> list[Measured]:
+        """The data with zeros put right."""
+        found: list[Any] = list(self.coarse if quick else self.data)
         for k, by in zip(self.turned, unknown[3:], strict=False):
-            found[k] = replace(found[k], arrival=found[k].arrival + [0.0, by], azimuth_known=True)
+            found[k] = from_zero(found[k], by)
         return found
 
     def errors(self, unknown: np.ndarray, step_m: float, *, quick: bool, near: Found | None = None) -> Found:
@@ -186,19 +196,20 @@ class Question:
         found ``near``. ``quick``: with few rays and single mirrors."""
         here = unknown[None, :3]
         points = np.concatenate([here, beside(here[0], step_m)]) if near is None else here
-        kinds, further, seen = kinds_of(self.moved(unknown)), {}, dict[Any, Any]()
+        kinds, further, seen = kinds_of(self.moved(unknown, quick=quick)), {}, dict[Any, Any]()
         for j, k in enumerate(self.turned):
-            other = unknown + TURN_RAD * (np.arange(len(unknown)) == 3 + j)
-            further[k] = 3 + j, kinds_of(self.moved(other))[k]
+            by = CLOCK_M if self.data[k].azimuth_known else TURN_RAD  # type: ignore[union-attr]
+            other = unknown + by * (np.arange(len(unknown)) == 3 + j)
+            further[k] = 3 + j, by, kinds_of(self.moved(other, quick=quick))[k]
         errors, rises = [], []
-        for place in self.places:
+        for place in self.coarse_places if quick else self.places:
             key = place.transmitter.tobytes(), place.shape, place.beam_sigma_rad
             if key not in seen:
                 seen[key] = self._gains(place, points, quick)
             gains = seen[key]
             chain = 3 + len(self.turned) + self.chains.index(place.chain) if place.chain else None
             times = 1.0 if chain is None else float(np.exp(unknown[chain]))
-            column, turned = further.get(place.data, (0, None))
+            column, by, turned = further.get(place.data, (0, 1.0, None))
             asked = [(kinds[place.data], *one) for one in zip(points, gains, strict=True)]
             asked += [] if turned is None else [(turned, points[0], gains[0])]
             observed = [kind.observe(replace(place, receiver=point), g.view) for kind, point, g in asked]
@@ -211,7 +222,7 @@ class Question:
             if near is None:
                 rise[:, :3] = quotients(others[:6], step_m)
             if turned is not None:
-                rise[:, column] = (others[-1] - error) / TURN_RAD
+                rise[:, column] = (others[-1] - error) / by
             if chain is not None:
                 rise[:, chain] = target.slope(powers[0]) * powers[0] / NOISE_DB
             if weight is not None:
@@ -250,7 +261,7 @@ class Question:
             threshold = now.threshold
             curvature, gradient = now.normal(threshold)
             diagonal = np.diag(curvature) + 1e-9 * np.trace(curvature)
-            step = -np.linalg.solve(curvature + damping * np.diag(diagonal), gradient)
+            step = -LONGER * np.linalg.solve(curvature + damping * np.diag(diagonal), gradient)
             step *= min(1.0, LONGEST_M / max(float(np.linalg.norm(step[:3])), 1e-12))
             while not self.field.mesh.visible(now.unknown[None, :3], (now.unknown + 1.1 * step)[None, :3])[0]:
                 step *= 0.5  # not through walls
@@ -304,7 +315,7 @@ def search(question: Question, maps: dict[bytes, FieldMap]) -> Location:
         if one.loss(threshold) >= FOLLOWED * least:
             rest.append(one)
         elif not one.near(first[: first.index(one)]):
-            found.append(question.descend(one.unknown, quick=False, near=one))
+            found.append(question.descend(one.unknown, quick=False, near=one if question.alike else None))
     best = min(found, key=lambda one: one.loss(threshold))
     ahead = {id(one): least - best.loss(threshold) for one in rest}  # what all effects would bring them too
     spread = best.loss(threshold) / max(len(best.error) - len(best.unknown), 1)
@@ -328,11 +339,13 @@ def search(question: Question, maps: dict[bytes, FieldMap]) -> Location:
     likelihood /= likelihood.sum()
     covariance, misfit = question.covariance(best, threshold), float(np.sqrt(spread))
     close = float(np.sqrt(np.trace(covariance))) < SPACING_M
-    after = zip(question.turned, best.unknown[3:].tolist(), strict=False)
+    after: list[Any] = [question.data[k] for k in question.turned]
+    zeros = list(zip(after, best.unknown[3:].tolist(), strict=False))
     gains = (NEPER * best.unknown[3 + len(question.turned) :]).tolist()
     return Location(
         position=best.unknown[:3], covariance=covariance, candidates=np.stack([one.unknown[:3] for one in order]),
         likelihoods=likelihood, known=bool(likelihood[0] > SURE and close and misfit < EXPLAINED), misfit=misfit,
         gains_db=dict(zip(question.chains, gains, strict=True)),
-        azimuth_zeros={question.data[k].name: by for k, by in after},  # type: ignore[union-attr]
+        azimuth_zeros={one.name: by for one, by in zeros if not one.azimuth_known},
+        clock_offsets_s={one.name: by / SPEED_OF_LIGHT for one, by in zeros if one.azimuth_known},
     )  # fmt: skip

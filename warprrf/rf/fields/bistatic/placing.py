@@ -1,7 +1,8 @@
-"""How a receiver stood, where that is not known: the zero of a rotator's azimuths, and positions to some centimetres.
+"""How a receiver stood, where that is not known: the zero of a rotator's azimuths or of a clock, and positions to some
+centimetres.
 
-Line of sight and mirrors hold no unknown but their strength, which matters little: turned about the vertical, the zero is
-where readings and what those paths would give are most alike. It is found before anything else is fitted.
+Line of sight and mirrors hold no unknown but their strength, which matters little: the zero is where readings and what those
+paths would give are most alike. It is found before anything else is fitted.
 
 A position is found after a first fit: moved by an offset, a receiver sees the same images of the transmitter elsewhere,
 and what is scattered hardly changes.
@@ -25,51 +26,78 @@ from warprrf.rf.tracing.records import Materials
 from warprrf.rf.tracing.tracer import SPECULAR, View
 
 STRONGEST = 20  # paths that count
-STEPS = 360
+STEPS = 360  # of a turn
+TAP_STEPS = 4.0  # that a clock is tried in, per tap
 MOST_OFFSET = 2.0  # standard deviations, along each axis
 
 
-def with_azimuths(
+def with_zeros(
     data: Sequence[Measured], places: Sequence[Place], views: Sequence[View]
-) -> tuple[list[Measured], dict[str, float]]:
-    """``data`` with azimuths that count from x, and by data set's name what was added to those of unknown zero [degrees].
+) -> tuple[list[Measured], dict[str, dict[str, float]]]:
+    """``data`` with azimuths that count from x and delays from when they were sent, and by data set's name what was added to
+    those of unknown zero: ``azimuth_zero_deg`` and ``clock_offset_s``.
 
     Raises:
         ValueError: where neither line of sight nor a mirror path reaches any place of such a data set.
     """
-    found, zeros = list(data), {}
+    found, zeros = list(data), dict[str, dict[str, float]](azimuth_zero_deg={}, clock_offset_s={})
     for k, one in enumerate(data):
-        if isinstance(one, Readings) and one.arrival is not None and not one.azimuth_known:
+        if isinstance(one, Readings) and not one.zero_known:
             seen = [
                 (p, v) for p, v in zip(places, views, strict=True) if p.data == k and len(v.paths.length_m)
             ]
             if not seen:
+                name, what = ("clock_known", "delays") if one.azimuth_known else ("azimuth_known", "azimuth")
                 raise ValueError(
-                    f"azimuth_known: neither line of sight nor mirrors reach a receiver of {one.name!r}, so its zero of "
-                    "azimuth cannot be found; expected it known"
+                    f"{name}: neither line of sight nor mirrors reach a receiver of {one.name!r}, so its zero of {what} "
+                    "cannot be found; expected it known"
                 )
             zero = _zero(one, seen)
-            zeros[one.name] = float(np.degrees(zero))
-            found[k] = replace(one, arrival=one.arrival + [0.0, zero], azimuth_known=True)
+            if one.azimuth_known:
+                zeros["clock_offset_s"][one.name] = zero / SPEED_OF_LIGHT
+            else:
+                zeros["azimuth_zero_deg"][one.name] = float(np.degrees(zero))
+            found[k] = from_zero(one, zero)
     return found, zeros
 
 
+def from_zero(one: Readings, by: float) -> Readings:
+    """The same, ``by`` added to what counts from an unknown zero: to azimuths [rad], or to delays, as length [m]."""
+    if one.arrival is not None and not one.azimuth_known:
+        return replace(one, arrival=one.arrival + [0.0, by], azimuth_known=True)
+    if one.delay_s is not None and not one.clock_known:
+        return replace(one, delay_s=one.delay_s + by / SPEED_OF_LIGHT, clock_known=True)
+    return one
+
+
 def _zero(one: Readings, seen: Sequence[tuple[Place, View]]) -> float:
-    """Angle to add to azimuths [rad], in (-pi, pi]."""
-    arrival = np.asarray(one.arrival)
-    angles = np.linspace(-np.pi, np.pi, STEPS, endpoint=False)
-    alike = np.zeros(STEPS)
+    """What to add to azimuths [rad], in (-pi, pi], or to delays [m]; see :func:`from_zero`."""
     paths = [(place.rows, *_strongest(view)) for place, view in seen]
-    for k, angle in enumerate(angles):
-        turned = replace(one, arrival=arrival + [0.0, angle])
+    tried = np.linspace(-np.pi, np.pi, STEPS, endpoint=False)
+    if one.azimuth_known:
+        tried = _clocks(one, paths)
+    alike = np.zeros(len(tried))
+    for k, by in enumerate(tried):
+        turned = from_zero(one, by)
         for rows, power, *ends in paths:
             expected = path_weights(turned, rows, *ends) @ power
             size = float(np.linalg.norm(expected) * np.linalg.norm(one.power[rows]))
             alike[k] += float(expected @ one.power[rows]) / max(size, 1e-300)
     best = int(alike.argmax())
-    low, mid, high = alike[[best - 1, best, (best + 1) % STEPS]]
+    low, mid, high = alike[[best - 1, best, (best + 1) % len(tried)]]
     bend = low - 2.0 * mid + high  # of the parabola through the three
-    return float(angles[best] + (0.5 * (low - high) / bend if bend < 0 else 0.0) * 2.0 * np.pi / STEPS)
+    return float(tried[best] + (0.5 * (low - high) / bend if bend < 0 else 0.0) * (tried[1] - tried[0]))
+
+
+def _clocks(one: Readings, paths: Sequence[tuple[np.ndarray, ...]]) -> np.ndarray:
+    """What may have to be added to delays [m]: each place's strongest tap may be any of its paths."""
+    if one.delay_s is None or one.bandwidth_hz is None:
+        raise ValueError("one: got readings without delays, expected some of which the zero is not known")
+    strongest = [one.delay_s[rows[np.nanargmax(one.power[rows])]] for rows, *_ in paths]
+    may_be = np.concatenate([delay - tap for tap, (*_, delay) in zip(strongest, paths, strict=True)])
+    tap = SPEED_OF_LIGHT / one.bandwidth_hz
+    low, high = SPEED_OF_LIGHT * may_be.min() - tap, SPEED_OF_LIGHT * may_be.max() + tap
+    return np.arange(low, high, tap / TAP_STEPS)
 
 
 def _strongest(view: View) -> tuple[np.ndarray, ...]:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
@@ -42,6 +42,7 @@ from warprrf.checks import (
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.geometry.splats.gaussians import Gaussians, discs_on_mesh, gaussians_of
+from warprrf.geometry.splats.rasterizer import Parameters, Rasterizer
 from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -61,14 +62,19 @@ from warprrf.rf.fields.harmonic.problem import Problem, harmonics
 from warprrf.rf.fields.harmonic.transport import (
     Lengths,
     Transport,
-    interaction_points,
     path_lengths,
     transport,
 )
 from warprrf.rf.paths.trace import Paths
 from warprrf.rf.positions import Ends, check_dataset, warn_of_unmodelled
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.spectrum import Spectrum, angles_from_directions, pixel_solid_angles, spread
+from warprrf.rf.spectra.spectrum import (
+    Spectrum,
+    angles_from_directions,
+    pixel_directions,
+    pixel_solid_angles,
+    spread,
+)
 from warprrf.steps import digest
 
 LAYERS = {"rf3dgs+": ("gain",), "rf3dgs": ("gain", "delay", "aod_x", "aod_y", "aod_z")}
@@ -198,13 +204,14 @@ class HarmonicField(RadioField):
         )
         seen = blank._seen_from(receivers, progress) if transport is None else transport
         rule = chosen.transmittance
-        if seen.shape != blank.shape or seen.rule != rule or not np.array_equal(seen.receivers, receivers):
+        got, wanted = (seen.shape, seen.rule, seen.gaussians), (blank.shape, rule, len(gaussians))
+        if got != wanted or not np.array_equal(seen.receivers, receivers):
             raise ValueError(
-                f"transport: got weights of {len(seen.receivers)} receivers, shape {seen.shape}, rule {seen.rule!r}; "
-                f"expected those of exactly the {len(receivers)} receivers of ds, shape {blank.shape}, rule {rule!r}"
+                f"transport: got weights of {len(seen.receivers)} receivers, (shape, rule, Gaussians) = {got}; expected those "
+                f"of exactly the {len(receivers)} receivers of ds, {wanted}"
             )
         ready = time.perf_counter()
-        trained = _train(blank, ds, images, seen, checkpoint=chosen.checkpoint, progress=progress)
+        trained = _train(blank, ds, images, seen.on(device), checkpoint=chosen.checkpoint, progress=progress)
         report = {
             "receivers": len(images),
             "transport_time_s": 0.0 if transport is not None else ready - started,
@@ -275,16 +282,23 @@ class HarmonicField(RadioField):
             "delay_unit": header["delay_unit"],
         }
 
-    def _lengths(self, seen: Transport, transmitter: np.ndarray) -> Lengths:
-        """Path lengths of every pixel of ``seen`` by the interaction point that the options name."""
-        points = interaction_points(
-            seen, self.gaussians, self.options.interaction_point, mesh=self.mesh, device=self.device
-        )
-        return path_lengths(points, transmitter, seen.receivers)
+    def _on_device(self) -> Parameters:
+        """The Gaussians where they are rendered, uploaded once."""
+        return self._uploaded.get("gaussians", lambda: Rasterizer(device=self.device).upload(self.gaussians))
 
-    def _factor(self, lengths: Lengths) -> np.ndarray:
-        """Solid angle [sr], times spreading loss for ``rf3dgs+``; zero where the ray meets nothing."""
-        loss = np.isfinite(lengths.total) if self.model == "rf3dgs" else self._free_space(lengths.total)
+    def _lengths(self, seen: Transport, transmitter: np.ndarray) -> Iterator[Lengths]:
+        """Path lengths of the pixels of each receiver of ``seen`` by the interaction point that the options name."""
+
+        def directions() -> wp.array:
+            return wp.array(pixel_directions(self.shape).reshape(-1, 3), dtype=wp.vec3d, device=seen.device)
+
+        toward, kind = self._uploaded.get("directions", directions), self.options.interaction_point
+        return path_lengths(seen, self._on_device(), toward, kind, transmitter, mesh=self.mesh)
+
+    def _factor(self, length: np.ndarray) -> np.ndarray:
+        """Solid angle [sr], times spreading loss for ``rf3dgs+``, of pixels whose paths are of ``length`` (..., H, W) [m];
+        zero where the ray meets nothing."""
+        loss = np.isfinite(length) if self.model == "rf3dgs" else self._free_space(length)
         return np.nan_to_num(pixel_solid_angles(self.shape)[:, None] * loss, posinf=0.0)
 
     def _line_of_sight(self, receiver: np.ndarray, transmitter: np.ndarray) -> tuple[bool, float]:
@@ -312,20 +326,20 @@ class HarmonicField(RadioField):
         """Blending weights of ``receivers`` (R, 3)."""
         return transport(
             self.gaussians, receivers, self.shape, range_db=self.range_db, rule=self.options.transmittance,
-            top_k=self.options.top_k, device=self.device, progress=progress,
+            top_k=self.options.top_k, device=self.device, uploaded=self._on_device(), progress=progress,
         )  # fmt: skip
 
     def _blend(self, name: str, seen: Transport) -> np.ndarray:
         """The blended layer ``name`` of one receiver, shape ``(H, W)`` float64."""
-        device = _device.resolve(self.device)
+        device, (view,) = seen.device, seen.views
         kernels = _kernels.build(wp.float32)
         kind = KINDS[self.options.gain] if name == "gain" else KINDS["signed"]
         out = wp.zeros(self.shape[0] * self.shape[1], dtype=float, device=device)
         inputs = [
             kind,
-            wp.array(seen.start.astype(np.int32), dtype=int, device=device),
-            wp.array(seen.gaussian, dtype=int, device=device),
-            wp.array(seen.weight, dtype=float, device=device),
+            view.start,
+            view.gaussian,
+            view.weight,
             self._uploaded.get("basis", lambda: harmonics(self.shape, wp.float32, device)),
             self._uploaded.get(name, lambda: wp.array(self.layers[name], dtype=kernels.vec16, device=device)),
             out,
@@ -337,9 +351,9 @@ class HarmonicField(RadioField):
         """Spectrum at one receiver and what it was made of."""
         seen = self._seen_from(receiver[None], None)
         visible, friis = self._line_of_sight(receiver, source)
-        lengths = self._lengths(seen, source)
-        power = self._factor(lengths)[0] * self.gain_unit * self._blend("gain", seen)
-        point, delay, departure = lengths.point[0], lengths.delay_s[0], lengths.departure[0]
+        (lengths,) = self._lengths(seen, source)
+        power = self._factor(lengths.total) * self.gain_unit * self._blend("gain", seen)
+        point, delay, departure = lengths.point, lengths.delay_s, lengths.departure
         if self.options.model == "rf3dgs":
             point = np.full_like(point, np.nan)
             delay, departure = self._channels(seen)
@@ -402,19 +416,19 @@ def _train(
     options, gaussians, device = blank.options, blank.gaussians, blank.device
     listed = None
     if options.train_opacity:
-        listed = list_responses(gaussians, seen, ds.range_db, device=device, progress=progress)
+        listed = list_responses(gaussians, seen, ds.range_db, progress=progress)
         seen = listed.transport
-    factor = blank._factor(blank._lengths(seen, blank.transmitter))
+    factor = blank._factor(np.stack([own.total for own in blank._lengths(seen, blank.transmitter)]))
     beams = [blank._beam(receiver, blank.transmitter) for receiver in seen.receivers]
     extra = np.stack([np.zeros(blank.shape) if beam is None else beam for beam in beams])
-    plan, gain_unit, delay_unit = targets(options, ds, images, seen, factor, extra)
     problem = Problem(seen, batch=options.batch, seed=options.seed, device=device)
+    plan, gain_unit, delay_unit = targets(options, ds, images, problem, factor, extra)
     channel_steps = 100  # of each delay and AoD channel: they start at means that are nearly right
     steps = {
         name: options.iterations if name == "gain" else min(channel_steps, options.iterations)
         for name in plan
     }
-    identity = digest(options, seen, plan)
+    identity = "" if checkpoint is None else digest(options, seen.values, plan)
     states, before = load_states(checkpoint, identity), 0
     layers: dict[str, np.ndarray] = {}
 

@@ -27,7 +27,6 @@ from warprrf.kernels.raster.sh import COEFFICIENTS as DEGREE_TO_COUNT
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining
 from warprrf.rf.fields.harmonic.options import GAIN_RATES, FieldOptions, Rates
 from warprrf.rf.fields.harmonic.problem import Problem
-from warprrf.rf.fields.harmonic.transport import Transport
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import directions_from_angles, to_db
 
@@ -143,33 +142,31 @@ class Layer:
         self.problem, self.target, self.kind, self.opacity = problem, target, KINDS[target.kind], opacity
         p, k = problem, problem.kernels
         self.loss = PhotoLoss(p.device, SSIM_SHARE, real=p.real, panorama=True)
-        shape = (len(p.transport.receivers), p.pixels)
-        ones, zeros = np.ones(shape, p.precision), np.zeros(shape, p.precision)
-        arrays = [
-            default if given is None else np.asarray(given, p.precision).reshape(shape)
-            for given, default in (
-                (target.image, zeros), (target.factor, ones), (target.extra, zeros), (target.mask, ones)
-            )
-        ]  # fmt: skip
         self.unit = p.upload(np.ones(len(p.seen)) if target.unit is None else target.unit)
-        self.data: list[_BatchTarget] = []
-        for batch in p.batches:
-            image, factor, extra, mask = (p.upload(a[batch.receivers].ravel()) for a in arrays)
-            count = max(float(mask.numpy().sum(dtype=np.float64)), 1.0)
-            shown, moments = mask, None
-            if target.mask is None:
-                size = self._size(image)
-                image = self.loss.plane(image.numpy(), size)
-                shown, moments = None, self.loss.moments(image, size)
-            self.data.append(_BatchTarget(image, factor, extra, shown, moments, count))
-        pairs, pixels = (
-            max(sizes)
-            for sizes in ([len(b.pair_pixel) for b in p.batches], [len(d.factor) for d in self.data])
-        )
+        self.data = [self._data(batch.receivers) for batch in p.batches]
+        pairs = max(len(batch.pair_pixel) for batch in p.batches)
+        pixels = max(len(data.factor) for data in self.data)
         self.contribution = wp.zeros(pairs, dtype=p.real, device=p.device)
         self.scalars = [wp.zeros(pixels, dtype=p.real, device=p.device) for _ in range(3)]
+        self.errors = wp.zeros(pixels // p.transport.shape[1], dtype=wp.vec2d, device=p.device)
         self.gradient = wp.zeros(len(p.seen), dtype=k.vec16, device=p.device)
-        self.opacity_gradient = np.zeros(len(p.seen))
+
+    def _data(self, receivers: np.ndarray) -> _BatchTarget:
+        """The target of some receivers."""
+        p, target, shape = self.problem, self.target, (len(receivers), *self.problem.transport.shape)
+
+        def part(values: np.ndarray | None, default: float) -> np.ndarray:
+            own = np.full(shape, default) if values is None else values[receivers]
+            return np.asarray(own, p.precision)
+
+        factor, extra = (p.upload(part(*own).ravel()) for own in ((target.factor, 1.0), (target.extra, 0.0)))
+        image = part(target.image, 0.0)
+        if target.mask is not None:
+            mask = part(target.mask, 1.0)
+            count = max(float(mask.sum(dtype=np.float64)), 1.0)
+            return _BatchTarget(p.upload(image.ravel()), factor, extra, p.upload(mask.ravel()), None, count)
+        plane = self.loss.plane(image, shape)
+        return _BatchTarget(plane, factor, extra, None, self.loss.moments(plane, shape), image.size)
 
     def _size(self, pixels: wp.array) -> tuple[int, ...]:
         """Receivers, rows and columns of the images that ``pixels`` are."""
@@ -181,29 +178,34 @@ class Layer:
         size = len(data.factor)
         total, absolute, adjoint = self.scalars
         weight = batch.pair_weight if self.opacity is None else self.opacity.weights(index)
-        gaussians = [batch.row_gaussian, batch.row_start]
         seen = [batch.pair_direction, weight, self.unit, p.basis]
-        p.launch(k.contributions, batch.rows, self.kind, *gaussians, *seen, coefficients, self.contribution)
+        rows = len(p.seen)
+        p.launch(k.contributions, rows, self.kind, batch.row_start, *seen, coefficients, self.contribution)
         p.launch(k.pixel_sums, size, batch.pixel_start, batch.pair_of_pixel, self.contribution, total)
-        similarity = 1.0
+        score = wp.empty(0, dtype=p.real, device=p.device)
         if data.moments is not None:
-            similarity = self._image_adjoint(data, data.moments)
+            score = self._image_adjoint(data, data.moments)
         else:
             share = p.real(1.0 / data.count)
             p.launch(k.absolute_adjoint, size, share, data.mask, data.image, total, absolute, adjoint)
         p.launch(
-            k.coefficient_adjoint, batch.rows, self.kind, *gaussians, batch.pair_pixel, *seen, self.contribution,
+            k.coefficient_adjoint, rows, self.kind, batch.row_start, batch.pair_pixel, *seen, self.contribution,
             adjoint, self.gradient,
         )  # fmt: skip
         if self.opacity is not None:
-            self.opacity_gradient = self.opacity.gradient(index, self.contribution, total, adjoint)
-        error = float(np.sum(absolute.numpy()[:size], dtype=np.float64)) / data.count
+            self.opacity.find_gradient(index, self.contribution, total, adjoint)
+        width = p.transport.shape[1]
+        lines = size // width
+        place = width, len(score) // lines, WRAPPED
+        p.launch(k.row_errors, lines, *place, absolute, score, self.errors)
+        error, similarity = self.errors[:lines].numpy().sum(axis=0) / data.count
         if data.mask is not None:
-            return error
-        return (1 - SSIM_SHARE) * error + SSIM_SHARE * (1 - similarity)
+            return float(error)
+        return float((1 - SSIM_SHARE) * error + SSIM_SHARE * (1 - similarity))
 
-    def _image_adjoint(self, data: _BatchTarget, moments: tuple[wp.array, wp.array]) -> float:
-        """Similarity of the dB image of the sums that lie in ``self.scalars``; leaves errors and adjoint there."""
+    def _image_adjoint(self, data: _BatchTarget, moments: tuple[wp.array, wp.array]) -> wp.array:
+        """The plane of similarities of the dB image of the sums that lie in ``self.scalars``; leaves errors and adjoint
+        there."""
         p, k, target, shape = self.problem, self.problem.kernels, self.target, self._size(data.factor)
         total, absolute, adjoint = self.scalars
         canvas, rows, width = self.loss.canvas(shape), shape[0] * shape[1], shape[2]
@@ -216,7 +218,7 @@ class Layer:
             k.loss_adjoint, rows * width, *place, data.factor, data.extra, *scale, total, canvas, data.image, slopes,
             absolute, adjoint,
         )  # fmt: skip
-        return float(np.mean(self.loss.values(score, shape), dtype=np.float64))
+        return score
 
 
 def fit_layer(
@@ -282,7 +284,7 @@ def fit_layer(
         )  # fmt: skip
         if opacity is not None:
             opacity_rate = 0.05  # Adam's, of the logits, as RF-3DGS publishes it
-            opacity.step(layer.opacity_gradient, step + 1, opacity_rate * falling)
+            opacity.step(step + 1, opacity_rate * falling)
         if each is not None:
             each(step + 1, snapshot)
     return snapshot()
@@ -300,7 +302,7 @@ def targets(
     options: FieldOptions,
     ds: SpectrumDataset,
     images: np.ndarray,
-    seen: Transport,
+    problem: Problem,
     factor: np.ndarray,
     extra: np.ndarray,
 ) -> tuple[dict[str, Target], float, float]:
@@ -319,7 +321,7 @@ def targets(
         ValueError: if no pixel above the floor meets a Gaussian.
     """
     floor = float(ds.floor)
-    blended = factor * seen.pixel_weight
+    blended = factor * problem.transport.pixel_weight
     above = (images - extra > floor) & (blended > 0)
     if not above.any():
         raise ValueError(
@@ -331,8 +333,8 @@ def targets(
     met = blended > 0
     dark = 0.1  # a pixel below the floor counts as this share of it where logarithms are averaged
     floored = np.maximum(images - extra, dark * floor)
-    relative = np.log(floored / np.where(met, blended * gain_unit, 1.0))
-    start = np.nan_to_num(weighted_means(seen, relative, met))
+    relative = np.log(floored / np.where(met, blended * gain_unit, np.nan))
+    start = np.nan_to_num(problem.weighted_means(relative))
     exponential = options.gain == "exp"
     low, high = (float(v) for v in ds.range_db)
     layers = {
@@ -352,7 +354,7 @@ def targets(
     delay_unit = 1.0
     delays = None if ds.delay_s is None else np.asarray(ds.delay_s, np.float64)
     if options.model == "rf3dgs" and delays is not None:
-        mask = (images > floor) & np.isfinite(delays) & (seen.dominant >= 0)
+        mask = (images > floor) & np.isfinite(delays) & (problem.transport.dominant >= 0)
         if mask.any():
             delay_unit = float(delays[mask].max())
             departure = directions_from_angles(*np.moveaxis(np.asarray(ds.aod, np.float64), -1, 0))
@@ -360,7 +362,7 @@ def targets(
             channels.update({f"aod_{axis}": departure[..., k] for k, axis in enumerate("xyz")})
             for name, image in channels.items():
                 middle = float(np.median(image[mask]))
-                mean = weighted_means(seen, image, mask)
+                mean = problem.weighted_means(np.where(mask, image, np.nan))
                 layers[name] = Target(
                     kind="signed",
                     image=np.where(mask, image, 0.0),
@@ -369,20 +371,3 @@ def targets(
                     mask=mask,
                 )
     return layers, gain_unit, delay_unit
-
-
-def weighted_means(transport: Transport, values: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Per Gaussian seen by ``transport``: the mean of ``values`` over the pixels ``where`` that see it.
-
-    Both images have shape ``(R, H, W)``; the mean is weighted by blending weight, NaN if it is seen in none of them.
-    """
-    seen = transport.seen
-    total, summed = np.zeros(len(seen)), np.zeros(len(seen))
-    for r in range(len(transport.receivers)):  # one at a time: what lies between is as large as the weights
-        part = transport.subset([r])
-        local, met = np.searchsorted(seen, part.gaussian), where[r].ravel()[part.pixel]
-        weight = part.weight * met
-        value = np.where(met, values[r].ravel()[part.pixel], 0.0)
-        total += np.bincount(local, weights=weight, minlength=len(seen))
-        summed += np.bincount(local, weights=weight * value, minlength=len(seen))
-    return np.divide(summed, total, out=np.full(len(seen), np.nan), where=total > 0)

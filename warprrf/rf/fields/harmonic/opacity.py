@@ -13,13 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
-from warprrf.device import DeviceLike, Progress
+from warprrf import device as _device
+from warprrf.device import Progress
 from warprrf.geometry.splats.gaussians import Gaussians
-from warprrf.geometry.splats.rasterizer import Blending
-from warprrf.kernels.adam import EPSILON, FIRST_DECAY, SECOND_DECAY, corrections
+from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
+from warprrf.kernels.adam import build_adam, corrections
 from warprrf.kernels.radio import opacity as _kernels
+from warprrf.kernels.radio.transport import write_responses
 from warprrf.rf.fields.harmonic.problem import Problem
-from warprrf.rf.fields.harmonic.transport import Transport, cutoffs, views
+from warprrf.rf.fields.harmonic.transport import Transport, cutoffs, kept, strongest
 
 
 @dataclass(frozen=True)
@@ -28,21 +30,27 @@ class Listed:
 
     Attributes:
         transport: its weights are those of the Gaussians' own opacities.
-        response: of each pair, in [0, 1], shape ``(E,)`` float32.
+        responses: of each receiver's pairs, in [0, 1], shape ``(E,)`` float32 on the device.
         alpha_max: clamp of alpha.
     """
 
     transport: Transport
-    response: np.ndarray
+    responses: tuple[wp.array, ...]
     alpha_max: float
 
     def with_opacities(self, opacities: np.ndarray) -> Transport:
         """The weights that other opacities (N,) give."""
-        seen = self.transport
-        alpha = np.minimum(opacities[seen.gaussian] * self.response.astype(np.float64), self.alpha_max)
-        cumulated = np.concatenate([[0.0], np.cumsum(np.log1p(-alpha))])
-        left = np.exp(cumulated[:-1] - cumulated[seen.start[seen.pixel]])
-        return replace(seen, weight=(alpha * left).astype(np.float32))
+        seen, device, kernels = self.transport, self.transport.device, _kernels.build(wp.float32)
+        opacity = wp.array(opacities, dtype=float, device=device)
+        views = []
+        for view, response in zip(seen.views, self.responses, strict=True):
+            order = wp.empty(len(response), dtype=int, device=device)
+            _device.launch(_kernels.count_up, len(order), [order], device=device)
+            weight = wp.empty(len(response), dtype=float, device=device)
+            inputs = [self.alpha_max, view.start, order, view.gaussian, response, opacity, weight]
+            _device.launch(kernels.blend, len(view.start) - 1, inputs, device=device)
+            views.append(replace(view, weight=weight))
+        return replace(seen, views=tuple(views))
 
 
 def list_responses(
@@ -51,44 +59,40 @@ def list_responses(
     range_db: tuple[float, float],
     *,
     top_k: int = 32,
-    device: DeviceLike = None,
     progress: Progress | None = None,
 ) -> Listed:
-    """Responses and order along the rays of the receivers of ``seen``.
+    """Responses and order along the rays of the receivers of ``seen``, on its device.
 
     Args:
         gaussians: the frozen geometry.
         seen: weights of the receivers, whose interaction points are kept; made with the ``product`` rule.
         range_db: range of the data set's dB images.
         top_k: Gaussians kept per pixel, those of largest thinned weight.
+        progress: called once a receiver with the stage ``"transport"``.
     """
-    rules = cutoffs(range_db)
+    rules, device = cutoffs(range_db), seen.device
     share = 0.5  # of each opacity
     thin = replace(gaussians, opacities=(share * gaussians.opacities).astype(np.float32))
     # transmittance at which a list ends: float32 weights give alpha to 0.1 % there
     blending = Blending(share * rules.alpha_min, rules.alpha_max, 1e-4, "product")
-    counts, indices, responses = [], [], []
-    for view in views(thin, seen.receivers, seen.shape, top_k, blending, device=device, progress=progress):
-        weight = np.asarray(view.weight, np.float64)
-        listed = (np.asarray(view.index) >= 0) & (weight > 0)
-        weight = np.where(listed, weight, 0.0)
-        left = 1.0 - (np.cumsum(weight, axis=-1) - weight)
-        alpha = weight / np.maximum(left, 1e-12)
-        index = np.asarray(view.index)[listed]
-        counts.append(np.count_nonzero(listed, axis=-1).ravel())
-        indices.append(index)
-        responses.append(np.minimum(alpha[listed] / thin.opacities[index], 1.0).astype(np.float32))
-    start = np.concatenate([[0], np.cumsum(np.concatenate(counts))]).astype(np.int64)
-    gaussian = np.concatenate(indices).astype(np.int32)
-    response = np.concatenate(responses)
-    blank = replace(seen, start=start, gaussian=gaussian, weight=np.zeros(len(gaussian), np.float32))
-    found = Listed(blank, response, rules.alpha_max)
-    own = found.with_opacities(np.asarray(gaussians.opacities, np.float64))
-    return replace(found, transport=own)
+    raster = Rasterizer(device=device, blending=blending)
+    scene, views, responses = raster.upload(thin), [], []
+    for k, (position, view) in enumerate(zip(seen.receivers, seen.views, strict=True)):
+        found = strongest(raster, scene, position, seen.shape, top_k)
+        start, pairs, _, _ = kept(device, found, 0.0)
+        gaussian, response = (wp.empty(pairs, dtype=kind, device=device) for kind in (int, float))
+        inputs = [*found[:2], scene[3], start, gaussian, response]
+        _device.launch(write_responses, len(start) - 1, inputs, device=device)
+        views.append(replace(view, start=start, gaussian=gaussian, weight=response))
+        responses.append(response)
+        if progress is not None:
+            progress("transport", k + 1, len(seen.receivers))
+    listed = Listed(replace(seen, views=tuple(views)), tuple(responses), rules.alpha_max)
+    return replace(listed, transport=listed.with_opacities(gaussians.opacities))
 
 
 class OpacityTraining:
-    """Logits of the opacities of the Gaussians that a problem sees, and their Adam.
+    """Logits of the opacities of the Gaussians that a problem sees, and their Adam, on the problem's device.
 
     Args:
         problem: of the transport of ``listed``.
@@ -103,29 +107,45 @@ class OpacityTraining:
         self.problem, self.kernels = problem, _kernels.build(problem.real)
         self.alpha_max = problem.real(listed.alpha_max)
         limits = np.array([1e-4, 1 - 1e-6])  # opacities that logits are made of
-        self._limits = np.log(limits / (1 - limits))
+        self._limits = [problem.real(x) for x in np.log(limits / (1 - limits))]
         first = np.clip(np.asarray(opacities, np.float64)[problem.seen], *limits)
-        self.state = np.stack([np.log(first / (1 - first)), np.zeros_like(first), np.zeros_like(first)])
-        if state is not None:
-            self.state = np.array(state, np.float64)
-        responses = replace(listed.transport, weight=listed.response)
-        self.pairs = []
-        for batch in problem.batches:
-            owner = np.repeat(batch.row_gaussian.numpy(), np.diff(batch.row_start.numpy()))
-            response = np.empty(len(owner), np.float32)
-            response[batch.pair_of_pixel.numpy()] = responses.subset(batch.receivers).weight
-            own = wp.array(owner.astype(np.int32), dtype=int, device=problem.device)
-            self.pairs.append((own, problem.upload(response)))
+        if state is None:
+            state = np.stack([np.log(first / (1 - first)), np.zeros_like(first), np.zeros_like(first)])
+        self._logits, self._first, self._second = (problem.upload(row) for row in state)
+        self.pairs = [
+            (self._owners(batch.row_start, len(batch.pair_pixel)), self._responses(listed, k))
+            for k, batch in enumerate(problem.batches)
+        ]
         largest = max(len(b.pair_pixel) for b in problem.batches)
         self._weight, self._pair_adjoint = (
             wp.zeros(largest, dtype=problem.real, device=problem.device) for _ in range(2)
         )
-        self._opacity = problem.upload(self.opacities)
+        self.gradient, self._opacity = (
+            wp.zeros(len(problem.seen), dtype=problem.real, device=problem.device) for _ in range(2)
+        )
+        self._activate()
+
+    def _owners(self, row_start: wp.array, pairs: int) -> wp.array:
+        """The row of each pair of a batch."""
+        out = wp.empty(pairs, dtype=int, device=self.problem.device)
+        self.problem.launch(_kernels.owners, len(row_start) - 1, row_start, out)
+        return out
+
+    def _responses(self, listed: Listed, index: int) -> wp.array:
+        """The responses of the pairs of batch ``index``."""
+        p, batch = self.problem, self.problem.batches[index]
+        own = [listed.responses[r].to(p.device) for r in batch.receivers]
+        return p.in_order(batch.pair_of_pixel, own)
 
     @property
     def opacities(self) -> np.ndarray:
         """Opacities of the Gaussians seen, shape ``(G,)``."""
-        return np.asarray(1.0 / (1.0 + np.exp(-self.state[0])))
+        return np.asarray(self._opacity.numpy())
+
+    @property
+    def state(self) -> np.ndarray:
+        """Logits and Adam's moments, shape ``(3, G)``."""
+        return np.stack([a.numpy() for a in (self._logits, self._first, self._second)])
 
     def weights(self, index: int) -> wp.array:
         """Blending weights of batch ``index`` as the opacities now are, pair by pair."""
@@ -136,24 +156,26 @@ class OpacityTraining:
         )  # fmt: skip
         return self._weight
 
-    def gradient(self, index: int, contribution: wp.array, total: wp.array, adjoint: wp.array) -> np.ndarray:
-        """Derivative of the loss by each opacity of batch ``index``, shape ``(G,)``."""
+    def find_gradient(self, index: int, contribution: wp.array, total: wp.array, adjoint: wp.array) -> None:
+        """Write the derivative of the loss by each opacity of batch ``index`` to ``gradient``."""
         p, batch = self.problem, self.problem.batches[index]
         p.launch(
             self.kernels.blend_adjoint, len(batch.pixel_start) - 1, self.alpha_max, batch.pixel_start,
             batch.pair_of_pixel, *self.pairs[index], self._opacity, contribution, total, adjoint, self._pair_adjoint,
         )  # fmt: skip
-        owner = self.pairs[index][0].numpy()
-        return np.bincount(owner, weights=self._pair_adjoint.numpy()[: len(owner)], minlength=len(p.seen))
+        p.launch(self.kernels.add_rows, len(p.seen), batch.row_start, self._pair_adjoint, self.gradient)
 
-    def step(self, gradient: np.ndarray, count: int, rate: float) -> None:
+    def step(self, count: int, rate: float) -> None:
         """Adam's step ``count`` (from 1) along the derivative by the opacities."""
-        opacity = self.opacities
-        slope = gradient * opacity * (1.0 - opacity)
-        unbias1, unbias2 = corrections(count)
-        logits, first, second = self.state
-        first = FIRST_DECAY * first + (1 - FIRST_DECAY) * slope
-        second = SECOND_DECAY * second + (1 - SECOND_DECAY) * slope**2
-        logits = logits - rate * unbias1 * first / (np.sqrt(unbias2 * second) + EPSILON)
-        self.state = np.stack([np.clip(logits, *self._limits), first, second])
-        self._opacity = self.problem.upload(self.opacities)
+        p, rows = self.problem, len(self.problem.seen)
+        p.launch(self.kernels.to_logits, rows, self._opacity, self.gradient)
+        none = wp.empty(0, dtype=p.real, device=p.device)
+        p.launch(
+            build_adam(p.real), rows, 1, p.upload(np.array([rate])), *corrections(count), none, none, self.gradient,
+            self._first, self._second, self._logits,
+        )  # fmt: skip
+        self._activate()
+
+    def _activate(self) -> None:
+        p = self.problem
+        p.launch(self.kernels.activate, len(p.seen), *self._limits, self._logits, self._opacity)

@@ -1,6 +1,7 @@
 """Blending weights of the training receivers as batches on the device: what every layer of a fit works on.
 
-A :class:`Problem` sorts the weights once into fixed batches, Gaussian by Gaussian, so that each sum has one owner.
+A :class:`Problem` sorts the weights once into fixed batches, Gaussian by Gaussian, so that each sum has one owner. They
+do not leave the device that they were made on.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from numpy.typing import DTypeLike
 from warprrf import device as _device
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import harmonics as _kernels
+from warprrf.kernels.radio import transport as _pairs
+from warprrf.kernels.raster.binning import tile_starts
 from warprrf.rf.fields.harmonic.transport import Transport
 from warprrf.rf.spectra.spectrum import pixel_directions
 
@@ -24,8 +27,6 @@ class Pairs:
     """One batch's pairs on the device, Gaussian by Gaussian; see :mod:`warprrf.kernels.radio.harmonics`."""
 
     receivers: np.ndarray
-    rows: int
-    row_gaussian: wp.array
     row_start: wp.array
     pair_pixel: wp.array
     pair_direction: wp.array
@@ -38,7 +39,7 @@ class Problem:
     """Blending weights of the training receivers, in batches on the device.
 
     Args:
-        transport: weights of the training receivers.
+        transport: weights of the training receivers, which are copied if they lie on another device.
         batch: receivers per optimiser step.
         seed: deals receivers into batches and orders them.
         device: where to fit.
@@ -54,13 +55,13 @@ class Problem:
         device: DeviceLike = None,
         precision: DTypeLike = np.float32,
     ) -> None:
-        self.transport = transport
         self.seed = int(seed)
         self.device = _device.resolve(device)
+        self.transport = transport.on(self.device)
         self.precision = np.dtype(precision)
         self.real = wp.float64 if self.precision == np.float64 else wp.float32
         self.kernels = _kernels.build(self.real)
-        self.seen = transport.seen
+        self._row, self.seen = self._rows()
         self.pixels = transport.shape[0] * transport.shape[1]
         count = len(transport.receivers)
         order = np.random.default_rng([self.seed, 0]).permutation(count)
@@ -83,26 +84,58 @@ class Problem:
         epoch, place = divmod(step, len(self.batches))
         return int(np.random.default_rng([self.seed, 1, epoch]).permutation(len(self.batches))[place])
 
+    def _rows(self) -> tuple[wp.array, np.ndarray]:
+        """The row of each Gaussian that any receiver sees, and these Gaussians, ascending."""
+        count = self.transport.gaussians
+        row = wp.zeros(count + 1, dtype=int, device=self.device)
+        for view in self.transport.views:
+            self.launch(_pairs.mark_seen, len(view.gaussian), view.gaussian, row)
+        wp.utils.array_scan(row, row, inclusive=False)
+        seen = wp.empty(int(row[count:].numpy()[0]), dtype=int, device=self.device)
+        self.launch(_pairs.list_seen, count, row, seen)
+        return row, seen.numpy()
+
     def _sorted(self, receivers: np.ndarray) -> Pairs:
         """The pairs of some receivers, sorted by Gaussian."""
-        part = self.transport.subset(receivers)
-        order = np.argsort(part.gaussian, kind="stable")
-        gaussian, pixel = part.gaussian[order], part.pixel[order]
-        first = np.flatnonzero(np.diff(gaussian, prepend=-1))
-        place = np.empty(len(order), dtype=np.int32)
-        place[order] = np.arange(len(order), dtype=np.int32)
-        arrays = {
-            "row_gaussian": np.searchsorted(self.seen, gaussian[first]),
-            "row_start": np.append(first, len(gaussian)),
-            "pair_pixel": pixel,
-            "pair_direction": pixel % self.pixels,
-            "pixel_start": part.start,
-            "pair_of_pixel": place,
-        }
-        on_device = {
-            n: wp.array(a.astype(np.int32), dtype=int, device=self.device) for n, a in arrays.items()
-        }
-        return Pairs(receivers, len(first), pair_weight=self.upload(part.weight[order]), **on_device)
+        views = [self.transport.views[r] for r in receivers]
+        firsts = np.cumsum([0, *(len(view.gaussian) for view in views)]).tolist()
+        count, pixels = firsts[-1], self.pixels * len(views)
+        keys, order = (wp.empty(2 * count, dtype=int, device=self.device) for _ in range(2))  # room to sort
+        pixel_start = wp.empty(pixels + 1, dtype=int, device=self.device)
+        for k, (first, view) in enumerate(zip(firsts[:-1], views, strict=True)):
+            self.launch(_pairs.gather_pairs, len(view.gaussian), first, self._row, view.gaussian, keys, order)
+            at = self.pixels * k, first
+            self.launch(_pairs.gather_starts, self.pixels + 1, *at, view.start, pixel_start)
+        wp.utils.radix_sort_pairs(keys, order, count, 0, len(self.seen).bit_length())
+        row_start = wp.empty(len(self.seen) + 1, dtype=int, device=self.device)
+        self.launch(tile_starts, len(row_start), keys, count, row_start)
+        place, pair_pixel, pair_direction = (wp.empty(count, dtype=int, device=self.device) for _ in range(3))
+        self.launch(_pairs.invert, count, order, place)
+        self.launch(
+            _pairs.pixels_of_pairs, pixels, self.pixels, pixel_start, place, pair_pixel, pair_direction
+        )
+        weight = self.in_order(place, [view.weight for view in views])
+        return Pairs(receivers, row_start, pair_pixel, pair_direction, weight, pixel_start, place)
+
+    def in_order(self, pair_of_pixel: wp.array, values: list[wp.array]) -> wp.array:
+        """Values (E,) of the pairs of a batch's receivers, in the batch's order and the problem's precision."""
+        out = wp.empty(len(pair_of_pixel), dtype=self.real, device=self.device)
+        first = 0
+        for own in values:
+            self.launch(self.kernels.put_in_order, len(own), first, pair_of_pixel, own, out)
+            first += len(own)
+        return out
+
+    def weighted_means(self, values: np.ndarray) -> np.ndarray:
+        """Mean of the ``values`` (R, H, W) of the pixels that see a Gaussian, weighted by blending weight, shape ``(G,)``;
+        pixels of NaN do not count, and without any it is NaN."""
+        total, summed = (wp.zeros(len(self.seen), dtype=wp.float64, device=self.device) for _ in range(2))
+        for batch in self.batches:
+            own = wp.array(values[batch.receivers].ravel(), dtype=wp.float64, device=self.device)
+            inputs = batch.row_start, batch.pair_pixel, batch.pair_weight, own, total, summed
+            self.launch(self.kernels.add_to_means, len(self.seen), *inputs)
+        weight = total.numpy()
+        return np.divide(summed.numpy(), weight, out=np.full(len(weight), np.nan), where=weight > 0)
 
 
 def harmonics(shape: tuple[int, int], real: type, device: DeviceLike) -> wp.array:

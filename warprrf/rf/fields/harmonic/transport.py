@@ -16,16 +16,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf.cache import cached_property
+from warprrf import device as _device
 from warprrf.checks import check_array
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.splats.camera import Camera
-from warprrf.geometry.splats.gaussians import Gaussians, rotations_of
-from warprrf.geometry.splats.rasterizer import Blending
-from warprrf.geometry.splats.render import BlendWeights, blend_weights_of_each
+from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.rasterizer import Blending, Parameters, Rasterizer
+from warprrf.kernels.radio import transport as _kernels
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.spectra.spectrum import check_shape, pixel_directions
 
@@ -34,61 +35,81 @@ TOP_K = 16  # Gaussians kept per pixel
 
 
 @dataclass(frozen=True)
+class Rows:
+    """What one receiver sees, as sparse rows on a device: one row a pixel, of H W.
+
+    Attributes:
+        start: where each pixel's pairs begin, shape ``(H * W + 1,)`` int32.
+        gaussian: Gaussian of each pair, front to back within a pixel, shape ``(E,)`` int32.
+        weight: blending weight alpha T of each pair, shape ``(E,)`` float32; what top-K left out is shared among the
+            pairs that stayed, so that a pixel's sum is that of all its Gaussians.
+        dominant: Gaussian with the largest weight, shape ``(H * W,)`` int32, -1 where there is none.
+        expected_range: blended mean of the peak ranges [m], shape ``(H * W,)`` float64, NaN where there is none.
+    """
+
+    start: wp.array
+    gaussian: wp.array
+    weight: wp.array
+    dominant: wp.array
+    expected_range: wp.array
+
+    def on(self, device: wp.Device) -> Rows:
+        """The same on another device."""
+        return Rows(**{name: array.to(device) for name, array in vars(self).items()})
+
+
+@dataclass(frozen=True)
 class Transport:
-    """Blending weights of the frozen geometry for some receivers, as sparse rows: one row a pixel.
+    """Blending weights of the frozen geometry for some receivers, on a device.
 
     Attributes:
         shape: rows and columns of a spectrum.
         receivers: positions [m], shape ``(R, 3)``.
-        start: where each pixel's pairs begin, shape ``(R * H * W + 1,)`` int64.
-        gaussian: Gaussian of each pair, front to back within a pixel, shape ``(E,)`` int32.
-        weight: blending weight alpha T of each pair, shape ``(E,)`` float32; what top-K left out is shared among the
-            pairs that stayed, so that a pixel's sum is that of all its Gaussians.
-        dominant: Gaussian with the largest weight, shape ``(R, H, W)`` int32, -1 where there is none.
-        expected_range: blended mean of the peak ranges [m], shape ``(R, H, W)`` float32, NaN where there is none.
+        views: what each of them sees.
+        gaussians: how many there are, seen or not.
         rule: transmittance rule, ``"product"`` or ``"exp"``.
     """
 
     shape: tuple[int, int]
     receivers: np.ndarray
-    start: np.ndarray
-    gaussian: np.ndarray
-    weight: np.ndarray
-    dominant: np.ndarray
-    expected_range: np.ndarray
+    views: tuple[Rows, ...]
+    gaussians: int
     rule: str
 
     def subset(self, indices: Sequence[int] | np.ndarray) -> Transport:
         """The receivers at ``indices``, in that order."""
         chosen = np.asarray(indices, dtype=np.int64)
-        pixels = self.shape[0] * self.shape[1]
-        pieces = [slice(self.start[r * pixels], self.start[(r + 1) * pixels]) for r in chosen]
-        counts = np.diff(self.start).reshape(len(self.receivers), pixels)[chosen].ravel()
-        return replace(
-            self,
-            receivers=self.receivers[chosen],
-            start=np.concatenate([[0], np.cumsum(counts)]),
-            gaussian=np.concatenate([self.gaussian[p] for p in pieces]),
-            weight=np.concatenate([self.weight[p] for p in pieces]),
-            dominant=self.dominant[chosen],
-            expected_range=self.expected_range[chosen],
-        )
+        return replace(self, receivers=self.receivers[chosen], views=tuple(self.views[r] for r in chosen))
 
-    @cached_property
-    def seen(self) -> np.ndarray:
-        """Gaussians that any receiver sees, ascending."""
-        return np.unique(self.gaussian)
+    def on(self, device: DeviceLike) -> Transport:
+        """The same on another device."""
+        where = _device.resolve(device)
+        return replace(self, views=tuple(view.on(where) for view in self.views))
 
     @property
-    def pixel(self) -> np.ndarray:
-        """Pixel of each pair, counted through all receivers, shape ``(E,)`` int32."""
-        return np.repeat(np.arange(len(self.start) - 1, dtype=np.int32), np.diff(self.start))
+    def device(self) -> wp.Device:
+        """Where the views lie."""
+        return self.views[0].start.device
+
+    @property
+    def values(self) -> list[np.ndarray]:
+        """All that the views hold, from the device."""
+        return [array.numpy() for view in self.views for array in vars(view).values()]
+
+    @property
+    def dominant(self) -> np.ndarray:
+        """Gaussian with the largest weight, shape ``(R, H, W)`` int32, -1 where there is none."""
+        return np.stack([view.dominant.numpy().reshape(self.shape) for view in self.views])
 
     @property
     def pixel_weight(self) -> np.ndarray:
         """Sum of the weights per pixel, shape ``(R, H, W)`` float64; with the ``exp`` rule it can exceed one."""
-        summed = np.add.reduceat(np.append(self.weight, np.float32(0)), self.start[:-1], dtype=np.float64)
-        return np.where(np.diff(self.start) > 0, summed, 0.0).reshape(len(self.receivers), *self.shape)
+        pixels = self.shape[0] * self.shape[1]
+        out = wp.empty((len(self.views), pixels), dtype=wp.float64, device=self.device)
+        for r, view in enumerate(self.views):
+            inputs = [view.start, view.weight, out[r]]
+            _device.launch(_kernels.sum_rows, pixels, inputs, device=self.device)
+        return np.asarray(out.numpy().reshape(-1, *self.shape))
 
 
 def cutoffs(range_db: tuple[float, float], rule: str = "product") -> Blending:
@@ -111,6 +132,7 @@ def transport(
     rule: str = "product",
     top_k: int = TOP_K,
     device: DeviceLike = None,
+    uploaded: Parameters | None = None,
     progress: Progress | None = None,
 ) -> Transport:
     """Blending weights of ``gaussians`` for every pixel of every receiver.
@@ -123,6 +145,7 @@ def transport(
         rule: transmittance: ``"product"`` of (1 - alpha), or the paper's ``"exp"`` of minus the sum of alphas.
         top_k: Gaussians kept per pixel.
         device: where blending runs.
+        uploaded: the Gaussians, if they lie there already.
         progress: called once a receiver with the stage ``"transport"``.
 
     Raises:
@@ -131,59 +154,52 @@ def transport(
     positions = check_array("receivers", receivers, (None, 3))
     if len(positions) == 0:
         raise ValueError("receivers: got none, expected at least one position")
-    rows, columns = check_shape(shape)
-    blending = cutoffs(range_db, rule)
-    seen = views(gaussians, positions, (rows, columns), top_k, blending, device=device, progress=progress)
-    counts, gaussian, weight, dominant, expected = zip(*map(_kept, seen), strict=True)
-    return Transport(
-        shape=(rows, columns),
-        receivers=positions,
-        start=np.concatenate([[0], np.cumsum(np.concatenate(counts))]).astype(np.int64),
-        gaussian=np.concatenate(gaussian),
-        weight=np.concatenate(weight),
-        dominant=np.stack(dominant),
-        expected_range=np.stack(expected),
-        rule=rule,
-    )
-
-
-def views(
-    gaussians: Gaussians,
-    receivers: np.ndarray,
-    shape: tuple[int, int],
-    top_k: int,
-    blending: Blending,
-    *,
-    device: DeviceLike,
-    progress: Progress | None,
-) -> Iterator[BlendWeights]:
-    """What each of ``receivers`` (R, 3) sees on a grid of ``shape``."""
-    cameras = (Camera.spherical(shape[1], shape[0], position=position) for position in receivers)
-    seen = blend_weights_of_each(gaussians, cameras, top_k=top_k, blending=blending, device=device)
-    for k, weights in enumerate(seen):
-        yield weights
+    size = check_shape(shape)
+    raster = Rasterizer(device=device, blending=cutoffs(range_db, rule))
+    scene = raster.upload(gaussians) if uploaded is None else uploaded
+    views = []
+    for k, position in enumerate(positions):
+        views.append(_rows(raster, strongest(raster, scene, position, size, top_k)))
         if progress is not None:
-            progress("transport", k + 1, len(receivers))
+            progress("transport", k + 1, len(positions))
+    return Transport(size, positions, tuple(views), len(gaussians), rule)
 
 
-def _kept(seen: BlendWeights) -> tuple[np.ndarray, ...]:
-    """Pairs a pixel (H * W,), Gaussians and weights (E,), dominant Gaussian and mean range (H, W) of one receiver."""
-    weight, index = np.asarray(seen.weight, dtype=np.float64), np.asarray(seen.index)
-    listed = (index >= 0) & (weight > 0)
-    total = np.sum(weight, axis=-1, where=listed, initial=0.0)
-    min_weight = 1e-4  # smaller shares of a pixel's weight are given to the others: 0.0004 dB
-    keep = listed & (weight > min_weight * total[..., None])
-    kept = np.sum(weight, axis=-1, where=keep, initial=0.0)
-    scale = np.divide(total + np.asarray(seen.dropped, float), kept, out=np.zeros_like(kept), where=kept > 0)
-    expected = np.sum(weight * np.asarray(seen.range), axis=-1, where=keep, initial=0.0)
-    expected = np.divide(expected, kept, out=np.full_like(kept, np.nan), where=kept > 0)
-    return (
-        np.count_nonzero(keep, axis=-1).ravel(),
-        index[keep].astype(np.int32),
-        (weight * scale[..., None])[keep].astype(np.float32),
-        np.where(kept > 0, np.asarray(seen.dominant), -1).astype(np.int32),
-        expected.astype(np.float32),
-    )
+Strongest = tuple[wp.array, wp.array, wp.array, wp.array]
+"""What :meth:`Rasterizer.strongest` gives."""
+
+
+def strongest(
+    raster: Rasterizer, scene: Parameters, position: np.ndarray, shape: tuple[int, int], top_k: int
+) -> Strongest:
+    """The ``top_k`` largest blending weights of every pixel of a receiver."""
+    cam = Camera.spherical(shape[1], shape[0], position=position)
+    return raster.strongest(raster.prepare(*scene, cam), top_k)
+
+
+def kept(device: wp.Device, found: Strongest, share: float) -> tuple[wp.array, int, wp.array, wp.array]:
+    """Where each pixel's row begins if all weights above ``share`` of the pixel's sum stay, how many these are, the dominant
+    Gaussians and the mean ranges; see :class:`Rows`."""
+    index, weight, distance, _ = found
+    pixels = index.shape[0] * index.shape[1]
+    start = wp.zeros(pixels + 1, dtype=int, device=device)
+    dominant = wp.empty(pixels, dtype=int, device=device)
+    expected = wp.empty(pixels, dtype=wp.float64, device=device)
+    inputs = [share, index, weight, distance, start, dominant, expected]
+    _device.launch(_kernels.count_kept, pixels, inputs, device=device)
+    wp.utils.array_scan(start, start, inclusive=False)
+    return start, int(start[pixels:].numpy()[0]), dominant, expected
+
+
+def _rows(raster: Rasterizer, found: Strongest) -> Rows:
+    """The largest weights of one receiver's pixels as rows."""
+    device, (index, weight, _, alpha) = raster.device, found
+    share = 1e-4  # smaller shares of a pixel's weight are given to the others: 0.0004 dB
+    start, pairs, dominant, expected = kept(device, found, share)
+    gaussian, out = (wp.empty(pairs, dtype=kind, device=device) for kind in (int, float))
+    inputs = [share, index, weight, alpha, start, gaussian, out]
+    _device.launch(_kernels.write_weights, len(dominant), inputs, device=device)
+    return Rows(start, gaussian, out, dominant, expected)
 
 
 INTERACTION_POINTS = ("centre", "peak", "expected", "mesh")
@@ -191,35 +207,55 @@ INTERACTION_POINTS = ("centre", "peak", "expected", "mesh")
 
 @dataclass(frozen=True)
 class Lengths:
-    """Single-bounce path geometry per pixel; NaN where the ray meets nothing.
+    """Single-bounce path geometry of one receiver's pixels; NaN where the ray meets nothing.
 
     Attributes:
-        point: interaction point [m], shape ``(..., H, W, 3)``.
-        total: length transmitter - point - receiver [m], shape ``(..., H, W)``.
-        departure: unit direction from the transmitter to the point, shape ``(..., H, W, 3)``.
+        shape: rows and columns.
+        transmitter: position [m], shape ``(3,)``.
+        points: interaction points on the device [m], ``H * W`` vectors.
+        lengths: transmitter - point - receiver on the device [m], shape ``(H * W,)``.
     """
 
-    point: np.ndarray
-    total: np.ndarray
-    departure: np.ndarray
+    shape: tuple[int, int]
+    transmitter: np.ndarray
+    points: wp.array
+    lengths: wp.array
+
+    @property
+    def point(self) -> np.ndarray:
+        """Interaction point [m], shape ``(H, W, 3)``."""
+        return np.asarray(self.points.numpy().reshape(*self.shape, 3))
+
+    @property
+    def total(self) -> np.ndarray:
+        """Length transmitter - point - receiver [m], shape ``(H, W)``."""
+        return np.asarray(self.lengths.numpy().reshape(self.shape))
 
     @property
     def delay_s(self) -> np.ndarray:
-        """Time of flight [s], shape ``(..., H, W)``."""
+        """Time of flight [s], shape ``(H, W)``."""
         return self.total / SPEED_OF_LIGHT
 
+    @property
+    def departure(self) -> np.ndarray:
+        """Way from the transmitter to the point [m], shape ``(H, W, 3)``."""
+        return self.point - self.transmitter
 
-def interaction_points(
+
+def path_lengths(
     seen: Transport,
-    gaussians: Gaussians,
+    scene: Parameters,
+    directions: wp.array,
     kind: str,
+    transmitter: np.ndarray,
     *,
     mesh: Mesh | None = None,
-    device: DeviceLike = None,
-) -> np.ndarray:
-    """Where each pixel's ray is taken to interact [m], shape ``(R, H, W, 3)`` float64; NaN where it meets nothing.
+) -> Iterator[Lengths]:
+    """Where the rays of each receiver's pixels are taken to interact, and how long the paths by there are, in float64.
 
     Args:
+        scene: the Gaussians on the device of ``seen``.
+        directions: of the pixels, ``H * W`` vectors of float64 there.
         kind: ``"centre"``, ``"peak"``, ``"expected"`` or ``"mesh"`` (see the module); a ray that misses the mesh falls
             back on ``"peak"``.
 
@@ -228,43 +264,18 @@ def interaction_points(
     """
     if kind == "mesh" and mesh is None:
         raise ValueError('interaction_point: got "mesh", but the geometry has no mesh; use "peak"')
-    directions = pixel_directions(seen.shape)
-    means = np.asarray(gaussians.means, dtype=np.float64)
-    dominant, expected = seen.dominant, seen.expected_range if kind == "expected" else None
-    points = np.empty((*dominant.shape, 3))
-    for r, origin in enumerate(seen.receivers):  # one at a time: what lies between is ten times the result
-        empty = dominant[r] < 0
-        if kind == "centre":
-            points[r] = means[dominant[r]]
-        elif expected is not None:
-            points[r] = origin + expected[r].astype(np.float64)[..., None] * directions
-        else:
-            distance = _peak_range(gaussians, dominant[r], origin, directions)
-            if mesh is not None and kind == "mesh":
-                t = mesh.cast(origin, directions.reshape(-1, 3), device=device).t.reshape(seen.shape)
-                distance = np.where(np.isfinite(t), t, distance)
-                empty = empty & ~np.isfinite(t)
-            points[r] = origin + distance[..., None] * directions
-        points[r][empty] = np.nan
-    return points
-
-
-def path_lengths(points: np.ndarray, transmitter: np.ndarray, receivers: np.ndarray) -> Lengths:
-    """Lengths and directions of departure of single bounces at ``points`` (R, H, W, 3) [m], in float64."""
-    outward = points - transmitter
-    previous = np.linalg.norm(outward, axis=-1)
-    view = np.linalg.norm(points - receivers[:, None, None, :], axis=-1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return Lengths(point=points, total=previous + view, departure=outward / previous[..., None])
-
-
-def _peak_range(
-    gaussians: Gaussians, dominant: np.ndarray, origin: np.ndarray, directions: np.ndarray
-) -> np.ndarray:
-    """Range [m] at which the dominant Gaussian's response peaks on the ray: t* = -(o.g) / (g.g), in float64."""
-    scales = np.asarray(gaussians.scales[dominant], dtype=np.float64)
-    rotations = rotations_of(gaussians.quaternions[dominant].reshape(-1, 4)).reshape(*dominant.shape, 3, 3)
-    means = np.asarray(gaussians.means[dominant], dtype=np.float64)
-    g = np.einsum("...ji,...j->...i", rotations, np.broadcast_to(directions, means.shape)) / scales
-    o = np.einsum("...ji,...j->...i", rotations, origin - means) / scales
-    return -np.einsum("...i,...i->...", o, g) / np.einsum("...i,...i->...", g, g)
+    device, pixels = seen.device, seen.shape[0] * seen.shape[1]
+    how = _kernels.CENTRE if kind == "centre" else _kernels.ALONG
+    nowhere = wp.empty(0, dtype=wp.float64, device=device)
+    for origin, view in zip(seen.receivers, seen.views, strict=True):
+        ranges = view.expected_range if kind == "expected" else nowhere
+        if mesh is not None and kind == "mesh":
+            hit = mesh.cast(origin, pixel_directions(seen.shape).reshape(-1, 3), device=device)
+            ranges = wp.array(hit.t, dtype=wp.float64, device=device)
+        points = wp.empty(pixels, dtype=wp.vec3d, device=device)
+        lengths = wp.empty(pixels, dtype=wp.float64, device=device)
+        inputs = [
+            how, wp.vec3d(origin), wp.vec3d(transmitter), directions, *scene[:3], view.dominant, ranges, points, lengths
+        ]  # fmt: skip
+        _device.launch(_kernels.single_bounces, pixels, inputs, device=device)
+        yield Lengths(seen.shape, transmitter, points, lengths)
