@@ -22,6 +22,10 @@ MAKEFLAGS += --no-builtin-rules
 VENV ?= .venv
 BIN := $(abspath $(VENV))/bin
 RUN := $(BIN)/python
+# Python compiles what is imported when it is: a small part of what is installed.
+INSTALL := $(RUN) -m pip install -q --no-compile
+# Two workers have a core each: threads of BLAS would wait for one another.
+PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(RUN) -m pytest -n 2 --dist loadfile
 ARGS ?=
 
 # Compiled kernels are kept in the checkout, so that they survive from one command to the next.
@@ -42,19 +46,19 @@ $(VENV)/.made:
 # One stamp for what the main job needs, one for everything (torch is only in the second).
 $(VENV)/.lobby: $(VENV)/.made pyproject.toml constraints.txt
 	bash tools/system_packages.sh
-	$(RUN) -m pip install -q -c constraints.txt -e '.[photos,plots,view]'
+	$(INSTALL) -c constraints.txt -e '.[photos,plots,view]'
 	touch $@
 
 $(VENV)/.sionna: $(VENV)/.lobby
 	bash tools/system_packages.sh llvm
-	$(RUN) -m pip install -q -c constraints.txt -e '.[photos,plots,view,sionna,exr]'
+	$(INSTALL) -c constraints.txt -e '.[photos,plots,view,sionna,exr]'
 	touch $@
 
 $(VENV)/.test: $(VENV)/.made pyproject.toml constraints.txt
 	bash tools/system_packages.sh llvm browser
-	$(RUN) -m pip install -q -c constraints.txt -e '.[all,docs,test]'
+	$(INSTALL) -c constraints.txt -e '.[all,docs,test]'
 	# Its wheel asks for an older NumPy than it needs, so it is no extra: only its scenario reader is tested against.
-	$(RUN) -m pip install -q --no-deps 'DeepMIMO==4.0.5' && $(RUN) -m pip install -q requests
+	$(INSTALL) --no-deps 'DeepMIMO==4.0.5' && $(INSTALL) requests
 	touch $(VENV)/.lobby $(VENV)/.sionna $@
 
 setup: $(VENV)/.lobby
@@ -75,11 +79,12 @@ lint: $(VENV)/.test
 docs: $(VENV)/.test
 	$(BIN)/sphinx-build -q -W --keep-going -b html -d build/doctrees docs build/site
 
-test: lint docs
-	$(RUN) -m pytest -n 2 --dist loadfile $(ARGS)
+test: $(VENV)/.test
+	$(MAKE) --output-sync -j 2 lint docs
+	$(PYTEST) $(ARGS)
 
 quick: $(VENV)/.test
-	$(RUN) -m pytest -n 2 --dist loadfile @tests/quick.txt $(ARGS)
+	$(PYTEST) @tests/quick.txt $(ARGS)
 
 gpu: $(VENV)/.test
 	@$(RUN) -m benchmarks gpu $(ARGS)

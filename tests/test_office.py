@@ -14,7 +14,7 @@ import warprrf as wr
 from warprrf import cli
 from warprrf.rf.spectra.spectrum import pixel_directions
 
-SHAPE, METER, CHAIN_DB, HORN_DEG = (30, 60), (90, 180), 7.0, 20.0
+SHAPE, METER, CHAIN_DB, HORN_DEG = (30, 60), (45, 90), 7.0, 20.0
 NAMES = ("concrete", "ceiling_board", "plasterboard", "glass", "wood", "chipboard")
 SOURCE = [str(x) for x in TRANSMITTER]
 CSV = "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z"
@@ -44,10 +44,10 @@ def place(tmp_path_factory):
     table = {name: {"scattering": 0.4, **({"thickness": 0.01} if name == "glass" else {})} for name in NAMES}
     (folder / "table.json").write_text(json.dumps(table))
     scene = [str(office(folder)), "--materials", str(folder / "table.json")]
-    run("sample", *scene, "-o", folder / "places.csv", "-n", "40", "--height", "1", "1.6")
+    run("sample", *scene, "-o", folder / "places.csv", "-n", "16", "--height", "1", "1.6")
     measured = [",".join(map(str, where)) for where in BEFORE_GLASS]
     for name, places, shape, beam in (
-        ("measured", measured, METER, 1),
+        ("measured", measured, METER, 2),
         ("truth", [folder / "places.csv"], SHAPE, 5),
     ):
         run("simulate", *scene, "-o", folder / f"{name}.nc", "--transmitter", *SOURCE, "--receivers", *places,
@@ -64,7 +64,7 @@ def run(*words):
 
 def test_the_office_s_places_are_in_its_air_before_and_behind_the_glass(place):
     places = np.loadtxt(place / "places.csv", delimiter=",", skiprows=1)
-    assert len(places) == 40
+    assert len(places) == 16
     assert not ((places[:, 0] > 5) & (places[:, 1] > 3.5)).any()  # the corner that is cut out
     assert (places[:, 0] > 6.5).any() and wr.Scene.load(place / "office.obj").is_free(BEHIND_GLASS).all()
 
@@ -75,7 +75,7 @@ def test_a_horn_and_a_power_meter_make_a_field_that_is_right_where_nobody_measur
     words = "evaluate {0}/field.safetensors {0}/truth.nc -o {0}/figures.json --no-lookups"
     run(*words.format(place).split())
     figures = json.loads((place / "figures.json").read_text())["bistatic"]
-    assert figures["receivers"] == 5 and figures["psnr_db"] > 24.0 and figures["direction_within_3deg"] > 0.8
+    assert figures["receivers"] == 2 and figures["psnr_db"] > 24.0 and figures["direction_within_3deg"] > 0.8
     truth = wr.SpectrumDataset.load(place / "truth.nc")
     seen = truth.subset(truth.line_of_sight)
     total = field.spectra(seen.receivers).path_gain.sum(axis=(1, 2)) / seen.path_gain.sum(axis=(1, 2))

@@ -18,7 +18,7 @@ from fuzz.trial import FILE, LAW, Case, Outcome, Trial
 from fuzz.workers import Workers
 
 CASES = 600
-"""About a minute of two processes, the same ones wherever they run."""
+"""About a minute of one process, the same ones wherever they run."""
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def attempt(place, tmp_path, monkeypatch):
 def found(place, cases, **how):
     """Findings of cases, and how many ended how."""
     findings, tried = [], Counter()
-    with Workers(partial(Trial, str(place.folder)), **how) as workers:
+    with Workers(partial(Trial, str(place.folder)), 1, **how) as workers:
         for case, outcome in workers.run(cases):
             tried[outcome.kind] += 1
             if outcome.kind == "finding":

@@ -399,13 +399,16 @@ def random_camera(rng: np.random.Generator, means: np.ndarray, *, spherical: boo
 
 
 SCENES = {Pictures: 32, Rays: 32, PathRecords: 60, SpecularPaths: 60}
+ON_A_GPU = 8  # of each: launches there are other ones, derivatives are not
 EVERY = pytest.mark.parametrize("kind", SCENES)
+CASES = [
+    *((kind, k, "cpu") for kind, count in SCENES.items() for k in range(count)),
+    *(pytest.param(kind, k, "cuda:0", marks=pytest.mark.cuda) for kind in SCENES for k in range(ON_A_GPU)),
+]
 
 
 @pytest.mark.usefixtures("device")
-@pytest.mark.parametrize(
-    ("kind", "seed"), [(kind, k) for kind, count in SCENES.items() for k in range(count)]
-)
+@pytest.mark.parametrize(("kind", "seed", "device"), CASES, indirect=["device"])
 def test_gradients_match_finite_differences_to_1e_6(kind, seed):
     path = kind(seed)
     assert path.share > 0.4  # most pixels or rays are away from decisions

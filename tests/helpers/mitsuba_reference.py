@@ -70,8 +70,8 @@ class Estimate:
         return float(self.runs.sum(axis=(1, 2)).std(ddof=1) / np.sqrt(len(self.runs)))
 
 
-def mitsuba_sequences(link: Link, samples: int, runs: int = 8) -> dict[str, Estimate]:
-    """S, SM, MS, SS and SSS, from ``runs`` times ``samples`` paths per pixel."""
+def mitsuba_sequences(link: Link, samples: int, scatterings: int, runs: int = 8) -> dict[str, Estimate]:
+    """S, SM, MS and, of as many ``scatterings``, SS and SSS, from ``runs`` times ``samples`` paths per pixel."""
     dark = replace(link, does=np.where(link.does == MIRROR, BLACK, link.does))
     with mitsuba("llvm_ad_mono") as mi:
         _register(mi)
@@ -84,9 +84,10 @@ def mitsuba_sequences(link: Link, samples: int, runs: int = 8) -> dict[str, Esti
             both, one = (traced(link, n, times, once=True, **how) for n in (2, 1))
             return both - one
 
-        one, two, three = (traced(dark, n) for n in (1, 2, 3))
+        upto = [traced(dark, n) for n in range(1, scatterings + 1)]
         lit = second(1, integrator="ptracer", light=_toward_mirrors(mi, link))
-        return {"S": one, "SM": second(4), "MS": lit, "SS": two - one, "SSS": three - two}
+        further = {"S" * n: upto[n - 1] - upto[n - 2] for n in range(2, scatterings + 1)}
+        return {"S": upto[0], "SM": second(4), "MS": lit, **further}
 
 
 def _toward_mirrors(mi, link: Link) -> dict[str, Any]:

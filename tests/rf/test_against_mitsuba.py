@@ -81,10 +81,19 @@ def lobby(receiver: int = 0) -> Link:
 
 
 @cache
-def compared(room: str) -> tuple[dict[str, np.ndarray], dict[str, Estimate]]:
-    """Path gain of each sequence, ours and Mitsuba's."""
-    link = {"floor": floor_and_mirror, "lobby": lobby}[room]()
-    return sequences(link), mitsuba_sequences(link, samples=64)
+def ours_in(room: str) -> dict[str, np.ndarray]:
+    return sequences(ROOMS[room][0]())
+
+
+@cache
+def mitsubas(room: str) -> dict[str, Estimate]:
+    make, scatterings = ROOMS[room]
+    return mitsuba_sequences(make(), 64, scatterings)
+
+
+def compared(room: str, sequence: str) -> tuple[np.ndarray, Estimate]:
+    """Path gain of a sequence, ours and Mitsuba's."""
+    return ours_in(room)[sequence], mitsubas(room)[sequence]
 
 
 def beamed(power: np.ndarray) -> np.ndarray:
@@ -92,6 +101,7 @@ def beamed(power: np.ndarray) -> np.ndarray:
     return np.moveaxis(beam_operator(power.shape, BEAM_RAD)(np.maximum(power, 0.0)[:, :, None].copy()), -1, 0)
 
 
+ROOMS = {"floor": (floor_and_mirror, 1), "lobby": (lobby, 3)}  # and scatterings that are compared
 LOOK, LIT = "4 rays a pixel look into mirrors", "mirrors light whole faces"
 ELEMENTS = "elements are lit evenly"
 
@@ -111,7 +121,7 @@ def cases(**wrong: str) -> list[object]:
     ["LOS M S MS SM", "MSM"],
 )  # fmt: skip
 def test_sequences_over_a_floor_and_a_mirror_follow_closed_forms(known):
-    ours, exact = sequences(floor_and_mirror()), closed_forms(floor_and_mirror())
+    ours, exact = ours_in("floor"), closed_forms(floor_and_mirror())
     for sequence in known.split():
         assert abs(10.0 * np.log10(ours[sequence].sum() / exact[sequence])) < 0.05, sequence
 
@@ -121,7 +131,7 @@ def test_the_exact_engine_follows_closed_forms_and_mitsuba():
     for sequence in "S MS SM MSM".split():
         assert abs(10.0 * np.log10(ours[sequence] / exact[sequence])) < 0.05, sequence
     sionna_or_skip()
-    ours, found = exact_totals(lobby()), compared("lobby")[1]
+    ours, found = exact_totals(lobby()), mitsubas("lobby")
     for sequence in "S MS SM SS SSS".split():
         assert ours[sequence] == pytest.approx(
             found[sequence].total, rel=0.01, abs=2.0 * found[sequence].error
@@ -132,7 +142,7 @@ def test_mitsuba_follows_closed_forms():
     sionna_or_skip()
     exact = closed_forms(floor_and_mirror())
     for sequence in ("S", "SM", "MS"):
-        found = compared("floor")[1][sequence]
+        found = mitsubas("floor")[sequence]
         assert found.error < 2e-3 * found.total
         assert found.total == pytest.approx(exact[sequence], rel=1e-4, abs=4.0 * found.error)
 
@@ -140,7 +150,7 @@ def test_mitsuba_follows_closed_forms():
 @pytest.mark.parametrize(("room", "sequence"), cases(lobby_SM=LOOK, lobby_MS=LIT, lobby_SSS=ELEMENTS))
 def test_totals_are_those_of_mitsuba(room, sequence):
     sionna_or_skip()
-    ours, found = (both[sequence] for both in compared(room))
+    ours, found = compared(room, sequence)
     assert found.error < 5e-3 * found.total
     assert ours.sum() == pytest.approx(found.total, rel=0.01, abs=0.0)
 
@@ -151,6 +161,6 @@ def test_totals_are_those_of_mitsuba(room, sequence):
 )  # fmt: skip
 def test_images_are_those_of_mitsuba(room, sequence):
     sionna_or_skip()
-    ours, found = (both[sequence] for both in compared(room))
+    ours, found = compared(room, sequence)
     noise_db = rms_change_db(*(beamed(found.runs[k::2].mean(axis=0)) for k in (0, 1))) / 2.0  # of their mean
     assert rms_change_db(beamed(ours), beamed(found.image)) < np.hypot(0.1, noise_db)
