@@ -53,7 +53,7 @@ from warprrf.geometry.photos.undistort import (
 from warprrf.steps import Attempt, Steps
 from warprrf.tensor_files import named as naming
 
-VERSIONS = {"features": 2, "matches": 2, "model": 3, "photos": 1}
+VERSIONS = {"features": 2, "matches": 2, "model": 4, "photos": 1}
 """Of the steps: counted up by whoever changes what a step computes."""
 
 LEAST_PIXELS = 10_000  # of max_pixels
@@ -67,12 +67,12 @@ PEAK_THRESHOLD = 0.004  # COLMAP's 0.0067 finds too little on bare walls
 IN_ORDER = (1, 2, 4, 8)  # photos so many places apart by name, as a film has them, are always matched
 FEWEST_FEATURES = 8  # of a photo that can be matched
 FEWEST_MATCHES = 15  # of a pair that COLMAP counts as matched
-LENIENT = {
+MAPPER = {
     "init_min_num_inliers": 40, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15,
     "abs_pose_min_inlier_ratio": 0.15,
 }  # fmt: skip
-"""Of COLMAP's mapper, where its own limits leave photos without a pose: of a film of monitors and desks they pose 7 of 25, these
-22; on three films whose poses are known, cameras are no worse."""
+"""Limits of COLMAP's mapper. Its own (100, 16 degrees, 30, 0.25) leave photos out where features are few: the largest model of
+125 frames of a walk through a lounge has 44 photos by them, 118 by these; of 25 of monitors and desks 7 and 22."""
 SHARED_ROUNDS = 5  # of fitting one model to another, each without what the last one fits badly
 SHARED_ERROR = 0.01  # median of points that two models share, over their extent, up to which the two are one
 EXTRACT_BATCH = 12
@@ -92,8 +92,8 @@ def structure_from_motion(
 
     The cameras are those of the undistorted, upright, reduced photos, which lie in ``sfm/photos`` of the workspace under
     their own names. Photos of one size whose EXIF names the same camera share a lens; without EXIF those of one size in
-    one folder do. EXIF's focal length is where the estimate starts. Features are found in photos of 1600 pixels at most,
-    and not where a mask (``NAME.mask.png``) is black.
+    one folder do. The estimate starts from EXIF's focal length, or from one that the matches agree on. Features are found in
+    photos of 1600 pixels at most, and not where a mask (``NAME.mask.png``) is black.
 
     Finished steps are kept in ``workspace`` and reused as long as photos, options and pycolmap stay the same, so that
     a stopped run goes on where it was.
@@ -464,27 +464,21 @@ def _map(
     options.random_seed = seed
     options.num_threads = 1  # sums in a fixed order: the same poses every time
     options.min_model_size = MIN_PHOTOS
-    best: list[Any] = []
-    for limits in ({}, LENIENT):
-        for name, limit in limits.items():
-            setattr(options.mapper, name, limit)
-        posed = itertools.count(2)
-        report("mapping", 0, len(named))
-        found = colmap.incremental_mapping(
-            working,
-            images,
-            _fresh(attempt.folder / "mapping"),
-            options,
-            next_image_callback=lambda posed=posed: report(
-                "mapping", min(next(posed), len(named)), len(named)
-            ),
-        )
-        models = [m for m in found.values() if m.num_reg_images() >= MIN_PHOTOS]
-        models.sort(key=lambda m: (m.num_reg_images(), m.num_points3D()), reverse=True)
-        if models and (not best or models[0].num_reg_images() > best[0].num_reg_images()):
-            best = models
-        if best and best[0].num_reg_images() == len(named):
-            break
+    for name, limit in MAPPER.items():
+        setattr(options.mapper, name, limit)
+    if lens != "OPENCV_FISHEYE":  # of which no fundamental matrix speaks
+        _calibrate(colmap, working, seed)
+    posed = itertools.count(2)
+    report("mapping", 0, len(named))
+    found = colmap.incremental_mapping(
+        working,
+        images,
+        _fresh(attempt.folder / "mapping"),
+        options,
+        next_image_callback=lambda: report("mapping", min(next(posed), len(named)), len(named)),
+    )
+    best = [m for m in found.values() if m.num_reg_images() >= MIN_PHOTOS]
+    best.sort(key=lambda m: (m.num_reg_images(), m.num_points3D()), reverse=True)
     if not best:
         with colmap.Database.open(str(working)) as database:
             inliers = np.array(database.read_two_view_geometry_num_inliers()[1])
@@ -516,6 +510,16 @@ def _map(
         os.replace(whole, folder / ("model" if len(pieces) == 1 else f"model-{len(pieces)}"))
     report("mapping", len(named), len(named))
     return pieces
+
+
+def _calibrate(colmap: ModuleType, matches: Path, seed: int) -> None:
+    """Start each lens whose EXIF says nothing from the focal length that most fundamental matrices of its photos agree on.
+
+    COLMAP would start from 1.2 times the longer side, where 0.6 to 0.9 are usual of phones and depth cameras. Source: C.
+    Sweeney et al., "Optimizing the viewing graph for structure-from-motion", ICCV 2015.
+    """
+    options = colmap.ViewGraphCalibrationOptions(random_seed=seed, reestimate_relative_pose=False)
+    colmap.calibrate_view_graph(matches, options)
 
 
 def _names(model: Any) -> set[str]:
