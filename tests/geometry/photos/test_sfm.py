@@ -113,7 +113,7 @@ def test_the_focal_length_is_known_before_any_photo_has_a_pose(posed, tmp_path):
         return camera.mean_focal_length()
 
     assert focal() == pytest.approx(1.2 * 640)
-    sfm._calibrate(pycolmap, matches, 0)
+    sfm._calibrate(pycolmap, matches, tmp_path / "scratch.db", 0)
     assert focal() == pytest.approx(395, rel=0.05)  # one in a hundred of the whole walk
 
 

@@ -67,12 +67,13 @@ PEAK_THRESHOLD = 0.004  # COLMAP's 0.0067 finds too little on bare walls
 IN_ORDER = (1, 2, 4, 8)  # photos so many places apart by name, as a film has them, are always matched
 FEWEST_FEATURES = 8  # of a photo that can be matched
 FEWEST_MATCHES = 15  # of a pair that COLMAP counts as matched
-MAPPER = {
+LENIENT = {
     "init_min_num_inliers": 40, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15,
     "abs_pose_min_inlier_ratio": 0.15,
 }  # fmt: skip
-"""Limits of COLMAP's mapper. Its own (100, 16 degrees, 30, 0.25) leave photos out where features are few: the largest model of
-125 frames of a walk through a lounge has 44 photos by them, 118 by these; of 25 of monitors and desks 7 and 22."""
+"""Of COLMAP's mapper, where its own limits leave photos without a pose: of a film of monitors and desks they pose 7 of 25, these
+22; the largest model of 125 frames of a walk through a lounge has 44 photos by them, 118 by these. Taken alone, these put a
+photo of ten into a wrong place where COLMAP's own leave it out."""
 SHARED_ROUNDS = 5  # of fitting one model to another, each without what the last one fits badly
 SHARED_ERROR = 0.01  # median of points that two models share, over their extent, up to which the two are one
 EXTRACT_BATCH = 12
@@ -464,21 +465,29 @@ def _map(
     options.random_seed = seed
     options.num_threads = 1  # sums in a fixed order: the same poses every time
     options.min_model_size = MIN_PHOTOS
-    for name, limit in MAPPER.items():
-        setattr(options.mapper, name, limit)
     if lens != "OPENCV_FISHEYE":  # of which no fundamental matrix speaks
-        _calibrate(colmap, working, seed)
-    posed = itertools.count(2)
-    report("mapping", 0, len(named))
-    found = colmap.incremental_mapping(
-        working,
-        images,
-        _fresh(attempt.folder / "mapping"),
-        options,
-        next_image_callback=lambda: report("mapping", min(next(posed), len(named)), len(named)),
-    )
-    best = [m for m in found.values() if m.num_reg_images() >= MIN_PHOTOS]
-    best.sort(key=lambda m: (m.num_reg_images(), m.num_points3D()), reverse=True)
+        _calibrate(colmap, working, attempt.folder / "calibrated.db", seed)
+    best: list[Any] = []
+    for limits in ({}, LENIENT):
+        for name, limit in limits.items():
+            setattr(options.mapper, name, limit)
+        posed = itertools.count(2)
+        report("mapping", 0, len(named))
+        found = colmap.incremental_mapping(
+            working,
+            images,
+            _fresh(attempt.folder / "mapping"),
+            options,
+            next_image_callback=lambda posed=posed: report(
+                "mapping", min(next(posed), len(named)), len(named)
+            ),
+        )
+        models = [m for m in found.values() if m.num_reg_images() >= MIN_PHOTOS]
+        models.sort(key=lambda m: (m.num_reg_images(), m.num_points3D()), reverse=True)
+        if models and (not best or models[0].num_reg_images() > best[0].num_reg_images()):
+            best = models
+        if best and best[0].num_reg_images() == len(named):
+            break
     if not best:
         with colmap.Database.open(str(working)) as database:
             inliers = np.array(database.read_two_view_geometry_num_inliers()[1])
@@ -512,14 +521,18 @@ def _map(
     return pieces
 
 
-def _calibrate(colmap: ModuleType, matches: Path, seed: int) -> None:
+def _calibrate(colmap: ModuleType, matches: Path, scratch: Path, seed: int) -> None:
     """Start each lens whose EXIF says nothing from the focal length that most fundamental matrices of its photos agree on.
 
     COLMAP would start from 1.2 times the longer side, where 0.6 to 0.9 are usual of phones and depth cameras. Source: C.
-    Sweeney et al., "Optimizing the viewing graph for structure-from-motion", ICCV 2015.
+    Sweeney et al., "Optimizing the viewing graph for structure-from-motion", ICCV 2015. The file ``scratch`` is written over:
+    COLMAP also sorts out pairs there, which the mapper can use.
     """
     options = colmap.ViewGraphCalibrationOptions(random_seed=seed, reestimate_relative_pose=False)
-    colmap.calibrate_view_graph(matches, options)
+    colmap.calibrate_view_graph(_copied(matches, scratch), options)
+    with colmap.Database.open(str(scratch)) as found, colmap.Database.open(str(matches)) as database:
+        for camera in found.read_all_cameras():
+            database.update_camera(camera)
 
 
 def _names(model: Any) -> set[str]:
