@@ -99,8 +99,22 @@ def test_what_was_posed_is_said_in_words():
     assert posed_in_words(lost) == "photos: 4 of 8 posed; without a pose: e.jpg, f.jpg, g.jpg, h.jpg"
     apart = replace(lost, pieces=(tuple(cameras), ("f.jpg", "g.jpg", "h.jpg")))
     assert posed_in_words(apart) == (
-        "photos: 4 of 8 posed in the largest of 2 pieces that share no view: add photos between d.jpg and f.jpg"
+        "photos: 4 of 8 posed in the largest of 2 pieces that too few features join: "
+        "add photos between d.jpg and f.jpg; without a pose: e.jpg"
     )
+
+
+def test_the_focal_length_is_known_before_any_photo_has_a_pose(posed, tmp_path):
+    matches = shutil.copy(posed[0] / "sfm" / "matches.db", tmp_path)
+
+    def focal():
+        with pycolmap.Database.open(str(matches)) as database:
+            (camera,) = database.read_all_cameras()
+        return camera.mean_focal_length()
+
+    assert focal() == pytest.approx(1.2 * 640)
+    sfm._calibrate(pycolmap, matches, tmp_path / "scratch.db", 0)
+    assert focal() == pytest.approx(395, rel=0.05)  # one in a hundred of the whole walk
 
 
 def test_models_that_share_a_photo_become_one_and_others_stay_apart(posed, tmp_path):

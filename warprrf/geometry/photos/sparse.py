@@ -36,7 +36,7 @@ class SparseModel:
         track_camera: photos (position in ``list(cameras)``) that see the points, shape ``(sum of track lengths,)``.
         unposed: names of the photos that no pose was found for, or that lie in a smaller, separate model.
         causes: why each of these has no pose, by name, where that is known.
-        pieces: names of the photos of each model that shares no view with the others; ``cameras`` are those of the first.
+        pieces: names of the photos of each model that too few features join to the others; ``cameras`` are those of the first.
         metric: whether lengths are metres.
         upright: whether z is up.
         scale_rms_m: rms distance between surveyed and reconstructed camera positions after alignment [m], else NaN.
@@ -84,21 +84,22 @@ class SparseModel:
 
 
 def posed_in_words(sparse: SparseModel) -> str:
-    """How many photos were posed, and between which more are missing; empty where all were."""
+    """How many photos were posed, between which more are missing, and which are in no piece; empty where all were posed."""
     if not sparse.unposed:
         return ""
     order = sorted((*sparse.cameras, *sparse.unposed))
     said = f"photos: {len(sparse.cameras)} of {len(order)} posed"
-    if len(sparse.pieces) < 2:
-        return f"{said}; without a pose: {some(sparse.unposed)}"
     main, gaps = [order.index(name) for name in sparse.cameras], []
     for piece in sparse.pieces[1:]:
         near = min((abs(k - m), m, k) for k in map(order.index, piece) for m in main)
         gaps.append(" and ".join(order[k] for k in sorted(near[1:])))
-    return (
-        f"{said} in the largest of {len(sparse.pieces)} pieces that share no view: "
-        f"add photos between {'; between '.join(gaps)}"
-    )
+    if gaps:
+        said += (
+            f" in the largest of {len(sparse.pieces)} pieces that too few features join: "
+            f"add photos between {'; between '.join(gaps)}"
+        )
+    alone = [name for name in sparse.unposed if not any(name in piece for piece in sparse.pieces[1:])]
+    return f"{said}; without a pose: {some(alone)}" if alone else said
 
 
 def align_to_known(sparse: SparseModel, known_positions: Mapping[str, ArrayLike]) -> SparseModel:
