@@ -46,8 +46,8 @@ PER_DEG = 1.0 / np.sqrt(
     8.0 * np.log(2.0)
 )  # standard deviation of a Gaussian over its full width at half maximum
 TURNS = 72  # zeros of azimuth that the nearest measurement is sought under
-BANDWIDTH_HZ, TAPS, LATE_S = 2e9, 160, 137e-9
-"""Of profiles: taps half as far apart as they are long, by a clock that is late."""
+BANDWIDTH_HZ, TAPS, LATE_S = 2e9, 320, 137e-9
+"""Of profiles: taps half as far apart as they are long, 24 m in all, by a clock that is late."""
 PROFILE_SAMPLES = 200_000  # of Sionna RT's rays
 FIRST_DB = 15.0  # below the strongest tap of a transmitter is its first arrival at the least
 MORE = (7.5, 1.5, 2.6), (7.5, 10.5, 2.6)
