@@ -35,7 +35,7 @@ PACKAGES = (
 )
 
 VERSIONS = {
-    "geometry": 2,
+    "geometry": 3,
     "renderer": 1,
     "metrics": 1,
     "exact": 2,
