@@ -81,7 +81,7 @@ docs: $(VENV)/.test
 
 test: $(VENV)/.test
 	$(MAKE) --output-sync -j 2 lint docs
-	$(PYTEST) $(ARGS)
+	$(PYTEST) --durations=30 $(ARGS)
 
 quick: $(VENV)/.test
 	$(PYTEST) @tests/quick.txt $(ARGS)
