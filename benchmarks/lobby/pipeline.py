@@ -45,7 +45,7 @@ SECTION_HEIGHT_M = 1.2
 HELP = """\
 Continues where a killed run stopped; each step is redone only if its inputs or its version changed. Writes report.html,
 report.json (every figure), geometry.ply (Gaussians, opens in any splat viewer), mesh.ply, field.safetensors and
-cameras.json. Six to thirteen minutes on two cores, no GPU.
+cameras.json. Six to eighteen minutes on two cores, no GPU.
 
 examples:
   python -m benchmarks lobby

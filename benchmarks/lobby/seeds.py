@@ -31,7 +31,7 @@ COLUMNS = (("figure", "figure", "{}"), ("mean", "mean", "{:.4g}"), ("spread", "s
            ("least", "least", "{:.4g}"), ("most", "most", "{:.4g}"))  # fmt: skip
 
 HELP = """\
-Runs the main job once a seed (six to thirteen minutes each) and writes mean, standard deviation, least and most of its
+Runs the main job once a seed (six to eighteen minutes each) and writes mean, standard deviation, least and most of its
 figures, with both truths at ten and fifty spectra.
 
 examples:
