@@ -396,10 +396,11 @@ def _lobe_table(most: int, reciprocal: bool) -> tuple[np.ndarray, np.ndarray]:
     incidence, di = np.polynomial.legendre.leggauss(10)
     scatter, ds = np.polynomial.legendre.leggauss(28)
     turn = (np.arange(28) + 0.5) * np.pi / 28  # of azimuth; the other half is the same
-    ci, cs, az = np.meshgrid(0.5 * (1.0 + incidence), 0.5 * (1.0 + scatter), turn, indexing="ij")
+    ci, cs, az = np.meshgrid(0.5 * (1.0 + incidence), 0.5 * (1.0 + scatter), turn, indexing="ij", sparse=True)
     psi = ci * cs + np.sqrt((1.0 - ci**2) * (1.0 - cs**2)) * np.cos(az)
-    weight = di[:, None, None] * ds[None, :, None] * cs
-    lobes = np.stack([lobe(n, ci, cs, psi, reciprocal=reciprocal).ravel() for n in range(most + 1)])
+    weight = np.broadcast_to(di[:, None, None] * ds[:, None] * cs, psi.shape)
+    every = [lobe(n, ci, cs, psi, reciprocal=reciprocal) for n in range(most + 1)]
+    lobes = np.stack([np.broadcast_to(one, psi.shape).ravel() for one in every])
     return lobes, weight.ravel() / weight.sum()
 
 
