@@ -2,6 +2,7 @@
 #
 #   make lobby      install what is missing, then photos -> geometry -> radio -> evaluation into runs/lobby/ (resumable)
 #   make test       lint, types, import rules, documentation, tests: what CI runs
+#   make long       the tests of a minute and more that the others leave out
 #   make quick      every public verb and the main laws once: two minutes on two cores with compiled kernels cached, on a
 #                   fresh clone a few more while they compile (tests/quick.txt)
 #   make lint       the first three alone
@@ -34,7 +35,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PYTHONHASHSEED ?= 0
 export PYTHON
 
-.PHONY: help lobby test quick lint docs gpu data notebooks clean setup setup-test
+.PHONY: help lobby test long quick lint docs gpu data notebooks clean setup setup-test
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -82,6 +83,9 @@ docs: $(VENV)/.test
 test: $(VENV)/.test
 	$(MAKE) --output-sync -j 2 lint docs
 	$(PYTEST) --durations=30 $(ARGS)
+
+long: $(VENV)/.test
+	$(PYTEST) -m long $(ARGS)
 
 quick: $(VENV)/.test
 	$(PYTEST) @tests/quick.txt $(ARGS)

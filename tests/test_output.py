@@ -194,16 +194,17 @@ def interrupted(words, when, folder, file="*"):
 
 def test_simulate_goes_on_where_ctrl_c_ended_it(room, monkeypatch, capsys):
     monkeypatch.chdir(room)
-    # A hundred receivers last for seconds: when Python loses the signal in a __del__, a second later the command ends all
+    # Forty receivers last for seconds: when Python loses the signal in a __del__, a second later the command ends all
     # the same.
-    words = "simulate room.xml --transmitter 0.7 0.7 0.9 --receivers receivers.csv --shape 45 90".split()
+    np.savetxt("forty.csv", np.loadtxt("receivers.csv", delimiter=",")[:40], delimiter=",")
+    words = "simulate room.xml --transmitter 0.7 0.7 0.9 --receivers forty.csv --shape 45 90".split()
     command = ["warprrf", *words, "-o", "i.nc"]
     message, took = interrupted(command, '"simulate"', room, "i.nc.receivers/[!.]*.npz")
     kept_in = "finished work is kept in i.nc.receivers, the same command goes on from there"
     assert message == f"interrupted; {kept_in}"
     assert took < 3.0 and not Path("i.nc").exists()
     kept = len(list(Path("i.nc.receivers").glob("[!.]*.npz")))
-    assert 0 < kept < 100
+    assert 0 < kept < 40
     for name in ("i.nc", "whole.nc"):
         assert cli.main([*words, "-o", name, "--device", "cpu", "--json"]) == 0
         first = events(capsys.readouterr().out)[0]

@@ -296,6 +296,7 @@ def test_a_table_given_to_the_page_puts_the_receiver_where_it_was_read(viewer, p
     _click(page, "Channel")
 
 
+@pytest.mark.long
 @browsed
 def test_a_thousand_updates_leave_memory_as_it_is(viewer, page):
     rng = np.random.default_rng(0)

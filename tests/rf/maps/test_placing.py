@@ -1,5 +1,6 @@
 """Where transmitters go: beside all sets tried, objectives by their definition, bad input."""
 
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -10,6 +11,7 @@ import warprrf as wr
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.observations import Frame
 from warprrf.rf.maps.placing import best_set
+from warprrf.rf.maps.radio_map import MapOptions, radio_map
 from warprrf.rf.tracing.model import Effects
 
 CANDIDATES = np.array(
@@ -32,9 +34,20 @@ def field(scene):
 
 @pytest.fixture(scope="module")
 def snr_db(field):
-    """Of each candidate at the cells in the air, by the field's own maps."""
-    maps = [field.radio_map(*MAP.values(), one).best_beam_snr_db for one in CANDIDATES]
-    return np.stack(maps)[:, np.isfinite(maps[0])]
+    """Of each candidate at the cells in the air, by the field's own maps, which are made once."""
+
+    @cache
+    def kept(height, cell, source, options):
+        return radio_map(field, height, cell, np.array(source), options)
+
+    def made(of, height, cell, source, options):
+        assert of is field
+        return kept(height, cell, tuple(source), options)
+
+    maps = [made(field, *MAP.values(), one, MapOptions()).best_beam_snr_db for one in CANDIDATES]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("warprrf.rf.maps.placing.radio_map", made)
+        yield np.stack(maps)[:, np.isfinite(maps[0])]
 
 
 @pytest.mark.parametrize("objective", BY_DEFINITION)
