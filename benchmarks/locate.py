@@ -30,7 +30,7 @@ A field of the lobby is fitted to 50 of Sionna RT's spectra, on the reconstructi
 is none. Test receivers, which no fit has seen, are located: from their spectrum; from a horn's pointings at three elevations, of
 unknown gain and zero of azimuth, with noise; from profiles of delay of three transmitters, under a clock of unknown zero, of
 Sionna RT's paths with noise; from the powers of six transmitters, which the exact engine gives. Beside it stands
-the place whose measurement is most alike: of Sionna's training receivers, or, for powers and profiles, of 400 that the exact
+the place whose measurement is most alike: of Sionna's training receivers, or, for powers and profiles, of --prints that the exact
 engine gives; for these also multilateration, as if all were in sight: by powers, or by first arrivals at the receiver's true
 height, which three of them need. Then transmitters are chosen among 200 places under the
 ceiling, by maps of single bounces in cells of a metre. Each receiver is kept as soon as it is found.
@@ -368,7 +368,8 @@ def rows(options: Options, fits: Fits) -> Iterator[Row]:
                 }  # fmt: skip
 
             found.append(fits.row(f"{part} {options.every * k}", make, known or name, options.prints))
-        yield {"measured": f"{part}, {name}", **summary(found)}
+        prints = {"prints": len(question.print_places)} if part in STORES else {}
+        yield {"measured": f"{part}, {name}", **prints, **summary(found)}
 
 
 def summary(found: list[Row]) -> Row:

@@ -106,15 +106,15 @@ def _locate() -> str:
         "blocked: 90th percentile [cm]",
     )  # fmt: skip
     further = (
-        "beyond 30 cm", "within the 95 % ellipsoid", "core seconds each", "nearest measurement: median [cm]",
-        "multilateration: median [cm]",
+        "beyond 30 cm", "of these not called known", "within the 95 % ellipsoid", "core seconds each",
+        "nearest measurement: median [cm]", "of places", "multilateration: median [cm]",
     )  # fmt: skip
     keys = ("median_cm", "p90_cm", "blocked_median_cm", "blocked_p90_cm")
     lines = [
         [
             r["measured"], str(r["test"]), *(show(r[key], "{:.1f}") for key in keys), f"{r['wrong']:.0%}",
-            f"{r['covered']:.0%}", show(r["cpu_s"]), show(r["nearest_cm"], "{:.0f}"),
-            show(r.get("lateration_cm"), "{:.0f}"),
+            show(r["wrong_told"], "{:.0%}"), f"{r['covered']:.0%}", show(r["cpu_s"]), show(r["nearest_cm"], "{:.0f}"),
+            str(r.get("prints", 60)), show(r.get("lateration_cm"), "{:.0f}"),
         ]
         for r in read("locate")["rows"]
     ]  # fmt: skip

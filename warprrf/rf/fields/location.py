@@ -20,7 +20,8 @@ class Location:
         candidates: places where readings are explained better than round about, the likeliest first [m], shape ``(K, 3)``.
         likelihoods: of each, among them, shape ``(K,)``; their sum is 1.
         known: whether readings and field tell the place: it is likelier than all other candidates together by far, its error
-            is small beside the distance of the places searched, and what was read is explained.
+            is small beside the distance of the places searched, and what was read is explained. Never where delays are read
+            more finely than half a metre, which those places lie apart: a valley of errors between them may be missed.
         misfit: root mean square error of what was read, over what the field and the readings state: about 1.
         gains_db: of measuring chains of unknown gain, by name [dB].
         azimuth_zeros: what was added to azimuths of an unknown zero, by table's name [rad].

@@ -157,6 +157,12 @@ class Question:
         """Whether what is searched quickly is what is searched to the end."""
         return all(a is b for a, b in zip(self.coarse, self.data, strict=True))
 
+    @property
+    def narrow(self) -> bool:
+        """Whether delays are read more finely than places of the lattice lie apart: the right valley of errors may hold none."""
+        widths = [getattr(one, "bandwidth_hz", None) for one in self.data]
+        return any(width and SPEED_OF_LIGHT / width < SPACING_M for width in widths)
+
     def _weight(self, one: Measured) -> np.ndarray | None:
         """By what errors of a spectrum's pixels are multiplied before they count as those of readings do: where rows crowd
         at the poles, many pixels have one error, so that squares count by solid angle."""
@@ -344,7 +350,8 @@ def search(question: Question, maps: dict[bytes, FieldMap]) -> Location:
     gains = (NEPER * best.unknown[3 + len(question.turned) :]).tolist()
     return Location(
         position=best.unknown[:3], covariance=covariance, candidates=np.stack([one.unknown[:3] for one in order]),
-        likelihoods=likelihood, known=bool(likelihood[0] > SURE and close and misfit < EXPLAINED), misfit=misfit,
+        likelihoods=likelihood, misfit=misfit,
+        known=bool(likelihood[0] > SURE and close and misfit < EXPLAINED and not question.narrow),
         gains_db=dict(zip(question.chains, gains, strict=True)),
         azimuth_zeros={one.name: by for one, by in zeros if not one.azimuth_known},
         clock_offsets_s={one.name: by / SPEED_OF_LIGHT for one, by in zeros if one.azimuth_known},
