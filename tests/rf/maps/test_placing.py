@@ -17,7 +17,7 @@ from warprrf.rf.tracing.model import Effects
 CANDIDATES = np.array(
     [[0.8, 0.9, 2.8], [4.2, 3.2, 2.8], [0.9, 3.3, 2.8], [4.3, 0.8, 2.8], [2.6, 1.0, 2.8], [2.6, 3.2, 2.8]]
 )
-MAP = {"height": 1.2, "cell": 0.5}
+MAP = {"height": 1.2, "cell": 1.0}
 LEVEL_DB = 28.0
 BY_DEFINITION = {
     "share": lambda snr: np.count_nonzero(snr >= LEVEL_DB) / len(snr),
