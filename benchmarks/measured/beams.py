@@ -185,7 +185,7 @@ def sight(walk: Walk, chosen: np.ndarray) -> Row:
     """
     names, found = ("length_m", "departure_deg", "arrival_deg", "gain_db"), []
     free = db(free_space_gain(walk.transmitter, walk.receivers, walk.frequency_hz))
-    for k in np.flatnonzero(chosen):
+    for k in np.flatnonzero(chosen).tolist():
         power = np.where(walk.nlos[k], 0.0, walk.rays[k].power)
         if power.any():
             off = walk.off(k)[:, power.argmax()]
