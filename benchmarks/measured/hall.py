@@ -44,6 +44,7 @@ MATERIALS = {
     "wall": ("plasterboard", 0.0125), "column": ("concrete", 0.4), "case": ("metal", 0.001), "slab": ("concrete", 0.2),
 }  # fmt: skip
 """What is guessed of each group: P.2040's name, thickness [m]. A wall is two sheets where the plan draws two lines."""
+SHEETS = ("wall", "column", "case")
 BLOCK = 9  # receivers one after the other that are held out together: 4.5 m of the walk
 FADING = 5  # independent samples in a power, guessed: several paths, each of a narrow beam
 EFFECTS = wr.Effects(
@@ -79,7 +80,7 @@ def place(folder: Path, seed: int) -> Place:
     Raises:
         FileNotFoundError, ValueError: naming the file that is not there or does not fit.
     """
-    walk, walls, full = measured(folder), scene(folder, "wall", "column", "case"), scene(folder, *MATERIALS)
+    walk, walls, full = measured(folder), scene(folder, *SHEETS), scene(folder, *MATERIALS)
     count = len(walk.receivers)
     ends = np.tile(walk.transmitter, (count, 1)), walk.receivers
     links = Links(
@@ -93,6 +94,8 @@ def place(folder: Path, seed: int) -> Place:
         "traced, one mirror": (walls, {"mirror_order": 1}), "traced, two mirrors": (walls, {"mirror_order": 2}),
         "traced, through walls too": (walls, through), "traced, floor and ceiling too": (full, through),
         "traced, through walls and over edges": (walls, through | {"diffractions": 1}),
+        "traced, walls of glass": (scene(folder, *SHEETS, wall=("glass", 0.01)), through),
+        "traced, walls of concrete": (scene(folder, *SHEETS, wall=("concrete", 0.2)), through),
     }  # fmt: skip
     fields = {"field": (full, EFFECTS), "field, without scattering": (full, replace(EFFECTS, scatterings=0))}
     noise: list[Row] = [
@@ -113,7 +116,10 @@ def place(folder: Path, seed: int) -> Place:
         known, how = digest(*files), {"device": job.device, "progress": job.progress}
         models = {"nearest receiver": (partial(beams.nearest, walk), known)}
         models |= {
-            name: (partial(beams.straight, walk, found), digest(known, repr(traced[name][1])))
+            name: (
+                partial(beams.straight, walk, found),
+                digest(known, *map(repr, (*traced[name][0].materials, traced[name][1]))),
+            )
             for name, found in rays.items()
         }
         models |= {
@@ -152,8 +158,8 @@ def measured(folder: Path) -> Walk:
     return Walk(np.array([*TRANSMITTER, HEIGHT_M]), places, rays, 10.0 ** (FLOOR_DB / 10.0), FREQUENCY_HZ)
 
 
-def scene(folder: Path, *parts: str) -> wr.Scene:
-    """Sheets of ``parts``, of "wall", "column", "case" and "slab" (floor and ceiling)."""
+def scene(folder: Path, *parts: str, wall: tuple[str, float] = MATERIALS["wall"]) -> wr.Scene:
+    """Sheets of ``parts``, of "wall", "column", "case" and "slab" (floor and ceiling), walls of what ``wall`` says."""
     names, quads = list(MATERIALS), []
     drawn = plan(folder)
     for name, lines in drawn.items():
@@ -167,7 +173,8 @@ def scene(folder: Path, *parts: str) -> wr.Scene:
     faces = (4 * np.arange(len(quads))[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
     mesh = wr.Mesh(np.concatenate([np.array(quad) for _, quad in quads]), faces)
     of_face = np.repeat([names.index(name) for name, _ in quads], 2)
-    materials = [itu_material(itu, name=name, thickness_m=thick) for name, (itu, thick) in MATERIALS.items()]
+    known = MATERIALS | {"wall": wall}
+    materials = [itu_material(itu, name=name, thickness_m=thick) for name, (itu, thick) in known.items()]
     return wr.Scene(mesh, materials, of_face, face_object=of_face, object_names=names)
 
 

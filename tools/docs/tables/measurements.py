@@ -73,7 +73,13 @@ def _headline_measured() -> str:
             "floor of offices: two receivers of four held out",
             floor_noise,
         ),
-        ("measured_hall", "block", "field", "hall, 60 GHz: nine places of 45 held out", sight["gain_db_spread"]),
+        (
+            "measured_hall",
+            "block",
+            "field",
+            "hall, 60 GHz: nine places of 45 held out",
+            sight["gain_db_spread"],
+        ),
     )
     lines = []
     for name, held_out, model, said, noise in shown:
@@ -240,7 +246,14 @@ def _hall_pairs() -> str:
 def _hall() -> str:
     rows = read("measured_hall")["rows"]
     blocks = sorted(rows[0]["each_db"], key=lambda name: int(name.split()[0]))
-    head = ("model", "error, rms [dB]", "in sight", "behind walls", "mean", *(f"places {name}" for name in blocks))
+    head = (
+        "model",
+        "error, rms [dB]",
+        "in sight",
+        "behind walls",
+        "mean",
+        *(f"places {name}" for name in blocks),
+    )
     lines = [
         [
             r["model"], *(f"{r[key]:.2f}" for key in ("rms_db", "seen_db", "behind_db")), f"{r['behind_bias_db']:+.2f}",
