@@ -1,4 +1,4 @@
-"""What a field is fitted to (readings, arrays, bare meshes, links of a flat, a floor and a hall), walls, limits, effects of a scene."""
+"""What a field is fitted to (readings, arrays, bare meshes, links of measured places), walls, limits, effects of a scene."""
 
 from __future__ import annotations
 
