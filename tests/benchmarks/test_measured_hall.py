@@ -1,12 +1,16 @@
 """The measured hall: a file of its form, made of one wall's image, is read, traced and met; what does not fit is named."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from places import ROOT
 from scipy.io import loadmat, savemat
 
+import warprrf as wr
 from benchmarks.measured import beams, command, hall
 from benchmarks.runner import Job
+from warprrf.steps import Steps
 
 FROM = np.array(hall.TRANSMITTER)
 WALL_X = 8.0  # of a wall from y = -9 to 9, which all receivers see
@@ -143,3 +147,23 @@ def test_the_measured_hall_is_as_it_was():
     walk = hall.measured(folder)
     assert len(walk.receivers) == 45 and sum(len(one.power) for one in walk.rays) == 362
     assert sum(not nlos.all() for nlos in walk.nlos) == 41
+
+
+def test_pairs_of_links_held_out_are_predicted_from_the_others(source):
+    """A field learns from nine links how the wall mirrors, which traced paths of metal have 6 dB too strong."""
+    walk, seen = hall.measured(source), hall.scene(source, "wall", wall=("metal", 0.001))
+    ends = {"transmitter": walk.transmitter, "receivers": walk.receivers}
+    paths = beams.Rays.of(wr.trace_paths(seen, **ends, frequency_hz=60e9, mirror_order=1))
+    effects = wr.Effects(mirrors=1, scatterings=0, transmissions=0, diffractions=0, mirror_scatter=False)
+    models = {
+        "traced": (partial(beams.straight, walk, paths), ""),
+        "nearest": (partial(beams.nearest, walk), ""),
+        "field": (partial(beams.fitted, walk, seen, effects=effects), ""),
+    }
+    with Steps(source / "steps") as steps:
+        rows = {row["model"]: row for row in beams.predicted(walk, models, hall.BLOCK, steps)}
+    for model in ("traced", "field"):
+        assert rows[model]["found"] == 1.0 and rows[model]["sight_db"] < 0.6 and rows[model]["lit"] < 0.05
+    assert rows["traced"]["nlos_mean_db"] == pytest.approx(6.0, abs=0.7)
+    assert abs(rows["field"]["nlos_mean_db"]) < 1.0
+    assert rows["nearest"]["sight_db"] > 1.0
