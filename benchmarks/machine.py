@@ -61,6 +61,7 @@ DEPENDS = {
     "locate": ("bistatic",),
     "map": ("geometry", "bistatic"),
     "measured_flat": ("bistatic",),
+    "measured_hall": ("bistatic",),
     "measured_office": ("bistatic",),
     "measurements": ("geometry", "bistatic"),
     "office": ("bistatic",),

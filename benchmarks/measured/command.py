@@ -13,7 +13,7 @@ import numpy as np
 import warprrf as wr
 from benchmarks.fits import rms
 from benchmarks.machine import machine
-from benchmarks.measured import flat, office
+from benchmarks.measured import flat, hall, office
 from benchmarks.measured.links import DARK_DB, Links, Place, db
 from benchmarks.measured.rivals import RIVALS
 from benchmarks.report import Report, Row, columns_table
@@ -30,13 +30,19 @@ Office: impulse responses of 24 links over 3 to 7 GHz on a floor of offices (rep
 which --source is a copy: data/meas/W1, data/struc/lay/WHERE1.lay, data/struc/furnitures/Furw1.ini). First and strong arrivals are
 compared with sharp paths of which nothing is fitted; then a receiver, two of the four, or one of two heights is held out.
 
+Hall: the paths between a transmitter and 45 places of a receiver at 60 GHz, with lengths, both directions and powers of pairs of
+beams, and the hall's plan. --source is a folder with two files that you fetch yourself (no licence is stated):
+Kampusareena_slam_measurements_svd_p999.mat (repository github.com/okaltiok/Robust-snapshot-radio-SLAM) and kampusarena_map.fig
+(github.com/BaiLiping/radio_SLAM). Nine neighbouring places are held out at a time.
+
 examples:
   python -m benchmarks measured flat --source external/ble_flat
   python -m benchmarks measured office --source external/pylayers
+  python -m benchmarks measured hall --source external/kampusareena
   python -m benchmarks measured flat --noise-alone
 """
-PLACES = {"flat": flat.place, "office": office.place}
-SOURCES = {"flat": "external/ble_flat", "office": "external/pylayers"}
+PLACES = {"flat": flat.place, "office": office.place, "hall": hall.place}
+SOURCES = {"flat": "external/ble_flat", "office": "external/pylayers", "hall": "external/kampusareena"}
 VERSION = 1
 """Counted up by hand when a field's predictions come out differently."""
 Predict = Callable[[Links, Links], np.ndarray]
@@ -59,11 +65,13 @@ class Options:
     """
 
     place: str = option("flat", "which place", choices=tuple(PLACES), positional=True)
-    source: str = option("", "folder of its files; external/ble_flat or external/pylayers by default")
+    source: str = option(
+        "", "folder of its files; external/ble_flat, external/pylayers or external/kampusareena by default"
+    )
     hold_out: tuple[str, ...] = option(
         (),
         "what is held out, one at a time; all that the place has by default",
-        choices=("anchor", "pair", "room", "height"),
+        choices=("anchor", "pair", "room", "height", "block"),
     )
     noise_alone: bool = option(False, "write the noise of the means, and fit nothing")
 
@@ -140,17 +148,19 @@ def run(options: Options, job: Job) -> Report:
             for kind, parts in error.items():
                 own, errors = (np.concatenate(side) for side in zip(*parts, strict=True))
                 rows.append(_row(links.subset(own), kind, model, errors, place.floor_db))
+        more, said = place.fitted(job, steps) if place.fitted else ({}, "")
     rows.sort(key=lambda row: str(row["held_out"]))
     own_figures = {"machine": machine(job.device), "seed": job.seed, "noise": place.noise, "rows": rows}
-    figures = {**own_figures, **place.more}
-    return Report(name, figures, "\n\n".join([place.about, place.said, columns_table(COLUMNS, rows)]))
+    figures = {**own_figures, **place.more, **more}
+    text = [place.about, place.said, columns_table(COLUMNS, rows), said]
+    return Report(name, figures, "\n\n".join(filter(None, text)))
 
 
 def _row(links: Links, kind: str, model: str, error: np.ndarray, floor_db: float) -> Row:
     """Errors of one model, no less than as if what it does not reach were at the floor, None in sight if none is."""
     dark = links.level_db + error < floor_db
     error = np.where(dark, floor_db - links.level_db, error)
-    own = links.room if kind == "room" else links.anchor.astype(str)
+    own = links.room if kind in ("room", "block") else links.anchor.astype(str)
     each = {str(one): rms(error[own == one]) for one in np.unique(own)}
     seen, behind = error[~links.behind], error[links.behind]
     return {

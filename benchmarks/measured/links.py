@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike
 
 import warprrf as wr
 from benchmarks.fits import rms
+from benchmarks.runner import Job
+from warprrf.steps import Steps
 
 DARK_DB = -300.0  # of what no path reaches
 
@@ -27,7 +29,7 @@ class Links:
         level_db: mean of their power [dB], shape ``(L,)``.
         anchor: number of the fixed end, shape ``(L,)``.
         cell: number of the cell, shape ``(L,)``.
-        room: name of the room of the cell, shape ``(L,)``.
+        room: name of the room of the cell, or of its block of a walk, shape ``(L,)``.
         walls: how many walls of each kind the straight way crosses, shape ``(L, kinds)``.
     """
 
@@ -57,8 +59,9 @@ class Links:
         return replace(self, **{name: values[chosen] for name, values in vars(self).items()})
 
     def held_out(self, kinds: Sequence[str]) -> Iterator[tuple[str, str, np.ndarray]]:
-        """What is held out together: its kind, "anchor", "pair", "room" or "height", which, and a mask of its links."""
-        own = {"anchor": self.anchor, "pair": self.anchor, "room": self.room, "height": self.receivers[:, 2]}
+        """What is held out together: its kind, "anchor", "pair", "room", "block" or "height", which, and a mask of its links."""
+        own = {"anchor": self.anchor, "pair": self.anchor, "room": self.room, "block": self.room}
+        own["height"] = self.receivers[:, 2]
         for kind in kinds:
             for which in combinations(np.unique(own[kind]), 2 if kind == "pair" else 1):
                 yield kind, " and ".join(map(str, which)), np.isin(own[kind], which)
@@ -81,6 +84,7 @@ class Place:
         noise: of the measurement, as figures.
         said: the same in words.
         more: figures of this place alone.
+        fitted: makes more of them by fits of its own, and says them in words.
     """
 
     about: str
@@ -95,6 +99,7 @@ class Place:
     noise: Mapping[str, Any]
     said: str
     more: Mapping[str, Any] = field(default_factory=dict)
+    fitted: Callable[[Job, Steps], tuple[Mapping[str, Any], str]] | None = None
 
 
 def db(power: ArrayLike) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What a field is fitted to (readings, arrays, bare meshes, links of a flat and a floor), walls, limits, effects of a scene."""
+"""What a field is fitted to (readings, arrays, bare meshes, links of measured places), walls, limits, effects of a scene."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from benchmarks.measured import hall
 from benchmarks.measured.office import ARRIVALS, NOISE
 from benchmarks.report import cell
 from tables.common import TRUTHS, Row, entry, find, markdown, read, show
@@ -54,6 +55,7 @@ def _headline_measured() -> str:
         np.mean([r["heights_total_db"] ** 2 for r in read("measured_office_noise")["rows"]])
     )
     flat = read("measured_flat")["noise"]["all"]["halves_by_time"]
+    sight = read("measured_hall")["noise"]["rows"][0]
     shown = (
         ("measured_flat", "anchor", "field", "flat, Bluetooth: one anchor held out", flat),
         ("measured_flat", "room", "field", "flat, Bluetooth: one room held out", flat),
@@ -70,6 +72,13 @@ def _headline_measured() -> str:
             "field, walls",
             "floor of offices: two receivers of four held out",
             floor_noise,
+        ),
+        (
+            "measured_hall",
+            "block",
+            "field",
+            "hall, 60 GHz: nine places of 45 held out",
+            sight["gain_db_spread"],
         ),
     )
     lines = []
@@ -209,6 +218,48 @@ def _floor() -> str:
             *(f"{r['each_db'][str(k)]:.2f}" for k in range(1, 5)),
         ]
         for r in read("measured_office")["rows"]
+    ]  # fmt: skip
+    return markdown(head, lines)
+
+
+@entry("hall-sight")
+def _hall_sight() -> str:
+    return _columns(hall.NOISE, read("measured_hall")["noise"]["rows"])
+
+
+@entry("hall-paths")
+def _hall_paths() -> str:
+    return _columns(hall.UNFITTED, read("measured_hall")["paths"])
+
+
+@entry("hall-bounces")
+def _hall_bounces() -> str:
+    return _columns(hall.BOUNCES, read("measured_hall")["bounces"])
+
+
+@entry("hall-pairs")
+def _hall_pairs() -> str:
+    return _columns(hall.FITTED, read("measured_hall")["pairs"])
+
+
+@entry("hall")
+def _hall() -> str:
+    rows = read("measured_hall")["rows"]
+    blocks = sorted(rows[0]["each_db"], key=lambda name: int(name.split()[0]))
+    head = (
+        "model",
+        "error, rms [dB]",
+        "in sight",
+        "behind walls",
+        "mean",
+        *(f"places {name}" for name in blocks),
+    )
+    lines = [
+        [
+            r["model"], *(f"{r[key]:.2f}" for key in ("rms_db", "seen_db", "behind_db")), f"{r['behind_bias_db']:+.2f}",
+            *(f"{r['each_db'][name]:.2f}" for name in blocks),
+        ]
+        for r in rows
     ]  # fmt: skip
     return markdown(head, lines)
 
