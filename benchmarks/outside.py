@@ -29,7 +29,9 @@ CARRIERS_GHZ = (1, 2.4, 5, 10, 24.25, 37, 47, 60, 77, 94)
 SENDERS = 50
 TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Positions of the pictures' tables, y up, in the axes of their mesh, z up."""
-SHARP = wr.Effects(mirrors=2, scatterings=1, mirror_scatter=False, scatter_mirror=False)
+SHARP = wr.Effects(
+    mirrors=2, scatterings=1, mirror_scatter=False, scatter_mirror=False, transmissions=0, diffractions=0
+)
 """Of the pictures: what an array tells apart."""
 PICTURES = (
     ("carrier_ghz", "carrier [GHz]", "{:g}"), ("line_of_sight", "line of sight, correlation", "{:.2f}"),
