@@ -49,6 +49,7 @@ TURNS = 72  # zeros of azimuth that the nearest measurement is sought under
 BANDWIDTH_HZ, TAPS, LATE_S = 2e9, 320, 137e-9
 """Of profiles: taps half as far apart as they are long, 24 m in all, by a clock that is late."""
 PROFILE_SAMPLES = 200_000  # of Sionna RT's rays
+SOUNDED_DB = 50.0  # range of profiles below the strongest tap of all transmitters
 FIRST_DB = 15.0  # below the strongest tap of a transmitter is its first arrival at the least
 MORE = (7.5, 1.5, 2.6), (7.5, 10.5, 2.6)
 """Transmitters [m] beside those of the data set and of the benchmark of measurements."""
@@ -179,7 +180,7 @@ def aligned(power: np.ndarray) -> np.ndarray:
     strongest = power.reshape(*power.shape[:-2], -1).argmax(axis=-1) % power.shape[-1]
     turn = (np.arange(power.shape[-1]) + strongest[..., None, None]) % power.shape[-1]
     db = NEPER * np.log(np.maximum(np.take_along_axis(power, turn, axis=-1), 1e-300))
-    return np.asarray(np.maximum(db - db.max(axis=(-2, -1), keepdims=True), -RANGE_DB))
+    return np.asarray(np.maximum(db - db.max(axis=(-2, -1), keepdims=True), -SOUNDED_DB))
 
 
 class Question:
@@ -245,7 +246,7 @@ class Question:
             share = tap_share(BANDWIDTH_HZ * (taps[:, None] - paths.tau), "hann")
             power.append(share @ paths.power)
         read = np.concatenate(power) * noise(len(NEAR) * TAPS, self.job.seed, k)
-        floor = 10.0 ** (-RANGE_DB / 10.0) * read.max()
+        floor = 10.0 ** (-SOUNDED_DB / 10.0) * read.max()
         return wr.Readings(
             np.repeat(self.sources[NEAR], TAPS, axis=0), test.receivers[k], np.maximum(read, floor), test.frequency_hz, floor,
             delay_s=np.tile(taps + LATE_S, len(NEAR)), bandwidth_hz=BANDWIDTH_HZ, window="hann", std_db=NOISE_DB,

@@ -8,7 +8,7 @@ import pytest
 from furnished import RECEIVERS
 
 import warprrf as wr
-from warprrf.rf.fields.bistatic.field_map import maps_of
+from warprrf.rf.fields.bistatic.field_map import coarse, maps_of
 from warprrf.rf.fields.bistatic.locate import Question, as_data
 from warprrf.rf.spectra.spectrum import directions_from_angles, pixel_solid_angles, sub_pixel_directions
 from warprrf.rf.tracing.render import path_gains
@@ -87,6 +87,20 @@ def test_profiles_of_delay_tell_the_place_and_how_late_their_clock_is(field, k):
     assert np.linalg.norm(found.position - UNSEEN[k]) < 0.05
     assert found.clock_offsets_s["profiles"] == pytest.approx(-137e-9, abs=0.2e-9)
     assert not found.known and not found.azimuth_zeros  # valleys of 15 cm, places half a metre apart
+
+
+def test_floors_do_not_add_up_to_what_looks_like_power():
+    """A profile of gigahertz read more coarsely: a path keeps its power, and where no tap was heard none is."""
+    taps, floor = np.arange(0.0, 100e-9, 0.25e-9), 1e-3
+    power = np.sinc(2e9 * (taps - 20e-9)) ** 2
+    one = wr.Readings(
+        [0, 0, 2], [1, 1, 1], np.maximum(power, floor), 60e9, floor, delay_s=taps, bandwidth_hz=2e9
+    )
+    found = coarse(one)
+    heard = found.power > found.floor
+    assert found.bandwidth_hz < 1e9 and len(found) < len(one) / 2
+    assert found.power.max() == pytest.approx(1.0 / 1.5, rel=0.2)  # of a Hann window
+    assert heard.any() and (np.abs(found.delay_s[heard] - 20e-9) < 2.0 / found.bandwidth_hz).all()
 
 
 def test_coarse_profiles_are_known(field):

@@ -274,11 +274,12 @@ def coarse(one: Measured) -> Measured:
     one = one.subset(np.isfinite(one.power))
     delay, wider = np.asarray(one.delay_s), float(one.bandwidth_hz or 0.0) / COARSE_HZ
     power, floor, kept = np.empty(len(one)), np.empty(len(one)), list[np.ndarray]()
+    heard = np.where(one.power > one.floor, one.power, 0.0)  # floors would add up to what looks like power
     own = _pointing(one, np.unique(np.asarray(one.chain), return_inverse=True)[1].reshape(-1))
     for rows in (np.flatnonzero(own == k) for k in range(own.max() + 1)):
         near = tap_share(COARSE_HZ * (delay[rows, None] - delay[rows]), "hann")
         near *= wider / near.sum(axis=1, keepdims=True)
-        power[rows], floor[rows] = near @ one.power[rows], near @ np.asarray(one.floor)[rows]
+        power[rows], floor[rows] = near @ heard[rows], near @ np.asarray(one.floor)[rows]
         kept.append(rows[np.unique(np.round(2.0 * COARSE_HZ * delay[rows]), return_index=True)[1]])
     some = np.sort(np.concatenate(kept))
     least = np.maximum(floor, 10.0 ** (-COARSE_DB / 10.0) * power.max())[some]
