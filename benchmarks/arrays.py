@@ -124,7 +124,8 @@ def rows(options: Options, fits: Fits) -> Iterator[Row]:
 def _fields(fits: Fits, scene: wr.Scene, measured: Any, asked: np.ndarray, test: wr.SpectrumDataset) -> Row:
     """PSNR [dB] of every test receiver, of a fitted field with and without phases of mirrors, and of its start."""
     fitted = fits.fit(scene, measured)
-    prior = type(fitted.parameters).prior(*fitted.parameters.log_weight.shape)
+    p = fitted.parameters
+    prior = type(p).prior(len(p.log_weight), p.lobes, reciprocal=p.reciprocal)
     start = replace(fitted, parameters=prior, residual=0.0 * fitted.residual)
 
     def scored(field: Any, length_std_m: float = 0.0) -> list[float]:
