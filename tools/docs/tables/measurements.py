@@ -35,7 +35,7 @@ def _headline_less() -> str:
     one, horn, power = (
         next(r for r in rows if r["readings"] == name) for name in ("1 spectrum, mean of 20", "horn", "power")
     )
-    at = read("locate")["rows"]
+    at = [r for r in read("locate")["rows"] if r["measured"].startswith(("spectrum", "horn"))]
     lines = [
         ["one spectrum, of 60 x 120 pixels", f"spectra: PSNR {one['psnr_db']:.1f} dB"],
         ["a horn's readings at ten places, its gain unknown", f"spectra: PSNR {horn['psnr_db']:.1f} dB"],
