@@ -64,10 +64,7 @@ def test_no_figure_is_typed(page):
     assert {*re.findall(r"\d+\.\d+ (?:dB|%|n?s|ms|mm|cm|degrees|times)(?!\w)", typed)} <= SETTINGS
 
 
-STALE = {
-    "arrays", "filmed", "lobby_seeds", "map", "measured_flat", "measurements", "outside",
-    "suggest",
-}  # fmt: skip
+STALE = {"filmed", "lobby_seeds", "map", "measured_flat", "measurements"}
 """Result files of before what they depend on computed something else; their pages say so. What is made anew leaves this list."""
 
 
@@ -81,7 +78,7 @@ def test_result_files_say_which_code_made_them_and_whether_it_is_todays():
         if kind in depends:
             assert found["machine"]["commit"] and set(depends[kind]) <= set(found["machine"]["computes"])
     assert {name for name in files if tables.common.older(name)} == STALE
-    for name in STALE - {"outside"}:
+    for name in STALE:
         assert "**Not run since" in tables.table(f"machine-{name}")
 
 
