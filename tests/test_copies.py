@@ -48,7 +48,7 @@ def test_copies_are_counted_both_ways(device):
 
 
 def test_a_view_moves_no_more_with_more_gaussians(box, device):
-    """A photo with its gradients, and the strongest weights of a panorama: the number of entries, the background."""
+    """A photo with its gradients, and the strongest weights of a panorama: the number of entries."""
     photo = wr.Camera.pinhole(40, 30, fx=20.0, fy=20.0, cx=20.0, cy=15.0, world_to_camera=np.eye(4))
     panorama = wr.Camera.spherical(*SHAPE[::-1], position=RECEIVERS[0])
     moved = []
@@ -62,7 +62,7 @@ def test_a_view_moves_no_more_with_more_gaussians(box, device):
             Rasterizer(device=device, blending=RADIO).strongest(raster.prepare(*inputs, panorama), 4)
         moved.append(dict(counted))
     assert moved[0] == moved[1]
-    assert moved[0]["up"] + moved[0]["down"] <= 64
+    assert moved[0].get("up", 0) + moved[0]["down"] <= 64
 
 
 def test_another_receiver_moves_no_more_with_more_gaussians(box, device):

@@ -28,9 +28,7 @@ from warprrf.kernels.raster.view import EXPONENTIAL, PINHOLE, PRODUCT, SPHERICAL
 PARTS = 8  # partial sums of gradients on a CPU, one writer each: the thread count changes nothing
 MOST_WEIGHTS = 1 << 16  # of a pixel that can be asked for
 GRAIN = 32  # a tile is work enough for few of them to be worth a thread
-PIXEL_TILE = (
-    8  # pixels: side of a tile where each pixel has a thread of its own: it walks what any of them may see
-)
+WARP = 32  # threads, which all take part where a GPU's add up
 
 RULES = {"product": PRODUCT, "exp": EXPONENTIAL}
 Parameters = tuple[wp.array, wp.array, wp.array, wp.array]
@@ -151,8 +149,8 @@ class Rasterizer:
         self.real = real
         self.per_pixel = per_pixel or self.device.is_cuda
         self.kernels = reference if self.per_pixel else blocks
-        self.tile = PIXEL_TILE if self.per_pixel else blocks.BLOCK
-        self.threads_per_tile = PIXEL_TILE**2 if self.per_pixel else 1
+        self.tile = reference.TILE if self.per_pixel else blocks.BLOCK
+        self.threads_per_tile = reference.LANES if self.per_pixel else 1
 
     def __reduce__(self) -> tuple[Callable[..., Rasterizer], tuple[()]]:
         device, blending, real = str(self.device), self.blending, self.real
@@ -226,13 +224,11 @@ class Rasterizer:
         view = _view(cam, self.tile)
         inputs = (means, quaternions, scales, opacities)
         span = wp.empty(n, dtype=wp.vec4i, device=device)
-        count = wp.empty(n, dtype=int, device=device)
-        distance = wp.empty(n, dtype=float, device=device)
+        keys, order = (wp.empty(2 * n, dtype=int, device=device) for _ in range(2))  # sorting wants room for two
         splats = wp.empty(n, dtype=projection.splat_of(self.real), device=device)
-        outputs = [span, count, distance, splats]
         project = projection.build_project(self.real)
-        launch(project, n, [*inputs, view, self.blending.rules, *outputs], device=device)
-        ids, starts = _listed(span, count, distance, view)
+        launch(project, n, [*inputs, view, self.blending.rules, span, keys, order, splats], device=device)
+        ids, starts = _listed(span, keys, order, view)
         return Prepared(cam, view, inputs, splats, ids, starts)
 
     def blend(
@@ -294,9 +290,9 @@ class Rasterizer:
         if isinstance(background, wp.array):
             self._fits("background", background, self.real, (channels,))
             return background
-        values = (
-            np.zeros(channels) if background is None else check_array("background", background, (channels,))
-        )
+        if background is None:
+            return wp.zeros(channels, dtype=self.real, device=self.device)
+        values = check_array("background", background, (channels,))
         return wp.array(values, dtype=self.real, device=self.device)
 
     def _check_colors(self, means: wp.array, sh: wp.array, out: wp.array) -> None:
@@ -330,7 +326,10 @@ class Rasterizer:
         """Launch a kernel over all tiles, cut at the tiles ``cuts``."""
         each = self.threads_per_tile
         bounds = None if cuts is None else [each * tile for tile in cuts]
-        launch(kernel, each * prepared.tiles, inputs, device=self.device, grain=each * GRAIN, cuts=bounds)
+        count = each * prepared.tiles
+        if self.device.is_cuda:
+            count += -count % WARP
+        launch(kernel, count, inputs, device=self.device, grain=each * GRAIN, cuts=bounds)
 
     def _blend(
         self, prepared: Prepared, features: wp.array, background: wp.array, *, requires_grad: bool
@@ -392,23 +391,19 @@ class Rasterizer:
         return wp.array(parts, dtype=int, device=self.device), cuts.tolist()
 
 
-def _listed(span: wp.array, count: wp.array, distance: wp.array, view: View) -> tuple[wp.array, wp.array]:
+def _listed(span: wp.array, keys: wp.array, order: wp.array, view: View) -> tuple[wp.array, wp.array]:
     """Gaussians of every tile by range (as float32; ties by index), and where each tile's begin."""
-    device, n = count.device, len(count)
+    device, n = span.device, len(span)
     tiles = view.tiles_x * view.tiles_y
-    starts = wp.zeros(tiles + 1, dtype=int, device=device)
-    nothing = wp.empty(1, dtype=int, device=device), starts
     if n == 0:
-        return nothing
-    keys, order = (wp.empty(2 * n, dtype=int, device=device) for _ in range(2))  # sorting wants room for two
-    launch(binning.sort_keys, n, [count, distance, keys, order], device=device)
+        return _nothing(tiles, device)
     wp.utils.radix_sort_pairs(keys, order, n)
     ends = wp.empty(n, dtype=wp.int64, device=device)
-    launch(binning.counts_in_order, n, [order, count, ends], device=device)
+    launch(binning.counts_in_order, n, [order, span, ends], device=device)
     wp.utils.array_scan(ends, ends, inclusive=True)
     entries = int(ends[n - 1 :].numpy()[0])  # one number, where the counts may be millions
     if entries == 0:
-        return nothing
+        return _nothing(tiles, device)
     if entries > 2**30:
         raise ValueError(
             f"gaussians: they cover {entries} tiles in all, more than 2^30; prune large Gaussians or render smaller"
@@ -416,8 +411,14 @@ def _listed(span: wp.array, count: wp.array, distance: wp.array, view: View) -> 
     keys, ids = (wp.empty(2 * entries, dtype=int, device=device) for _ in range(2))
     launch(binning.emit_entries, n, [order, span, ends, view.tiles_x, keys, ids], device=device)
     wp.utils.radix_sort_pairs(keys, ids, entries, 0, tiles.bit_length())
+    starts = wp.empty(tiles + 1, dtype=int, device=device)
     launch(binning.tile_starts, tiles + 1, [keys, entries, starts], device=device)
     return ids[:entries], starts
+
+
+def _nothing(tiles: int, device: wp.Device) -> tuple[wp.array, wp.array]:
+    """Lists of a view in which there is nothing to see."""
+    return wp.empty(1, dtype=int, device=device), wp.zeros(tiles + 1, dtype=int, device=device)
 
 
 def _view(cam: Camera, tile: int) -> View:

@@ -7,29 +7,13 @@ import warp as wp
 
 
 @wp.kernel(enable_backward=False)
-def sort_keys(
-    offset: int,
-    count: wp.array(dtype=int),
-    distance: wp.array(dtype=float),
-    keys: wp.array(dtype=int),
-    values: wp.array(dtype=int),
-):
-    """Ranges as integers of the same order (a float that is not negative sorts as its bits do); unseen ones last."""
-    i = offset + wp.tid()
-    key = int(2147483647)
-    if count[i] > 0:
-        key = wp.cast(distance[i], wp.int32)
-    keys[i] = key
-    values[i] = i
-
-
-@wp.kernel(enable_backward=False)
 def counts_in_order(
-    offset: int, order: wp.array(dtype=int), count: wp.array(dtype=int), ordered: wp.array(dtype=wp.int64)
+    offset: int, order: wp.array(dtype=int), span: wp.array(dtype=wp.vec4i), ordered: wp.array(dtype=wp.int64)
 ):
-    """The count of tiles of each Gaussian, near to far; their sum may be too large for 32 bits."""
+    """How many tiles each Gaussian covers, near to far; their sum may be too large for 32 bits."""
     i = offset + wp.tid()
-    ordered[i] = wp.int64(count[order[i]])
+    s = span[order[i]]
+    ordered[i] = wp.int64(s[1] * s[3])
 
 
 @wp.kernel(enable_backward=False)

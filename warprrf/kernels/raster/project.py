@@ -157,6 +157,7 @@ CHANNELS = 4  # feature channels blended by one launch
 OF_OPACITY, OF_FEATURES, OF_WEIGHT = 9, 10, 14
 SUMS = 16  # one is free
 sums_d = wp.types.vector(SUMS, wp.float64)
+LAST = 2147483647
 # Stays finite where scales are near the smallest number: zero offset times infinity would be NaN.
 STEEPEST = 1.0e15
 
@@ -169,14 +170,15 @@ def splat_of(real: type) -> Any:
     @wp.struct
     class Splat:
         g0: vec3  # linear forms of a ray, of M times the smallest scale;
-        g1: vec3  # these two times |M m|
-        g2: vec3
-        flat: real  # 1 / |M m|^2
         cut: real  # q at which alpha falls below alpha_min
+        g1: vec3  # these two times |M m|
+        flat: real  # 1 / |M m|^2
+        g2: vec3
         opacity: real
         reach: real  # |m| |M m| with M scaled as above: a range is reach g0 / |g|^2 [m]
         lift: real  # how a range's gradient joins the others in the adjoint [m]
-        tilt: real
+        tilt: real  # never positive
+        free: real  # rows of 64 bytes in float32: two sectors of a GPU's cache
 
     return Splat
 
@@ -220,18 +222,19 @@ def build_project(real: type) -> Any:
         view: View,
         rules: Rules,
         span: wp.array(dtype=wp.vec4i),
-        count: wp.array(dtype=int),
-        distance: wp.array(dtype=float),
+        keys: wp.array(dtype=int),
+        order: wp.array(dtype=int),
         splats: wp.array(dtype=Splat),
     ):
-        """Per Gaussian and view: the covered tiles, the range that orders blending, and the splat where it is seen."""
+        """Per Gaussian and view: the covered tiles, the key that orders blending, and the splat where it is seen. A key is
+        the range, whose bits sort as it does, as it is not negative; those of Gaussians that are not seen come last."""
         i = offset + wp.tid()
         m = wp.vec3d(means[i]) - view.origin
         range_ = wp.length(m)
         opacity = wp.float64(opacities[i])
         span[i] = wp.vec4i(0, 0, 0, 0)
-        count[i] = 0
-        distance[i] = float(range_)
+        keys[i] = wp.static(LAST)
+        order[i] = i
         if opacity < rules.alpha_min or opacity <= wp.float64(0.0) or range_ < wp.float64(1.0e-12):
             return
         s = wp.vec3d(scales[i])
@@ -251,7 +254,7 @@ def build_project(real: type) -> Any:
         if tiles[1] * tiles[3] == 0:
             return
         span[i] = tiles
-        count[i] = tiles[1] * tiles[3]
+        keys[i] = wp.cast(float(range_), wp.int32)
         steep = wp.min(steepness, wp.float64(wp.static(STEEPEST)))
         flat = wp.float64(1.0) / steep
         forms = wp.transpose(r * (wp.diag(scaling) * whitened_frame(a)))

@@ -13,16 +13,28 @@ from warprrf.kernels.raster.project import OF_FEATURES, OF_OPACITY, OF_WEIGHT, S
 from warprrf.kernels.raster.view import PRODUCT, Rules, View, pixel_of, pixel_ray
 
 
+TILE = 4  # pixels: side of a tile, whose 16 lanes walk its list together; a warp has two tiles
+LANES = TILE**2
+
+
+@wp.func
+def touch(splats: wp.array(dtype=Any), ids: wp.array(dtype=int), at: int, end: int):
+    """Zero, read from both halves of a row. Each lane of a tile reads another one of the 16 that they all walk next:
+    memory is waited for once, and the rows then lie in the nearest cache."""
+    splat = splats[ids[wp.min(at, end - 1)]]
+    none = type(splat.cut)(0.0)
+    return wp.min(splat.cut, none) + wp.max(splat.tilt, none)
+
+
 @wp.func
 def meet(splat: Any, ray: Any, least: Any):
-    """How a ray passes a Gaussian: its forms g0, g1, g2, the reciprocal of |g|^2 (of ``least`` at least, so that it
-    stays finite) and the squared distance q in standard deviations."""
+    """How a ray passes a Gaussian: its forms g0, g1, g2, n = g1^2 + g2^2, and |g|^2 (``least`` at least, so that its
+    reciprocal stays finite): it is n / |g|^2 squared standard deviations away."""
     g0 = wp.dot(splat.g0, ray)
     g1 = wp.dot(splat.g1, ray)
     g2 = wp.dot(splat.g2, ray)
     n = g1 * g1 + g2 * g2
-    inverse = type(least)(1.0) / wp.max(g0 * g0 + splat.flat * n, least)
-    return g0, g1, g2, inverse, n * inverse
+    return g0, g1, g2, n, wp.max(g0 * g0 + splat.flat * n, least)
 
 
 @wp.func
@@ -79,7 +91,9 @@ def build_blend(real: type, width: int) -> Any:
     ):
         """Blend channels from ``first`` front to back: features, sum of weights, mean range (0 where nothing is seen,
         so that a loss on it stays finite), transmittance left, Gaussian of largest weight and the range of its peak."""
-        tile, x, y = pixel_of(offset + wp.tid(), view)
+        thread = offset + wp.tid()
+        lane = thread % wp.static(LANES)
+        tile, x, y = pixel_of(thread, view)
         if x >= view.width or y >= view.height:
             return
         ray = vec3(pixel_ray(view, x, y))
@@ -90,14 +104,19 @@ def build_blend(real: type, width: int) -> Any:
         best = real(0.0)
         peak = real(0.0)
         owner = int(-1)
-        for j in range(starts[tile], starts[tile + 1]):
+        begin = starts[tile]
+        end = starts[tile + 1]
+        for j in range(begin, end):
             if transmittance <= real(rules.transmittance_min):
                 break
+            if (j - begin) % wp.static(LANES) == 0:
+                transmittance += touch(splats, ids, j + lane, end)
             k = ids[j]
             splat = splats[k]
-            g0, g1, g2, inverse, q = meet(splat, ray, real(wp.static(least)))
-            if g0 > real(0.0) and q < splat.cut:
-                alpha = wp.min(splat.opacity * wp.exp(real(-0.5) * q), real(rules.alpha_max))
+            g0, g1, g2, n, square = meet(splat, ray, real(wp.static(least)))
+            if g0 > real(0.0) and n < splat.cut * square:
+                inverse = real(1.0) / square
+                alpha = wp.min(splat.opacity * wp.exp(real(-0.5) * n * inverse), real(rules.alpha_max))
                 weight = alpha * transmittance
                 transmittance = behind(transmittance, alpha, rules.rule)
                 t = splat.reach * g0 * inverse
@@ -122,12 +141,61 @@ def build_blend(real: type, width: int) -> Any:
     return blend
 
 
+ADD_OVER_TILES = """
+#if defined(__CUDA_ARCH__)
+    const unsigned all = 0xffffffffu;
+    const unsigned who = __ballot_sync(all, seen);
+    if (who) {
+        const int lane = threadIdx.x % 16;
+#pragma unroll
+        for (int step = 0; step < 4; ++step) {
+            const int half = 8 >> step;
+            const bool upper = lane & half;
+#pragma unroll
+            for (int i = 0; i < 8; ++i) {
+                if (i >= half) break;
+                const auto kept = upper ? s[i + half] : s[i];
+                const auto given = upper ? s[i] : s[i + half];
+                s[i] = kept + __shfl_xor_sync(all, given, half);
+            }
+        }
+        if (who & (0xffffu << (threadIdx.x & 16))) atomicAdd(&(*wp::address(sums, part, k))[lane], s[0]);
+    }
+    return __any_sync(all, going);
+#else
+    if (seen) wp::atomic_add(sums, part, k, s);
+    return going;
+#endif
+"""
+
+
+@once
+def build_add(real: type) -> Any:
+    """The function that adds what the pixels of a tile make of one Gaussian.
+
+    On a GPU all lanes of a warp call it together, 16 for each of two tiles. Of the numbers that a lane holds it gives one
+    half to a neighbour and gets the other: after 8, 4, 2 and 1 of them each lane has one sum of all 16, which are
+    added in one go. On a CPU a pixel is alone.
+    """
+    sums_of_one = wp.types.vector(SUMS, real)
+
+    @wp.func_native(ADD_OVER_TILES)
+    def add(
+        sums: wp.array2d(dtype=sums_of_one), part: int, k: int, s: sums_of_one, seen: bool, going: bool
+    ) -> bool:
+        """Add ``s`` of the lanes that have ``seen`` the Gaussian to ``sums[part, k]``; whether any is ``going`` on."""
+        ...
+
+    return add
+
+
 @once
 def build_adjoint(real: type, width: int) -> Any:
     """The adjoint of ``blend``, as :func:`build_blend` makes it."""
     vec3 = wp.types.vector(3, real)
     values = wp.types.vector(width, real)
     sums_of_one = wp.types.vector(SUMS, real)
+    add = build_add(real)
     Splat = splat_of(real)
     least = 1.0e-30 if real is wp.float32 else 1.0e-250
 
@@ -155,57 +223,74 @@ def build_adjoint(real: type, width: int) -> Any:
         dL/da_i = T_i x_i - (R - sum_{j<=i} w_j x_j) / (1 - a_i), x the gradient dotted with the pair's features, R the
         same dotted with the finished pixel; without the division for the exponential rule.
         """
-        tile, x, y = pixel_of(offset + wp.tid(), view)
-        if x >= view.width or y >= view.height:
-            return
+        thread = offset + wp.tid()
+        lane = thread % wp.static(LANES)
+        tile, x, y = pixel_of(thread, view)
+        tile = wp.min(tile, view.tiles_x * view.tiles_y - 1)  # of lanes that fill the last warp
         part = parts[tile]
         ray = vec3(pixel_ray(view, x, y))
+        inside = x < view.width and y < view.height  # lanes beyond the image stay: a warp adds up as a whole
         of_features = values()  # gradients: of features, of the sums of weight and of weight times range
         of_weight = real(0.0)
         of_range = real(0.0)
         rest = real(0.0)  # what gradients make of all that lies behind
-        if first == 0 and alphas[y, x] > real(0.0):
-            of_range = depth_grad[y, x] / alphas[y, x]
-            of_weight = alpha_grad[y, x] - of_range * ranges[y, x]
-            of_range *= wp.length(ray)
-            rest = alphas[y, x] * alpha_grad[y, x]
-        for c in range(wp.static(width)):
-            of_features[c] = image_grad[y, x, first + c]
-            rest += of_features[c] * image[y, x, first + c]
+        if inside:
+            if first == 0 and alphas[y, x] > real(0.0):
+                of_range = depth_grad[y, x] / alphas[y, x]
+                of_weight = alpha_grad[y, x] - of_range * ranges[y, x]
+                of_range *= wp.length(ray)
+                rest = alphas[y, x] * alpha_grad[y, x]
+            for c in range(wp.static(width)):
+                of_features[c] = image_grad[y, x, first + c]
+                rest += of_features[c] * image[y, x, first + c]
         transmittance = real(1.0)
-        for j in range(starts[tile], starts[tile + 1]):
-            if transmittance <= real(rules.transmittance_min):
-                break
-            k = ids[j]
-            splat = splats[k]
-            g0, g1, g2, inverse, q = meet(splat, ray, real(wp.static(least)))
-            if g0 > real(0.0) and q < splat.cut:
-                response = wp.exp(real(-0.5) * q)
-                raw = splat.opacity * response
-                alpha = wp.min(raw, real(rules.alpha_max))
-                weight = alpha * transmittance
-                lever = g0 * inverse
-                value = of_weight + splat.reach * lever * of_range
-                s = sums_of_one()
-                for c in range(wp.static(width)):
-                    value += of_features[c] * features[k, first + c]
-                    s[wp.static(OF_FEATURES) + c] = of_features[c] * weight
-                rest -= weight * value
-                slope = real(0.0)  # dL/d(opacity): none where alpha is clamped
-                if raw <= real(rules.alpha_max):
-                    hidden = rest
-                    if rules.rule == wp.static(PRODUCT):
-                        hidden = rest / wp.max(real(1.0) - alpha, real(wp.static(least)))
-                    slope = (transmittance * value - hidden) * response
-                y1 = lever * g1
-                y2 = lever * g2
-                pull = weight * of_range * inverse
-                h0 = splat.lift * pull * g0
-                h1 = splat.tilt * pull * g1
-                h2 = splat.tilt * pull * g2
-                s = pair_sums(s, slope, q, y1, y2, h0, h1, h2, weight)
-                wp.atomic_add(sums, part, k, s)
-                transmittance = behind(transmittance, alpha, rules.rule)
+        j = int(starts[tile])
+        end = starts[tile + 1]
+        going = inside and j < end
+        others = bool(True)  # whether any lane of the warp is going on: until none is, all stay
+        step = int(0)
+        while others:
+            s = sums_of_one()
+            seen = bool(False)
+            k = int(0)
+            if j < end:
+                if step % wp.static(LANES) == 0:
+                    transmittance += touch(splats, ids, j + lane, end)
+                k = ids[j]
+                splat = splats[k]
+                g0, g1, g2, n, square = meet(splat, ray, real(wp.static(least)))
+                seen = going and g0 > real(0.0) and n < splat.cut * square
+                if seen:
+                    inverse = real(1.0) / square
+                    q = n * inverse
+                    response = wp.exp(real(-0.5) * q)
+                    raw = splat.opacity * response
+                    alpha = wp.min(raw, real(rules.alpha_max))
+                    weight = alpha * transmittance
+                    lever = g0 * inverse
+                    value = of_weight + splat.reach * lever * of_range
+                    for c in range(wp.static(width)):
+                        value += of_features[c] * features[k, first + c]
+                        s[wp.static(OF_FEATURES) + c] = of_features[c] * weight
+                    rest -= weight * value
+                    slope = real(0.0)  # dL/d(opacity): none where alpha is clamped
+                    if raw <= real(rules.alpha_max):
+                        hidden = rest
+                        if rules.rule == wp.static(PRODUCT):
+                            hidden = rest / wp.max(real(1.0) - alpha, real(wp.static(least)))
+                        slope = (transmittance * value - hidden) * response
+                    y1 = lever * g1
+                    y2 = lever * g2
+                    pull = weight * of_range * inverse
+                    h0 = splat.lift * pull * g0
+                    h1 = splat.tilt * pull * g1
+                    h2 = splat.tilt * pull * g2
+                    s = pair_sums(s, slope, q, y1, y2, h0, h1, h2, weight)
+                    transmittance = behind(transmittance, alpha, rules.rule)
+            j += 1
+            step += 1
+            going = going and j < end and transmittance > real(rules.transmittance_min)
+            others = add(sums, part, k, s, seen, going)
 
     return blend_adjoint
 
@@ -254,7 +339,9 @@ def build_strongest(real: type) -> Any:
     ):
         """The largest weights of each pixel, as many as ``index`` (H, W, K) has places, in front-to-back order; their
         Gaussians, the ranges of their peaks, and the sum of all weights."""
-        tile, x, y = pixel_of(offset + wp.tid(), view)
+        thread = offset + wp.tid()
+        lane = thread % wp.static(LANES)
+        tile, x, y = pixel_of(thread, view)
         if x >= view.width or y >= view.height:
             return
         ray = vec3(pixel_ray(view, x, y))
@@ -262,14 +349,19 @@ def build_strongest(real: type) -> Any:
         transmittance = real(1.0)
         total = real(0.0)
         kept = int(0)
-        for j in range(starts[tile], starts[tile + 1]):
+        begin = starts[tile]
+        end = starts[tile + 1]
+        for j in range(begin, end):
             if transmittance <= real(rules.transmittance_min):
                 break
+            if (j - begin) % wp.static(LANES) == 0:
+                transmittance += touch(splats, ids, j + lane, end)
             k = ids[j]
             splat = splats[k]
-            g0, g1, g2, inverse, q = meet(splat, ray, real(wp.static(least)))
-            if g0 > real(0.0) and q < splat.cut:
-                alpha = wp.min(splat.opacity * wp.exp(real(-0.5) * q), real(rules.alpha_max))
+            g0, g1, g2, n, square = meet(splat, ray, real(wp.static(least)))
+            if g0 > real(0.0) and n < splat.cut * square:
+                inverse = real(1.0) / square
+                alpha = wp.min(splat.opacity * wp.exp(real(-0.5) * n * inverse), real(rules.alpha_max))
                 weight = alpha * transmittance
                 transmittance = behind(transmittance, alpha, rules.rule)
                 total += weight
