@@ -438,15 +438,16 @@ def test_a_second_backward_on_the_tape_adds_the_same_gradients_again(kind):
     tape.zero()
     tape.backward(loss)
     for name, array in arrays.items():
-        assert np.array_equal(array.grad.numpy(), once[name]), name
+        assert np.allclose(array.grad.numpy(), once[name], rtol=1e-12, atol=1e-14), name
 
 
 @EVERY
 def test_gradients_do_not_depend_on_the_number_of_threads(kind, monkeypatch):
     both = []
-    for count in (1, 2):
+    for count in (1, 2):  # of a CPU: a GPU adds in any order
         monkeypatch.setattr(device, "threads", lambda count=count: count)
-        both.append(kind(2).gradients())
+        with wp.ScopedDevice("cpu"):
+            both.append(kind(2).gradients())
     for name, gradient in both[0].items():
         assert np.array_equal(gradient, both[1][name]), name
 

@@ -192,7 +192,8 @@ def test_masked_pixels_take_no_part(problem):
     rng = np.random.default_rng(4)
     spoilt = [np.where(m[..., None], rng.random(p.shape), p) for p, m in zip(photos, masks, strict=True)]
     posed = [PosedPhotos(images, cameras, masks) for images in (photos, spoilt)]
-    one, other = (refine(start, photos, config=CONFIG) for photos in posed)
+    # A CPU's sums are the same bits from run to run.
+    one, other = (refine(start, photos, config=CONFIG, device="cpu") for photos in posed)
     assert np.array_equal(one.sh, other.sh) and np.array_equal(one.means, other.means)
 
 

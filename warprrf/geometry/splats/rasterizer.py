@@ -23,7 +23,7 @@ from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.kernels.raster import binning, blocks, reference
 from warprrf.kernels.raster import project as projection
 from warprrf.kernels.raster import sh as harmonics
-from warprrf.kernels.raster.view import EXPONENTIAL, PINHOLE, PRODUCT, SPHERICAL, Rules, View
+from warprrf.kernels.raster.view import EXPONENTIAL, PINHOLE, PRODUCT, SPHERICAL, TILE, Rules, View
 
 PARTS = 8  # partial sums of gradients on a CPU, one writer each: the thread count changes nothing
 MOST_WEIGHTS = 1 << 16  # of a pixel that can be asked for
@@ -149,7 +149,6 @@ class Rasterizer:
         self.real = real
         self.per_pixel = per_pixel or self.device.is_cuda
         self.kernels = reference if self.per_pixel else blocks
-        self.tile = reference.TILE if self.per_pixel else blocks.BLOCK
         self.threads_per_tile = reference.LANES if self.per_pixel else 1
 
     def __reduce__(self) -> tuple[Callable[..., Rasterizer], tuple[()]]:
@@ -221,10 +220,12 @@ class Rasterizer:
         self._fits("quaternions", quaternions, self._vector(4), (n,))
         self._fits("scales", scales, self._vector(3), (n,))
         self._fits("opacities", opacities, self.real, (n,))
-        view = _view(cam, self.tile)
+        view = _view(cam)
         inputs = (means, quaternions, scales, opacities)
         span = wp.empty(n, dtype=wp.vec4i, device=device)
-        keys, order = (wp.empty(2 * n, dtype=int, device=device) for _ in range(2))  # sorting wants room for two
+        keys, order = (
+            wp.empty(2 * n, dtype=int, device=device) for _ in range(2)
+        )  # sorting wants room for two
         splats = wp.empty(n, dtype=projection.splat_of(self.real), device=device)
         project = projection.build_project(self.real)
         launch(project, n, [*inputs, view, self.blending.rules, span, keys, order, splats], device=device)
@@ -421,11 +422,11 @@ def _nothing(tiles: int, device: wp.Device) -> tuple[wp.array, wp.array]:
     return wp.empty(1, dtype=int, device=device), wp.zeros(tiles + 1, dtype=int, device=device)
 
 
-def _view(cam: Camera, tile: int) -> View:
+def _view(cam: Camera) -> View:
     view = View()
     view.kind = SPHERICAL if cam.kind == "spherical" else PINHOLE
     view.width, view.height = cam.width, cam.height
-    view.tile, view.tiles_x, view.tiles_y = tile, -(-cam.width // tile), -(-cam.height // tile)
+    view.tile, view.tiles_x, view.tiles_y = TILE, -(-cam.width // TILE), -(-cam.height // TILE)
     view.fx, view.fy, view.cx, view.cy = cam.fx, cam.fy, cam.cx, cam.cy
     view.rotation = wp.mat33d(cam.rotation if cam.kind == "spherical" else cam.rotation[[0, 2, 1]])
     view.origin = wp.vec3d(cam.position)

@@ -1,8 +1,8 @@
 """Blending on a CPU, 4 x 4 pixels at a time: :mod:`.reference` with one Warp vector per number of its pixels.
 
 A CPU's wide registers hold a block's numbers, so the loops over a vector's elements become one or two instructions
-each. A block is a tile of its own, with tile size ``BLOCK``, and has one thread. Loops over a block's pixels run to
-``view.tile``: to a constant they would be unrolled, and its vectors taken apart into single numbers.
+each. A block is a tile, and has one thread. Loops over its pixels run to ``view.tile``: to a constant they would be
+unrolled, and its vectors taken apart into single numbers.
 """
 
 from types import SimpleNamespace
@@ -13,10 +13,9 @@ import warp as wp
 from warprrf.cache import once
 from warprrf.kernels.raster.project import OF_FEATURES, OF_OPACITY, OF_WEIGHT, SUMS, splat_of
 from warprrf.kernels.raster.reference import keep_weight
-from warprrf.kernels.raster.view import PRODUCT, Rules, View, pixel_ray
+from warprrf.kernels.raster.view import PRODUCT, TILE, Rules, View, pixel_ray
 
-BLOCK = 4  # pixels: blocks are BLOCK x BLOCK
-PIXELS = BLOCK * BLOCK
+PIXELS = TILE * TILE
 VECTORISED = {
     # Warp's loops over a vector's 16 numbers become one instruction each if they are not unrolled first, and if the
     # rest is not put together again from single numbers.
@@ -165,11 +164,11 @@ def block_functions(real: type) -> SimpleNamespace:
         for i in range(view.tile):  # axes a and b are those of a column, c of a row
             ray = pixel_ray(view, x0 + i, y0 + i)
             for j in range(view.tile):
-                a[wp.static(BLOCK) * j + i] = real(ray[0])
-                b[wp.static(BLOCK) * j + i] = real(ray[1])
-                c[wp.static(BLOCK) * i + j] = real(ray[2])
+                a[wp.static(TILE) * j + i] = real(ray[0])
+                b[wp.static(TILE) * j + i] = real(ray[1])
+                c[wp.static(TILE) * i + j] = real(ray[2])
                 if x0 + j < view.width and y0 + i < view.height:
-                    inside[wp.static(BLOCK) * i + j] = real(1.0)
+                    inside[wp.static(TILE) * i + j] = real(1.0)
         return a, b, c, inside
 
     @wp.func
@@ -258,8 +257,8 @@ def build_blend(real: type, width: int) -> Any:
         peak_out: wp.array(dtype=real, ndim=2),
     ):
         tile = offset + wp.tid()
-        x0 = (tile % view.tiles_x) * wp.static(BLOCK)
-        y0 = (tile / view.tiles_x) * wp.static(BLOCK)
+        x0 = (tile % view.tiles_x) * wp.static(TILE)
+        y0 = (tile / view.tiles_x) * wp.static(TILE)
         a, b, c, transmittance = rays(view, x0, y0)
         amax = per_pixel(real(rules.alpha_max))
         tmin = per_pixel(real(rules.transmittance_min))
@@ -294,8 +293,8 @@ def build_blend(real: type, width: int) -> Any:
             peak = where_positive(weight - best, t, peak)
             best = higher(best, weight)
         for i in range(view.tile * view.tile):
-            x = x0 + i % wp.static(BLOCK)
-            y = y0 + i / wp.static(BLOCK)
+            x = x0 + i % wp.static(TILE)
+            y = y0 + i / wp.static(TILE)
             if x < view.width and y < view.height:
                 for channel in range(wp.static(width)):
                     image[y, x, first + channel] = (
@@ -347,8 +346,8 @@ def build_adjoint(real: type, width: int) -> Any:
     ):
         tile = offset + wp.tid()
         part = parts[tile]
-        x0 = (tile % view.tiles_x) * wp.static(BLOCK)
-        y0 = (tile / view.tiles_x) * wp.static(BLOCK)
+        x0 = (tile % view.tiles_x) * wp.static(TILE)
+        y0 = (tile / view.tiles_x) * wp.static(TILE)
         a, b, c, transmittance = rays(view, x0, y0)
         amax = per_pixel(real(rules.alpha_max))
         tmin = per_pixel(real(rules.transmittance_min))
@@ -359,8 +358,8 @@ def build_adjoint(real: type, width: int) -> Any:
         of_range = per_pixel()
         rest = per_pixel()
         for i in range(view.tile * view.tile):
-            x = x0 + i % wp.static(BLOCK)
-            y = y0 + i / wp.static(BLOCK)
+            x = x0 + i % wp.static(TILE)
+            y = y0 + i / wp.static(TILE)
             if x < view.width and y < view.height:
                 if first == 0 and alphas[y, x] > real(0.0):
                     per_weight = depth_grad[y, x] / alphas[y, x]
@@ -435,8 +434,8 @@ def build_strongest(real: type) -> Any:
         total_out: wp.array(dtype=real, ndim=2),
     ):
         tile = offset + wp.tid()
-        x0 = (tile % view.tiles_x) * wp.static(BLOCK)
-        y0 = (tile / view.tiles_x) * wp.static(BLOCK)
+        x0 = (tile % view.tiles_x) * wp.static(TILE)
+        y0 = (tile / view.tiles_x) * wp.static(TILE)
         a, b, c, transmittance = rays(view, x0, y0)
         amax = per_pixel(real(rules.alpha_max))
         tmin = per_pixel(real(rules.transmittance_min))
@@ -459,13 +458,13 @@ def build_strongest(real: type) -> Any:
             total += weight
             for i in range(view.tile * view.tile):
                 if weight[i] > real(0.0):
-                    x = x0 + i % wp.static(BLOCK)
-                    y = y0 + i / wp.static(BLOCK)
+                    x = x0 + i % wp.static(TILE)
+                    y = y0 + i / wp.static(TILE)
                     t = splat.reach * g0[i] * inverse[i] * wp.sqrt(a[i] * a[i] + b[i] * b[i] + c[i] * c[i])
                     kept[i] = keep_weight(index, weight_out, range_out, y, x, kept[i], k, weight[i], t)
         for i in range(view.tile * view.tile):
-            x = x0 + i % wp.static(BLOCK)
-            y = y0 + i / wp.static(BLOCK)
+            x = x0 + i % wp.static(TILE)
+            y = y0 + i / wp.static(TILE)
             if x < view.width and y < view.height:
                 total_out[y, x] = total[i]
 

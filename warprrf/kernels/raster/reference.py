@@ -2,6 +2,8 @@
 
 A GPU runs these. On a CPU :mod:`.blocks` computes the same 16 pixels at a time, and tests compare the two. Threads go
 tile by tile; a tile's entries ``ids[starts[tile]:starts[tile + 1]]`` are the Gaussians that it may see, near to far.
+What a GPU waits for is memory: its 16 threads of a tile each fetch one of the 16 rows that all of them walk next
+(:func:`touch`), and what they add to a Gaussian is summed before it leaves the warp (:func:`build_add`).
 """
 
 from typing import Any
@@ -10,11 +12,10 @@ import warp as wp
 
 from warprrf.cache import once
 from warprrf.kernels.raster.project import OF_FEATURES, OF_OPACITY, OF_WEIGHT, SUMS, splat_of
-from warprrf.kernels.raster.view import PRODUCT, Rules, View, pixel_of, pixel_ray
+from warprrf.kernels.raster.view import PRODUCT, TILE, Rules, View, pixel_of, pixel_ray
 
 
-TILE = 4  # pixels: side of a tile, whose 16 lanes walk its list together; a warp has two tiles
-LANES = TILE**2
+LANES = TILE**2  # threads of a tile, which walk its list together
 
 
 @wp.func

@@ -6,6 +6,8 @@ taken where they are cheapest: on the image plane of a photo, on the cylinder ro
 
 import warp as wp
 
+TILE = 4
+"""Pixels: side of a tile, which has one list of Gaussians. A CPU's thread blends a tile, a GPU's warp two."""
 PINHOLE, SPHERICAL = 0, 1
 PRODUCT, EXPONENTIAL = 0, 1  # transmittance rules: prod(1 - alpha), or the paper's exp(-sum alpha)
 
@@ -21,7 +23,7 @@ class View:
     kind: int
     width: int
     height: int
-    tile: int  # tiles are tile x tile pixels
+    tile: int  # TILE, where it must not be a constant
     tiles_x: int
     tiles_y: int
     fx: wp.float64
@@ -59,10 +61,10 @@ def pixel_ray(view: View, x: int, y: int):
 @wp.func
 def pixel_of(thread: int, view: View):
     """Tile, column and row of the pixel of a thread; threads go tile by tile, row by row in each."""
-    area = view.tile * view.tile
-    tile = thread / area
-    x = (tile % view.tiles_x) * view.tile + (thread % area) % view.tile
-    y = (tile / view.tiles_x) * view.tile + (thread % area) / view.tile
+    tile = thread / wp.static(TILE * TILE)
+    place = thread % wp.static(TILE * TILE)
+    x = (tile % view.tiles_x) * wp.static(TILE) + place % wp.static(TILE)
+    y = (tile / view.tiles_x) * wp.static(TILE) + place / wp.static(TILE)
     return tile, x, y
 
 
