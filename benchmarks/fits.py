@@ -90,7 +90,7 @@ class Fits:
         total: list[float] = []
 
         def predict(receiver: np.ndarray) -> Any:
-            found = field.spectrum(receiver)
+            found = field.spectrum(receiver, test.transmitter)
             total.append(float(found.path_gain.sum()))
             return found
 

@@ -14,7 +14,6 @@ from warprrf.cache import once
 from warprrf.kernels.raster.project import OF_FEATURES, OF_OPACITY, OF_WEIGHT, SUMS, splat_of
 from warprrf.kernels.raster.view import PRODUCT, TILE, Rules, View, pixel_of, pixel_ray
 
-
 LANES = TILE**2  # threads of a tile, which walk its list together
 
 
