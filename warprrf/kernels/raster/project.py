@@ -155,7 +155,7 @@ CHANNELS = 4  # feature channels blended by one launch
 # first nine lack the factor -opacity/2, and 1/|M m| for each first component of y but its sign: `chain` multiplies
 # once.
 OF_OPACITY, OF_FEATURES, OF_WEIGHT = 9, 10, 14
-SUMS = 16  # one is free
+SUMS = 16  # as many as a tile has pixels, each of which adds up one on a GPU; the last is free
 sums_d = wp.types.vector(SUMS, wp.float64)
 LAST = 2147483647
 # Stays finite where scales are near the smallest number: zero offset times infinity would be NaN.
