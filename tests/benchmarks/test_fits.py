@@ -30,6 +30,8 @@ def test_a_field_is_asked_under_the_transmitter_of_what_it_is_scored_on(tmp_path
     scene, own = wr.Scene.load(room / "scene.xml"), wr.SpectrumDataset.load(room / "spectra.nc")
     field = wr.RadioField.fit(scene, own, model="bistatic", quick=True, device="cpu")
     link = {"frequency_hz": own.frequency_hz, "shape": own.shape, "beam_sigma_rad": own.beam_sigma_rad}
-    other = wr.simulate(scene, transmitter=(4.5, 3.4, 0.6), receivers=own.receivers[10:], device="cpu", **link)
+    other = wr.simulate(
+        scene, transmitter=(4.5, 3.4, 0.6), receivers=own.receivers[10:], device="cpu", **link
+    )
     asked = fits.Fits(Job(tmp_path, device="cpu"), None, "")
     assert asked.score(field, other)["total_rms_db"] < 1.0
