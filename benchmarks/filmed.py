@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 import warprrf as wr
+from benchmarks.machine import machine
 from benchmarks.report import Report, table
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.device import Progress, require
@@ -247,7 +248,7 @@ def run(options: Options, job: Job) -> Report:
         device=job.device,
     )
     seconds = time.perf_counter() - start
-    figures: dict[str, Any] = {"frames": len(photos), "posed": len(rec.cameras)}
+    figures: dict[str, Any] = {"machine": machine(job.device), "frames": len(photos), "posed": len(rec.cameras)}
     if fresh:  # else some steps were there already
         figures["seconds"] = seconds
     taken = film.poses[[photos[name] for name in rec.cameras]]
