@@ -248,7 +248,11 @@ def run(options: Options, job: Job) -> Report:
         device=job.device,
     )
     seconds = time.perf_counter() - start
-    figures: dict[str, Any] = {"machine": machine(job.device), "frames": len(photos), "posed": len(rec.cameras)}
+    figures: dict[str, Any] = {
+        "machine": machine(job.device),
+        "frames": len(photos),
+        "posed": len(rec.cameras),
+    }
     if fresh:  # else some steps were there already
         figures["seconds"] = seconds
     taken = film.poses[[photos[name] for name in rec.cameras]]

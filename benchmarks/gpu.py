@@ -118,7 +118,8 @@ def stage_2(sizes: Sizes, device: wp.Device) -> dict[str, Any]:
     scene, rng = lobby(), np.random.default_rng(0)
     receivers = wr.sample_receivers(scene, sizes.receivers, seed=0, device=device)
     ds = wr.SpectrumDataset.from_spectra(
-        receivers=receivers, transmitter=TRANSMITTER, frequency_hz=FREQUENCY_HZ, beam_sigma_rad=np.radians(2.0),
+        receivers=receivers, transmitter=np.array(TRANSMITTER), frequency_hz=FREQUENCY_HZ,
+        beam_sigma_rad=np.radians(2.0),
         path_gain=10 ** rng.uniform(-14, -12, (len(receivers), *sizes.field)),
     )  # fmt: skip
     geometry = wr.Reconstruction(discs_on_mesh(scene.mesh, sizes.discs), scene.mesh)
@@ -258,7 +259,7 @@ def _process(words: list[str]) -> tuple[str, str]:
         done = subprocess.run(words, capture_output=True, text=True, timeout=PART_LIMIT_S)
     except subprocess.TimeoutExpired:
         return "", f"stopped after {PART_LIMIT_S:.0f} s"
-    return done.stdout, "" if done.returncode == 0 else (done.stdout + done.stderr)[-4_000:]
+    return done.stdout, "" if done.returncode == 0 else done.stdout[-2_000:] + done.stderr[-2_000:]
 
 
 def _gsplat(
