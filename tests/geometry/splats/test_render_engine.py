@@ -11,8 +11,10 @@ from benchmarks.engine.scenes import panorama, photo
 from warprrf import device
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
-from warprrf.geometry.splats.rasterizer import RADIO, Blending, Rasterizer
+from warprrf.geometry.splats.rasterizer import RADIO, WARP, Blending, Rasterizer
 from warprrf.geometry.splats.render import render
+from warprrf.kernels.raster import reference
+from warprrf.kernels.raster.project import SUMS
 
 CAMERAS = {
     "pinhole": photo(70, 45),
@@ -73,6 +75,11 @@ def test_the_exponential_of_float32_errs_by_less_than_1e_6():
     q = (x / 0.01) ** 2 / (1 + x * x)
     assert q.max() > 80
     assert np.abs(found - np.exp(-q / 2)).max() < 1e-6
+
+
+def test_a_gpu_s_tiles_have_a_lane_for_each_sum_and_two_fill_a_warp():
+    """What the native code that adds up over a tile counts on."""
+    assert (reference.LANES, SUMS, WARP) == (16, 16, 32)
 
 
 OTHERS = [{"per_pixel": True}, pytest.param({"device": "cuda:0"}, marks=pytest.mark.cuda)]

@@ -223,9 +223,8 @@ class Rasterizer:
         view = _view(cam)
         inputs = (means, quaternions, scales, opacities)
         span = wp.empty(n, dtype=wp.vec4i, device=device)
-        keys, order = (
-            wp.empty(2 * n, dtype=int, device=device) for _ in range(2)
-        )  # sorting wants room for two
+        # Sorting wants room for two.
+        keys, order = (wp.empty(2 * n, dtype=int, device=device) for _ in range(2))
         splats = wp.empty(n, dtype=projection.splat_of(self.real), device=device)
         project = projection.build_project(self.real)
         launch(project, n, [*inputs, view, self.blending.rules, span, keys, order, splats], device=device)

@@ -157,7 +157,7 @@ CHANNELS = 4  # feature channels blended by one launch
 OF_OPACITY, OF_FEATURES, OF_WEIGHT = 9, 10, 14
 SUMS = 16  # as many as a tile has pixels, each of which adds up one on a GPU; the last is free
 sums_d = wp.types.vector(SUMS, wp.float64)
-LAST = 2147483647
+LAST = 2147483647  # key of what is not seen
 # Stays finite where scales are near the smallest number: zero offset times infinity would be NaN.
 STEEPEST = 1.0e15
 

@@ -244,17 +244,17 @@ def build_adjoint(real: type, width: int) -> Any:
                 of_features[c] = image_grad[y, x, first + c]
                 rest += of_features[c] * image[y, x, first + c]
         transmittance = real(1.0)
-        j = int(starts[tile])
+        begin = starts[tile]
         end = starts[tile + 1]
+        j = int(begin)
         going = inside and j < end
         others = bool(True)  # whether any lane of the warp is going on: until none is, all stay
-        step = int(0)
         while others:
             s = sums_of_one()
             seen = bool(False)
             k = int(0)
             if j < end:
-                if step % wp.static(LANES) == 0:
+                if (j - begin) % wp.static(LANES) == 0:
                     transmittance += touch(splats, ids, j + lane, end)
                 k = ids[j]
                 splat = splats[k]
@@ -288,7 +288,6 @@ def build_adjoint(real: type, width: int) -> Any:
                     s = pair_sums(s, slope, q, y1, y2, h0, h1, h2, weight)
                     transmittance = behind(transmittance, alpha, rules.rule)
             j += 1
-            step += 1
             going = going and j < end and transmittance > real(rules.transmittance_min)
             others = add(sums, part, k, s, seen, going)
 
