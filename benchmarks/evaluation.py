@@ -139,11 +139,11 @@ def run(options: Options, job: Job) -> Report:
     }
     kept = read_json(file) if file.is_file() and not job.fresh else found
     rows = {key_of(row): row for row in unpacked(kept)}
-    other = next((r for r in rows.values() if r["truth"] == lab.name and r["data"] != lab.key), None)
-    if other is not None:
+    known = {row["data"] for row in rows.values() if row["truth"] == lab.name}
+    if known and lab.key not in known:
         raise ValueError(
-            f"name: {file} holds runs of {lab.name} on other data ({other['data']}, not {lab.key}); expected --fresh, or "
-            "another --name"
+            f"name: {file} holds runs of {lab.name} on other data ({', '.join(sorted(known))}, not {lab.key}); expected "
+            "--fresh, or another --name"
         )
     planned = {key_of(about): about for about in lab.planned()}
     asked = [key for key, about in planned.items() if not lab.holds(rows.get(key), about["method"])]

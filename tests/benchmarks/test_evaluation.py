@@ -89,6 +89,20 @@ def test_data_sets_of_any_room_stand_beside_each_other_and_no_run_is_done_twice(
     assert done == ["cgan", "nearest", "idw"]
 
 
+def test_a_name_stands_for_data_that_some_of_its_runs_are_of(data, tmp_path):
+    first = evaluate(tmp_path, data, methods=("nearest",))
+    ds = wr.SpectrumDataset.load(data / "spectra.nc")
+    ds.subset(np.arange(1, len(ds))).save(tmp_path / "fewer.nc")
+    fewer = {"data": str(tmp_path / "fewer.nc"), "name": "spectra", "counts": (3,), "methods": ("idw",)}
+    with pytest.raises(ValueError, match="name: .*holds runs of spectra on other data"):
+        evaluate(tmp_path, data, **fewer)
+    assert json.loads((tmp_path / "paper.json").read_text()) == first
+    more = evaluate(tmp_path / "fewer", data, **fewer)
+    both = first | {"runs": first["runs"] + more["runs"]}
+    (tmp_path / "paper.json").write_text(json.dumps(both))
+    assert evaluate(tmp_path, data, **fewer) == both | {"machine": more["machine"]}
+
+
 def test_a_killed_command_loses_the_run_at_work_and_says_what_is_missing(data, tmp_path):
     def killed(stage, done, total):
         if (stage, done) == ("runs", 1):

@@ -200,8 +200,11 @@ def _paper_statement() -> str:
 
 @entry("paper-runs")
 def _paper_runs() -> str:
-    hashes = {r["truth"]: r["data"] for r in runs()} | {"paper-law": read("law")["data"]}
-    data = "; ".join(f"{name} {hashes[truth]}" for truth, name in PAPER_TRUTHS.items())
+    hashes = {(r["truth"], r["data"]): None for r in runs()} | {("paper-law", read("law")["data"]): None}
+    data = "; ".join(
+        f"{name} {', '.join(own for truth, own in hashes if truth == known)}"
+        for known, name in PAPER_TRUTHS.items()
+    )
     missing_runs = read("paper")["missing"]
     left = f" Runs not made: {len(missing_runs)}." if missing_runs else ""
     rooms = {r["room"] for r in runs() if r["truth"] in ("exact", "sionna")}
