@@ -63,7 +63,6 @@ from warprrf.rf.fields.bistatic.options import SUB_PIXELS, FitOptions
 from warprrf.rf.fields.bistatic.paths import paths_of, strongest
 from warprrf.rf.fields.bistatic.suggest import SHAPE as SUGGEST_SHAPE
 from warprrf.rf.fields.bistatic.suggest import Pointings, Sensitivity, Unknowns, suggest
-from warprrf.rf.fields.bistatic.training import TrainingViews
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
 from warprrf.rf.fields.location import Location
 from warprrf.rf.maps.links import LinkOptions, Links
@@ -175,7 +174,6 @@ class BistaticField(RadioField):
         model: str = "bistatic",
         *,
         options: FitOptions | None = None,
-        views: TrainingViews | None = None,
         client: Any = None,
         device: DeviceLike = None,
         progress: Progress | None = None,
@@ -189,7 +187,6 @@ class BistaticField(RadioField):
                 Without any receiver the field is what is known beforehand.
             model: ``"bistatic"``.
             options: what is modelled and how it is fitted.
-            views: what :func:`warprrf.rf.fields.bistatic.training.trace` found for exactly these receivers.
             client: a ``dask.distributed.Client`` whose workers cast the rays; this process by default.
             device: where rays are cast.
             progress: called with the stages ``"patches"``, ``"mirrors"``, ``"transport"`` and ``"fit"``.
@@ -197,8 +194,8 @@ class BistaticField(RadioField):
                 ``options``: ``quick=True``, ``effects="room"``, ``relevance=found``, ...
 
         Raises:
-            ValueError: for options out of range, receivers on a surface or outside the scene, spectra that are all
-                empty, or ``views`` of others.
+            ValueError: for options out of range, receivers on a surface or outside the scene, or spectra that are all
+                empty.
             TypeError: for a geometry without a mesh, or an unknown option.
         """
         chosen, data = with_settings(options or FitOptions(), settings), as_list(ds)
@@ -206,13 +203,13 @@ class BistaticField(RadioField):
             raise ValueError(f"model: got {model!r}, expected 'bistatic'")
         if not any(map(len, data)):
             return cls._unmeasured(geometry, data, chosen, device)
-        found = fit(geometry, data, chosen, views=views, client=client, device=device, progress=progress)
+        found = fit(geometry, data, chosen, client=client, device=device, progress=progress)
         frame = frame_of(data)
         ends = np.concatenate([np.column_stack(kind.ends()) for kind in kinds_of(data)])
         ends = ends[np.sort(np.unique(ends, axis=0, return_index=True)[1])]
         receivers = ends[(ends[:, :3] == frame.transmitter).all(axis=1), 3:]
         fitted = replace(
-            cls.prior(found.surface, frame, effects=found.model.effects, sub_pixels=found.sub_pixels, device=device),
+            cls.prior(found.surface, frame, effects=found.model.effects, sub_pixels=chosen.rays, device=device),
             parameters=replace(found.model.parameters, log_gains=np.zeros(0)), residual=found.model.residual,
             material=found.material, errors=found.errors, report=found.report, fitted_on=ends[:, 3:],
             fitted_under=ends[:, :3],

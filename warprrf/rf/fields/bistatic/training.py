@@ -96,22 +96,6 @@ class TrainingViews:
         """Surface, transmitter and grid of the first place."""
         return self.views[0].tracer
 
-    def subset(self, indices: Sequence[int] | np.ndarray) -> TrainingViews:
-        """Some of its places."""
-        chosen = [int(i) for i in indices]
-        return replace(self, places=[self.places[i] for i in chosen], views=[self.views[i] for i in chosen])
-
-    def check(self, places: Sequence[Place], sub_pixels: int | None) -> None:
-        """Raise ValueError if they are not those of exactly ``places``."""
-        same = len(self.places) == len(places) and all(
-            a.seen_from == b.seen_from for a, b in zip(self.places, places, strict=True)
-        )
-        if not same or sub_pixels not in (None, self.tracer.grid.sub_pixels):
-            raise ValueError(
-                f"views: got what {len(self.views)} receivers see with {self.tracer.grid.per_pixel} rays a pixel; "
-                f"expected exactly the {len(places)} receivers, transmitter, carrier, grid, beam, air and rays of this fit"
-            )
-
 
 def trace(
     geometry: GeometryLike,
@@ -291,7 +275,7 @@ class Training:
         rng: np.random.Generator,
         progress: Progress | None = None,
     ) -> Training:
-        """What ``data`` holds of the places that decide, or of all if those are ``seen``."""
+        """What ``data`` holds of the places that decide, where that is ``seen``."""
         frequency_hz = frame_of(data).frequency_hz
         candidates = _possible(options.candidates(frequency_hz), seen.effects, data)
         steps = 4 + len(candidates) + MERGES + (2 * split.count if split.count <= FEW else 3)
@@ -299,9 +283,7 @@ class Training:
             options, candidates, seen.tracer.surface, split, {}, {},
             chains_of(seen.places), data, options.exponents(frequency_hz), _Steps(progress, split.count, steps),
         )  # fmt: skip
-        return found.and_at(
-            split.deciding if len(seen.places) < split.count else np.arange(split.count), seen, rng
-        )
+        return found.and_at(split.deciding, seen, rng)
 
     def and_at(self, places: np.ndarray, seen: TrainingViews, rng: np.random.Generator) -> Training:
         """With what was read at ``places`` (P,), where that is ``seen``, and readings of them that parameters are fitted to."""
