@@ -70,9 +70,6 @@ class EdgePaths(Rows):
         """Path gain [linear], shape ``(L,)``."""
         return np.abs(self.amplitude) ** 2
 
-    def __len__(self) -> int:
-        return len(self.receiver)
-
     def beside(self, found: MirrorPaths) -> MirrorPaths:
         """``found`` with these paths of the same receivers, whose share is what the edge makes of the field.
 
@@ -101,7 +98,7 @@ class EdgePaths(Rows):
             self.receiver, none, none, self.point, share, self.length_m, self.excess_m, self.arrival,
             np.full_like(self.point, np.nan), zero, zero, np.full_like(zero, np.nan), self.code,
         ).of_width(count)  # fmt: skip
-        return MirrorPaths.joined([found, edges.subset(np.flatnonzero(share > 0))])
+        return MirrorPaths.joined([found, edges.take(np.flatnonzero(share > 0))])
 
 
 def patch_edges(patches: PlanarPatches) -> Edges:

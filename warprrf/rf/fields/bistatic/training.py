@@ -155,7 +155,7 @@ def trace(
         if effects is None:
             wanted = replace(wanted, mirrors=tracer.images.affordable(receivers, wanted.mirrors))
         found = tracer.paths(receivers, wanted, progress)
-        parts = [(receivers[r], found.subset(np.flatnonzero(found.receiver == r))) for r in range(len(own))]
+        parts = [(receivers[r], found.take(np.flatnonzero(found.receiver == r))) for r in range(len(own))]
         for r, view in each(partial(view_of, tracer.again, wanted, keeps), parts, client):
             views[own[r]] = tracer.adopted(view)
             tell("transport", len(views), len(places))
