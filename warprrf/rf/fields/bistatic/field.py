@@ -50,7 +50,6 @@ from warprrf.rf.fields.bistatic.locate import locate
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, read
 from warprrf.rf.fields.bistatic.needs import assumed
 from warprrf.rf.fields.bistatic.observations import (
-    Frame,
     Observation,
     Place,
     Target,
@@ -251,7 +250,7 @@ class BistaticField(RadioField):
     def prior(
         cls,
         geometry: GeometryLike,
-        ds: SpectrumDataset | Frame,
+        ds: SpectrumDataset,
         *,
         effects: Effects | None = None,
         lobes: tuple[int, ...] | None = None,
@@ -274,24 +273,23 @@ class BistaticField(RadioField):
             TypeError: for a geometry without a mesh.
         """
         surface = Surface.of(geometry)
-        rows, columns = ds.shape if isinstance(ds, Frame) else ds.path_gain.shape[1:]
         return cls(
             surface=surface,
-            transmitter=check_array("ds.transmitter", ds.transmitter, (3,)),
-            frequency_hz=float(ds.frequency_hz),
-            shape=(int(rows), int(columns)),
-            floor=float(ds.floor),
-            range_db=(float(ds.range_db[0]), float(ds.range_db[1])),
-            beam_sigma_rad=float(ds.beam_sigma_rad),
+            transmitter=ds.transmitter,
+            frequency_hz=ds.frequency_hz,
+            shape=ds.shape,
+            floor=ds.floor,
+            range_db=ds.range_db,
+            beam_sigma_rad=ds.beam_sigma_rad,
             effects=replace(SETS["single"], residual=False) if effects is None else effects,
             parameters=replace(
                 Parameters.prior(surface.groups, *([] if lobes is None else [lobes]), reciprocal=reciprocal),
-                log_through=surface.slabs(float(ds.frequency_hz))[2],
+                log_through=surface.slabs(ds.frequency_hz)[2],
             ),
             material=surface.material,
             residual=np.zeros((2, surface.cells)),
             sub_pixels=sub_pixels,
-            air=getattr(ds, "air", None),
+            air=ds.air,
             device=device,
         )
 

@@ -38,7 +38,7 @@ from warprrf.rf.positions import check_dataset, check_positions, question_unit
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings, fading_db, path_weights, question_readings
-from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, to_db
+from warprrf.rf.spectra.spectrum import to_db
 from warprrf.rf.tracing.model import SETS, Effects, Layout, Model, Parameters
 from warprrf.rf.tracing.records import Bins, Materials
 from warprrf.rf.tracing.render import PathGains, path_gains
@@ -461,14 +461,15 @@ class Kind(ABC):
         """Transmitter of each receiver and the receivers [m], shape ``(R, 3)`` each."""
         return self.one.transmitters, self.one.receivers
 
-    def frame(self) -> Frame:
+    def frame(self) -> SpectrumDataset:
         """What a field's spectra are made with, if it is the first: floor and range are those of the powers."""
         one = self.one
         floor = float(np.min(one.floor))
         levels = 10.0 * float(np.log10(floor)), 10.0 * float(np.log10(np.nanmax(one.power)))
-        return Frame(
-            one.transmitters[0], one.frequency_hz, READINGS_SHAPE, floor, levels, BEAM_SIGMA_RAD, one.air
+        none = SpectrumDataset.empty(
+            transmitter=one.transmitters[0], frequency_hz=one.frequency_hz, shape=READINGS_SHAPE, floor=floor
         )
+        return replace(none, range_db=levels, attributes={} if one.air is None else one.air.attributes)
 
 
 @dataclass(eq=False)
@@ -499,11 +500,8 @@ class _Spectra(Kind):
         target = Target(above, None if known.all() else known.astype(float))
         return Observation(place, view, self._whole[key], target, float(one.floor), robust=False)
 
-    def frame(self) -> Frame:
-        one = self.one
-        return Frame(
-            one.transmitter, one.frequency_hz, one.shape, one.floor, one.range_db, one.beam_sigma_rad, one.air
-        )  # fmt: skip
+    def frame(self) -> SpectrumDataset:
+        return self.one
 
 
 @dataclass(eq=False)
@@ -683,26 +681,9 @@ def _check_places(mesh: Mesh | None, one: Readings | ArraySpectra, device: Devic
         check_positions(mesh, transmitter, receivers, wavelength_m, names=names, device=device)
 
 
-@dataclass(frozen=True)
-class Frame:
-    """What a field's spectra are made with: those of the first data set of spectra, else defaults; and its transmitter.
-
-    Attributes:
-        transmitter: position [m], shape ``(3,)``.
-        frequency_hz, shape, floor, range_db, beam_sigma_rad, air: see :class:`SpectrumDataset`.
-    """
-
-    transmitter: np.ndarray
-    frequency_hz: float
-    shape: tuple[int, int]
-    floor: float
-    range_db: tuple[float, float]
-    beam_sigma_rad: float
-    air: Air | None
-
-
-def frame_of(data: Sequence[Measured]) -> Frame:
-    """That of the first data set of spectra, else of the first."""
+def frame_of(data: Sequence[Measured]) -> SpectrumDataset:
+    """What a field's spectra are made with, and its transmitter: the first data set of spectra, else an empty one that is like
+    the first of readings."""
     return min(kinds_of(data), key=lambda kind: not isinstance(kind, _Spectra)).frame()
 
 
