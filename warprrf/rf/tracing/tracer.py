@@ -108,11 +108,11 @@ class View:
     _beams: list[np.ndarray] = field(init=False, repr=False, default_factory=list)
 
     @property
-    def beams(self) -> np.ndarray | None:
-        """Unit beam of each path over the pixels, shape ``(L, H, W)`` float32; None where the tracer has no beam."""
+    def beams(self) -> np.ndarray:
+        """Unit beam of each path over the pixels, shape ``(L, H, W)`` float32; ValueError where the tracer has no beam."""
         sigma = self.tracer.beam_sigma_rad
         if sigma is None:
-            return None
+            raise ValueError("view: it was traced without a receiver's beam, expected one of a spectrum")
         made = (
             self._beams[0] if self._beams else unit_beams(self.paths.arrival, self.tracer.grid.shape, sigma)
         )

@@ -121,10 +121,7 @@ class SpectrumPixels(ByPixels):
 
     def of_paths(self, view: View) -> np.ndarray:
         """Each path's beam."""
-        beams = view.beams
-        if beams is None:
-            raise ValueError("view: it was traced without a receiver's beam, expected one of a spectrum")
-        beams = beams.reshape(len(beams), int(np.prod(self.beam.shape)))
+        beams = view.beams.reshape(len(view.paths), int(np.prod(self.beam.shape)))
         return beams if self.pixels is None else beams[:, self.pixels]
 
     def part(self, index: np.ndarray) -> SpectrumPixels:

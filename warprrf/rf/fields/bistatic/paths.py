@@ -82,7 +82,7 @@ def strongest(gains: PathGains, image: np.ndarray, beam_sigma_rad: float) -> tup
     point = receiver + range_m[..., None] * grid.directions[ray]
     outward = np.where(dark[..., None], 1.0, point - transmitter)
     length = np.where(dark, np.nan, np.linalg.norm(outward, axis=-1) + range_m)
-    if len(power) and view.beams is not None:
+    if len(power):
         beams = power[:, None, None] * view.beams
         which = beams.argmax(axis=0)
         diffuse = np.maximum(image - beams.sum(axis=0), 0.0)
