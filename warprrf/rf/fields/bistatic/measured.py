@@ -102,8 +102,8 @@ class SpectrumPixels(ByPixels):
 
     @property
     def alike(self) -> object:
-        """Itself: receivers of one data set have one."""
-        return id(self)
+        """Whole spectra through one beam are; of a part, itself."""
+        return id(self.beam if self.pixels is None else self)
 
     def of_bins(self, power: np.ndarray, *, quick: bool = False) -> np.ndarray:
         """Seen through the beam."""
