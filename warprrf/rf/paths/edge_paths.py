@@ -34,7 +34,6 @@ class EdgePaths(Rows):
 
     Attributes:
         receiver: Index of the receiver, shape ``(L,)``.
-        edge: Index of the edge, shape ``(L,)``.
         patch: Patch of the mirror before and of that behind the edge, -1 for none, shape ``(L, 2)``.
         code: What happens at each point, from the transmitter on: 1 mirror, 4 slab, 8 edge, 0 past the last, shape ``(L, 2)``.
         point: Where [m], shape ``(L, 2, 3)``; NaN past the last.
@@ -52,7 +51,6 @@ class EdgePaths(Rows):
     """
 
     receiver: np.ndarray
-    edge: np.ndarray
     patch: np.ndarray
     code: np.ndarray
     point: np.ndarray
@@ -298,7 +296,7 @@ class EdgeFinder:
         )
         code, point = ways.stops()
         return EdgePaths(
-            receiver, ways.edge, ways.patch, code, point, length, excess,
+            receiver, ways.patch, code, point, length, excess,
             length - np.linalg.norm(ways.end[:, 1] - ways.end[:, 0], axis=1), departure, arrival, matrix,
             size * sign / np.maximum(np.abs(sign), 1e-300), self.wavelength_m,
         )  # fmt: skip
