@@ -18,6 +18,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -43,9 +44,11 @@ from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.materials import Material
 from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import Data, Measured, RadioField, with_settings
+from warprrf.rf.fields.batches import Work
 from warprrf.rf.fields.bistatic import edited, files
 from warprrf.rf.fields.bistatic.fit import fit
-from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
+from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, links, receivers_at_once
+from warprrf.rf.fields.bistatic.links import SHAPE as LINK_SHAPE
 from warprrf.rf.fields.bistatic.locate import locate
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, read
 from warprrf.rf.fields.bistatic.needs import assumed
@@ -64,7 +67,7 @@ from warprrf.rf.fields.bistatic.suggest import SHAPE as SUGGEST_SHAPE
 from warprrf.rf.fields.bistatic.suggest import Pointings, Sensitivity, Unknowns, suggest
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
 from warprrf.rf.fields.location import Location
-from warprrf.rf.maps.links import LinkOptions, Links
+from warprrf.rf.maps.links import LinkOptions
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.antenna import Pattern
 from warprrf.rf.spectra.beam import BeamOperator, beam_operator
@@ -568,11 +571,11 @@ class BistaticField(RadioField):
         floor = self.floor * np.prod(self.shape) / np.prod(SUGGEST_SHAPE)
         return Sensitivity(tracer, self.state, materials, floor), Unknowns.of(tracer, self.material)
 
-    def trace_links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
-        """:meth:`links` at positions that were checked, several at a time."""
-        tracer = self.tracer(transmitter)
-        work = LinkTracer(tracer, self.state, self.materials_of(tracer), options, self.shape)
-        return options.in_batches(receivers, work.batch, work)
+    def _link_work(self, options: LinkOptions) -> tuple[Work, int]:
+        effects, shape = self.effects, options.shape or LINK_SHAPE
+        if options.mirror_order is not None:
+            effects = replace(effects, mirrors=min(effects.mirrors, options.mirror_order))
+        return partial(links, self, effects, shape, options.beam_sigma_rad), receivers_at_once(shape)
 
     @property
     def _beam(self) -> BeamOperator:
