@@ -17,6 +17,7 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from warprrf.device import DeviceLike, Progress
@@ -83,6 +84,12 @@ class MirrorPaths(Rows):
     def in_sight(self) -> np.ndarray:
         """Which are line of sight, shape ``(L,)``."""
         return (self.order == 0) & (self.slabs == 0) & ~self.over_edge
+
+    @property
+    def kind(self) -> NDArray[np.str_]:
+        """``"los"``, ``"mirror"``, ``"slab"`` or ``"edge"``, shape ``(L,)``."""
+        told = [self.over_edge, self.slabs > 0, self.order > 0]
+        return np.select(told, ["edge", "slab", "mirror"], "los").astype("<U7")
 
     @property
     def slabs(self) -> np.ndarray:

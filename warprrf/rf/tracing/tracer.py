@@ -124,6 +124,12 @@ class View:
         """Surface cell that each ray meets, shape ``(R K,)``; any where it meets nothing."""
         return self.tracer.surface.cell.take(self.hits.face, mode="wrap")
 
+    @property
+    def outward(self) -> np.ndarray:
+        """Way of each path of one receiver from the transmitter to its first point [m], shape ``(L, 3)``."""
+        first = self.paths.point[:, 0]
+        return np.where(np.isnan(first), self.receivers[0], first) - self.tracer.transmitter
+
     def single_bounce_m(self) -> np.ndarray:
         """Length from the transmitter over what each ray meets to the receiver [m], shape ``(R K,)``; 0 where that is nothing."""
         ray = np.flatnonzero(self.hits.face >= 0)

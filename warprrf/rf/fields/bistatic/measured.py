@@ -136,9 +136,7 @@ each, shape ``(N, K)``."""
 
 def direct_paths(view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Directions of arrival and departure (L, 3) and delays (L,) [s] of one receiver's line of sight and mirror paths."""
-    paths, transmitter = view.paths, view.tracer.transmitter
-    first = paths.point[:, 0]
-    toward = np.where(np.isnan(first), view.receivers[0], first) - transmitter
+    paths, toward = view.paths, view.outward
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     return paths.arrival, toward, paths.delay_m / SPEED_OF_LIGHT
 
