@@ -239,15 +239,6 @@ class Tracer:
 
         return _TRACED.get(key, make)
 
-    @property
-    def again(self) -> Callable[[], Tracer]:
-        """Makes the same again, in another process: it holds the surface, not what was traced."""
-        g = self._first_grid
-        return partial(
-            Tracer.of, self.surface, self.transmitter, self.frequency_hz, g.shape, g.sub_pixels,
-            beam_sigma_rad=self.beam_sigma_rad, loss_per_m=g.loss_per_m, device=str(g.device),
-        )  # fmt: skip
-
     def on_grid(self, shape: tuple[int, int], sub_pixels: int) -> Tracer:
         """The same for receivers with other rays and no beams; what belongs to the transmitter is shared."""
         other, g = copy(self), self.grid
@@ -522,10 +513,11 @@ class Tracer:
 
 
 def view_of(
-    again: Callable[[], Tracer], effects: Effects, keeps: bool, part: tuple[np.ndarray, MirrorPaths]
+    make: Callable[[], Tracer], effects: Effects, keeps: bool, part: tuple[np.ndarray, MirrorPaths]
 ) -> View:
-    """What a receiver (3,) of known line of sight and mirror paths sees, without what all receivers share."""
-    view = again().view(part[0], effects, paths=part[1], keeps=keeps)
+    """What a receiver (3,) of known line of sight and mirror paths sees, without what all receivers share; ``make`` makes their
+    tracer, in another process too."""
+    view = make().view(part[0], effects, paths=part[1], keeps=keeps)
     view.traced(effects if keeps else SETS["single"])
     none: dict[str, Any] = {"directions": None, "solid_angle": None}
     return replace(view, tracer=None, hits=replace(view.hits, **none))  # type: ignore[arg-type]

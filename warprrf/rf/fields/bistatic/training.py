@@ -17,7 +17,7 @@ import numpy as np
 from warprrf.cache import cached_property
 from warprrf.checks import check_count
 from warprrf.cluster import each
-from warprrf.device import DeviceLike, Progress
+from warprrf.device import DeviceLike, Progress, resolve
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.fields.base import Data, Measured
@@ -147,16 +147,17 @@ def trace(
     for own in together.values():
         first = places[own[0]]
         loss_per_m = 0.0 if first.air is None else first.air.loss_per_m(first.frequency_hz)
-        tracer = Tracer.of(
-            surface, first.transmitter, first.frequency_hz, first.shape, sub_pixels,
-            beam_sigma_rad=first.beam_sigma_rad, loss_per_m=loss_per_m, device=device,
+        make = partial(
+            Tracer.of, surface, first.transmitter, first.frequency_hz, first.shape, sub_pixels,
+            beam_sigma_rad=first.beam_sigma_rad, loss_per_m=loss_per_m, device=str(resolve(device)),
         )  # fmt: skip
+        tracer = make()
         receivers = np.stack([places[k].receiver for k in own])
         if effects is None:
             wanted = replace(wanted, mirrors=tracer.images.affordable(receivers, wanted.mirrors))
         found = tracer.paths(receivers, wanted, progress)
         parts = [(receivers[r], found.take(np.flatnonzero(found.receiver == r))) for r in range(len(own))]
-        for r, view in each(partial(view_of, tracer.again, wanted, keeps), parts, client):
+        for r, view in each(partial(view_of, make, wanted, keeps), parts, client):
             views[own[r]] = tracer.adopted(view)
             tell("transport", len(views), len(places))
     seconds = time.perf_counter() - started
