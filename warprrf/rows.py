@@ -13,6 +13,9 @@ import numpy as np
 class Rows:
     """A table. What is no array is of all rows."""
 
+    def __len__(self) -> int:
+        return len(getattr(self, self._columns[0]))
+
     def take(self, rows: Any) -> Self:
         """The rows ``rows``: indices, a mask or a slice."""
         return replace(self, **{name: getattr(self, name)[rows] for name in self._columns})

@@ -9,12 +9,18 @@ import numpy as np
 import warprrf as wr
 from benchmarks.arrays import ARRAY, SHAPE, _fields, hemisphere, normalised
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.observations import Frame
+from warprrf.rf.spectra.dataset import SpectrumDataset
 
 
 def test_a_field_comes_nearer_to_pictures_of_darker_walls_than_its_start():
     scene, places = furnished.furnished(), furnished.RECEIVERS[:3]
-    frame = Frame(furnished.TX, 28e9, (30, 60), 1e-14, (-140.0, -60.0), furnished.SIGMA, None)
+    frame = SpectrumDataset.empty(
+        transmitter=furnished.TX,
+        frequency_hz=28e9,
+        shape=(30, 60),
+        beam_sigma_rad=furnished.SIGMA,
+        floor=1e-14,
+    )
     single = wr.Effects(mirrors=1, scatterings=1, transmissions=0, diffractions=0, residual=False)
     start = BistaticField.prior(scene, frame, effects=single)
     darker = replace(start.parameters, log_mirror=start.parameters.log_mirror - 3.0)

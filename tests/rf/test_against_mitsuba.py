@@ -23,8 +23,8 @@ from sionna_room import sionna_or_skip
 import warprrf as wr
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.observations import Frame
 from warprrf.rf.spectra.beam import beam_operator
+from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.tracing.model import Effects, Parameters
 from warprrf.rf.tracing.render import PathGains
 
@@ -34,7 +34,13 @@ BEAM_RAD = np.radians(2.0)
 def sequences(link: Link) -> dict[str, np.ndarray]:
     """Ours: path gain of specular paths, shape ``(L,)``, and of others per pixel, before any beam, shape ``(H, W)``."""
     scene = wr.Scene(link.mesh, [wr.Material(name, ()) for name in ("scatter", "mirror", "black")], link.does)
-    frame = Frame(link.transmitter, link.frequency_hz, link.shape, 1e-17, (-170.0, -60.0), BEAM_RAD, None)
+    frame = SpectrumDataset.empty(
+        transmitter=link.transmitter,
+        frequency_hz=link.frequency_hz,
+        shape=link.shape,
+        beam_sigma_rad=BEAM_RAD,
+        floor=1e-17,
+    )
     no = -40.0  # ln of what is not there
     shares = (
         np.array([[0.0], [no], [no]]),

@@ -274,7 +274,7 @@ class ExactEngine:
             image = self.surface.images(tracer.transmitter)[0][patch[chosen, 0]]
             light = tracer.grid.light_through(rays.hits, image, ray[row[chosen]])
             k = np.flatnonzero(light.strength > 0)
-            own, image, mirrors = row[chosen][k], image[k], mirrors.subset(k)
+            own, image, mirrors = row[chosen][k], image[k], mirrors.take(k)
             way, plane = point[own] - image, self.surface.plane_normal[patch[chosen, 0][k]]
             before = tracer.specular(mirrors).interactions
             seen = Rays(rays.hits, np.arange(len(rays.ray)))

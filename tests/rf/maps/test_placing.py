@@ -9,9 +9,9 @@ from furnished import SHAPE, SIGMA, TX, F
 
 import warprrf as wr
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.observations import Frame
 from warprrf.rf.maps.placing import best_set
 from warprrf.rf.maps.radio_map import MapOptions, radio_map
+from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.tracing.model import Effects
 
 CANDIDATES = np.array(
@@ -28,7 +28,9 @@ BY_DEFINITION = {
 
 @pytest.fixture(scope="module")
 def field(scene):
-    known = Frame(TX, F, SHAPE, 1e-16, (-150.0, -90.0), SIGMA, None)
+    known = SpectrumDataset.empty(
+        transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA, floor=1e-16
+    )
     return BistaticField.prior(scene, known, effects=Effects(mirrors=1, scatterings=1, residual=False))
 
 

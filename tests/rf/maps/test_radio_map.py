@@ -11,9 +11,9 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.observations import Frame
 from warprrf.rf.maps.links import BeamSearch, directivity, links_of
 from warprrf.rf.maps.radio_map import QUANTITIES, RadioMap, is_free
+from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_solid_angles
 from warprrf.rf.tracing.model import Effects
 from warprrf.rf.tracing.surface import Surface
@@ -24,7 +24,9 @@ PLACES = RECEIVERS[[0, 1, 3, 5, 9]]
 
 
 def prior(scene, effects):
-    known = Frame(TX, F, SHAPE, 1e-16, (-150.0, -90.0), SIGMA, None)
+    known = SpectrumDataset.empty(
+        transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA, floor=1e-16
+    )
     return BistaticField.prior(scene, known, effects=effects)
 
 

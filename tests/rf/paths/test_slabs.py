@@ -12,9 +12,9 @@ from warprrf.rf.em.materials import Material, itu_material
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine, together
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.observations import Frame
 from warprrf.rf.paths.trace import trace_paths
 from warprrf.rf.scene import Scene
+from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.tracing.model import Effects
 
 F, TX, RX = 28e9, np.array([-2.0, 0.0, 1.5]), np.array([2.0, 0.4, 1.2])
@@ -176,7 +176,9 @@ def test_spectra_do_not_jump_at_a_shadow_s_boundary():
 @pytest.mark.parametrize(("kind", "most"), [("edge", 0), ("edge", 2), ("slab", 2)])
 def test_a_field_s_paths_through_slabs_and_over_edges_are_those_that_are_traced(kind, most):
     """Points, what happens there, and delays, those of slabs included."""
-    frame = Frame(TX, F, (18, 36), 1e-20, (-200.0, 0.0), 0.1, None)
+    frame = SpectrumDataset.empty(
+        transmitter=TX, frequency_hz=F, shape=(18, 36), beam_sigma_rad=0.1, floor=1e-20
+    )
     effects = Effects(mirrors=1, transmissions=most, diffractions=1)
     own = BistaticField.prior(SHEET, frame, effects=effects).paths(RX)
     mine, known = (

@@ -443,10 +443,6 @@ def codebook_of(name: str, value: Ends) -> Codebook:
     return dft_codebook(array)
 
 
-def _isotropic(array: PlanarArray) -> bool:
-    return isinstance(array.element.pattern, str) and array.element.pattern == "isotropic"
-
-
 def squared(values: np.ndarray) -> np.ndarray:
     """Squared moduli of complex ``values``."""
     return values.real**2 + values.imag**2

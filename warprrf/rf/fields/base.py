@@ -38,7 +38,7 @@ from warprrf.rf.channel.response import LinkOptions as LinkEnds
 from warprrf.rf.channel.response import frequency_response
 from warprrf.rf.em.absorption import Air, Gas
 from warprrf.rf.em.waves import CARRIERS_HZ, SPEED_OF_LIGHT
-from warprrf.rf.fields.batches import Batch
+from warprrf.rf.fields.batches import Batch, Work
 from warprrf.rf.fields.location import Location
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
@@ -415,12 +415,7 @@ class RadioField(ABC):
             TypeError: for an unknown option.
         """
         ends, asked = self.check_positions(receivers, transmitter), LinkOptions(**options)
-        rows, found = np.zeros(0, int), []
-        for source, own in ends.groups():
-            tell = asked.progress and partial(_progress_after, asked.progress, len(rows), len(ends.receivers))
-            found.append(self.trace_links(ends.receivers[own], source, replace(asked, progress=tell)))
-            rows = np.concatenate([rows, own])
-        return Links.joined(found)[0 if ends.single else np.argsort(rows)]
+        return self.trace_links(ends, asked)[0 if ends.single else slice(None)]
 
     def slope(
         self,
@@ -546,14 +541,21 @@ class RadioField(ABC):
             )  # fmt: skip
         return ends
 
-    def trace_links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
-        """:meth:`links` at positions that were checked: from paths, one receiver at a time."""
+    def trace_links(self, ends: Ends, options: LinkOptions) -> Links:
+        """:meth:`links` at positions that were checked."""
+        work, at_once = self._link_work(options)
+        batch = Batch("links", ends, None, options.client, options.progress, at_once=at_once)
+        rows, found = zip(*batch.each(work), strict=True)
+        return Links.joined(found).take(np.argsort(np.concatenate(rows)))
+
+    def _link_work(self, options: LinkOptions) -> tuple[Work, int]:
+        """What finds links, and of how many receivers at once: from paths, one receiver at a time."""
         if options.mirror_order is not None:
             raise ValueError(
                 f"mirror_order: got {options.mirror_order!r}, but a field of model {self.model!r} has no mirrors"
             )
         shape, sigma = check_shape(options.shape or self.shape), options.beam_sigma_rad
-        return options.in_batches(receivers, 1, partial(_links, self, transmitter, shape, sigma))
+        return partial(_links, self, shape, sigma), 1
 
     def radio_map(
         self, height: float, cell: float = 0.25, transmitter: ArrayLike | None = None, **options: Any
@@ -653,11 +655,6 @@ def _cfr(
     return {"cfr": np.stack(found)}
 
 
-def _progress_after(progress: Progress, before: int, total: int, stage: str, done: int, _: int) -> None:
-    """Progress of a part, after ``before`` of ``total``."""
-    progress(stage, before + done, total)
-
-
 def _sampled(option: Any) -> Any:
     """An option as a store is known by it: of antennas, whose patterns may be functions, their gains."""
     if isinstance(option, Antenna):
@@ -667,8 +664,6 @@ def _sampled(option: Any) -> Any:
     return option
 
 
-def _links(
-    field: RadioField, transmitter: np.ndarray, shape: tuple[int, int], sigma: float, receivers: np.ndarray
-) -> Links:
+def _links(field: RadioField, shape: tuple[int, int], sigma: float, part: Part) -> Links:
     search = BeamSearch(shape, sigma, device=field.device)
-    return links_of([field.paths(receiver, transmitter) for receiver in receivers], search)
+    return links_of(_paths(field, None, part), search)

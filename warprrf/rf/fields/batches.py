@@ -30,6 +30,7 @@ class Batch:
         ends: places that were checked.
         store, client, progress: where they are gathered and computed, and who is told; see :meth:`RadioField.spectra`.
         row_bytes: of one receiver's answer.
+        at_once: most receivers of a part; :data:`AT_ONCE` by default.
     """
 
     stage: str
@@ -38,11 +39,12 @@ class Batch:
     client: Any
     progress: Progress | None
     row_bytes: int = 0
+    at_once: int | None = None
 
     def parts(self) -> list[np.ndarray]:
         """Receivers that are asked together, under one transmitter: always the same, so that so are the answers."""
         part_bytes = 64_000_000  # of its answers at most
-        most = max(1, min(AT_ONCE, part_bytes // max(1, self.row_bytes)))
+        most = max(1, min(self.at_once or AT_ONCE, part_bytes // max(1, self.row_bytes)))
         return [own[k : k + most] for _, own in self.ends.groups() for k in range(0, len(own), most)]
 
     def each(self, work: Work, missing: np.ndarray | None = None) -> Iterator[tuple[np.ndarray, Any]]:

@@ -8,14 +8,13 @@ pixels of a grid for what is diffuse.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from warprrf.checks import check_choice, checked, one_line
-from warprrf.cluster import each
 from warprrf.device import Progress
 from warprrf.rf.channel.dispersion import delay_spread
 from warprrf.rf.paths.path_set import Paths
@@ -79,16 +78,6 @@ class LinkOptions:
             object.__setattr__(self, "shape", check_shape(self.shape))
         check_beam(self.beam_sigma_rad)
         check_choice("mirror_order", self.mirror_order, (None, 0, 1, 2, 3))
-
-    def in_batches(self, receivers: np.ndarray, batch: int, trace: Callable[[np.ndarray], Links]) -> Links:
-        """Links of ``receivers`` (R, 3), at most ``batch`` of them at a time."""
-        parts = [receivers[first : first + batch] for first in range(0, len(receivers), batch)]
-        found, done, tell = dict[int, Links](), 0, self.progress or (lambda *_: None)
-        tell("links", 0, len(receivers))
-        for k, links in each(trace, parts, self.client):
-            found[k], done = links, done + len(parts[k])
-            tell("links", done, len(receivers))
-        return Links.joined([found[k] for k in sorted(found)])
 
 
 def directivity(sigma: float, cosine: Any = 1.0) -> np.ndarray:

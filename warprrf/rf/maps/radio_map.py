@@ -21,7 +21,7 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.netcdf_files import Variable
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.maps.links import LinkOptions
-from warprrf.rf.positions import NEAR_FIELD, check_positions, ground_height, is_free
+from warprrf.rf.positions import NEAR_FIELD, Ends, check_positions, ground_height, is_free
 from warprrf.rf.spectra.spectrum import to_db
 from warprrf.tensor_files import named
 
@@ -296,7 +296,7 @@ def radio_map(
     free &= np.linalg.norm(places - source, axis=-1) > NEAR_FIELD * wavelength_m
     if not free.any():
         raise ValueError(f"bounds: no cell of the {free.size} at {height!r} m lies in the air")
-    links = field.trace_links(places[free], source, o)
+    links = field.trace_links(Ends.of(places[free], source), o)
     layers = {}
     for name in _LAYERS:
         layers[name] = np.full(free.shape, np.nan)

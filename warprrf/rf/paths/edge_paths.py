@@ -34,7 +34,6 @@ class EdgePaths(Rows):
 
     Attributes:
         receiver: Index of the receiver, shape ``(L,)``.
-        edge: Index of the edge, shape ``(L,)``.
         patch: Patch of the mirror before and of that behind the edge, -1 for none, shape ``(L, 2)``.
         code: What happens at each point, from the transmitter on: 1 mirror, 4 slab, 8 edge, 0 past the last, shape ``(L, 2)``.
         point: Where [m], shape ``(L, 2, 3)``; NaN past the last.
@@ -52,7 +51,6 @@ class EdgePaths(Rows):
     """
 
     receiver: np.ndarray
-    edge: np.ndarray
     patch: np.ndarray
     code: np.ndarray
     point: np.ndarray
@@ -69,9 +67,6 @@ class EdgePaths(Rows):
     def power(self) -> np.ndarray:
         """Path gain [linear], shape ``(L,)``."""
         return np.abs(self.amplitude) ** 2
-
-    def __len__(self) -> int:
-        return len(self.receiver)
 
     def beside(self, found: MirrorPaths) -> MirrorPaths:
         """``found`` with these paths of the same receivers, whose share is what the edge makes of the field.
@@ -101,7 +96,7 @@ class EdgePaths(Rows):
             self.receiver, none, none, self.point, share, self.length_m, self.excess_m, self.arrival,
             np.full_like(self.point, np.nan), zero, zero, np.full_like(zero, np.nan), self.code,
         ).of_width(count)  # fmt: skip
-        return MirrorPaths.joined([found, edges.subset(np.flatnonzero(share > 0))])
+        return MirrorPaths.joined([found, edges.take(np.flatnonzero(share > 0))])
 
 
 def patch_edges(patches: PlanarPatches) -> Edges:
@@ -301,7 +296,7 @@ class EdgeFinder:
         )
         code, point = ways.stops()
         return EdgePaths(
-            receiver, ways.edge, ways.patch, code, point, length, excess,
+            receiver, ways.patch, code, point, length, excess,
             length - np.linalg.norm(ways.end[:, 1] - ways.end[:, 0], axis=1), departure, arrival, matrix,
             size * sign / np.maximum(np.abs(sign), 1e-300), self.wavelength_m,
         )  # fmt: skip

@@ -56,9 +56,6 @@ class Chains(Rows):
     axis: np.ndarray
     sine: np.ndarray
 
-    def __len__(self) -> int:
-        return len(self.sine)
-
     @classmethod
     def none(cls, order: int) -> Chains:
         """No chains, of ``order`` reflections."""

@@ -12,12 +12,12 @@ slab does not bend its way.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from warprrf.device import DeviceLike, Progress
@@ -65,9 +65,6 @@ class MirrorPaths(Rows):
     thickness_m: np.ndarray
     code: np.ndarray
 
-    def __len__(self) -> int:
-        return len(self.receiver)
-
     @property
     def delay_m(self) -> np.ndarray:
         """How far light goes in air in the time that each takes [m], shape ``(L,)``."""
@@ -89,18 +86,15 @@ class MirrorPaths(Rows):
         return (self.order == 0) & (self.slabs == 0) & ~self.over_edge
 
     @property
+    def kind(self) -> NDArray[np.str_]:
+        """``"los"``, ``"mirror"``, ``"slab"`` or ``"edge"``, shape ``(L,)``."""
+        told = [self.over_edge, self.slabs > 0, self.order > 0]
+        return np.select(told, ["edge", "slab", "mirror"], "los").astype("<U7")
+
+    @property
     def slabs(self) -> np.ndarray:
         """Number of slabs that are passed, shape ``(L,)``."""
         return (self.slab >= 0).sum(axis=1)
-
-    @property
-    def by_interactions(self) -> Iterator[tuple[int, np.ndarray]]:
-        """Numbers of mirrors and slabs, and the paths over so many."""
-        count = self.order + self.slabs
-        for k in np.unique(count):
-            yield int(k), np.flatnonzero(count == k)
-
-    subset = Rows.take
 
     def of_width(self, most: int) -> MirrorPaths:
         """The same with ``most`` columns, the last ones left off or empty ones behind."""
@@ -113,7 +107,7 @@ class MirrorPaths(Rows):
 
     def of(self, receivers: np.ndarray) -> MirrorPaths:
         """The rows of ``receivers`` (N,), ascending, which are counted anew."""
-        own = self.subset(np.isin(self.receiver, receivers))
+        own = self.take(np.isin(self.receiver, receivers))
         return replace(own, receiver=np.searchsorted(receivers, own.receiver))
 
 
@@ -164,7 +158,7 @@ def exact_paths(
             found = row[own], patch[own], point[own], np.ones(len(own))
             parts.append(described(patches, source, receivers, found, order, walls, slabs))
     paths = MirrorPaths.joined(parts)
-    return paths.subset(np.argsort(paths.receiver, kind="stable"))
+    return paths.take(np.argsort(paths.receiver, kind="stable"))
 
 
 def zone_paths(

@@ -247,10 +247,9 @@ class MirrorTracer:
         """Paths of each of ``receivers`` (R, 3), one after the other."""
         points = check_array("receivers", receivers, (None, 3))
         found = self.find(points, mirror_order, progress)
-        held = self._held(found, points).evaluate()
+        held, kind = self._held(found, points).evaluate(), found.kind
         over = None if self.edges is None else self.edges.find(points, min(mirror_order, 1), progress)
         ends = np.searchsorted(found.receiver, np.arange(len(points) + 1))
-        kind = np.where(found.slabs > 0, "slab", np.where(found.order == 0, "los", "mirror")).astype("<U7")
         result = []
         for k, point in enumerate(points):
             own = slice(ends[k], ends[k + 1])

@@ -17,8 +17,8 @@ from warprrf.rf.em.absorption import gas_attenuation_db_per_m
 from warprrf.rf.em.fresnel import fresnel_curves, lobe, slab_reflection, surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.observations import Frame
 from warprrf.rf.spectra.beam import beam_operator
+from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import default_floor, pixel_solid_angles, to_db
 from warprrf.rf.tracing.model import Effects, Parameters
 from warprrf.rf.tracing.render import images
@@ -76,8 +76,10 @@ def full_field(
         # Air is judged by itself.
         return replace(geometry, effects=effects, transmitter=transmitter, air=None), "fit"
     surface = Surface.of(geometry)
-    frame = Frame(transmitter, frequency_hz, shape, 1.0, (0.0, 1.0), beam_sigma_rad, None)
-    field = BistaticField.prior(surface, frame, effects=replace(EVERYTHING, residual=False), device=device)
+    none = SpectrumDataset.empty(
+        transmitter=transmitter, frequency_hz=frequency_hz, shape=shape, beam_sigma_rad=beam_sigma_rad
+    )
+    field = BistaticField.prior(surface, none, effects=replace(EVERYTHING, residual=False), device=device)
     if not hasattr(geometry, "materials"):
         return field, "assumed"
     parameters = material_parameters(geometry.materials, frequency_hz)

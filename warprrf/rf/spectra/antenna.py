@@ -25,6 +25,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 from warprrf.cache import cached_property
@@ -453,24 +454,12 @@ class _Grid:
         return cls(zenith, azimuth, values)
 
     def __call__(self, zenith: np.ndarray, azimuth: np.ndarray) -> Any:
-        row, down = _place(self.zenith, zenith)
-        column, across = _place(
-            self.azimuth, self.azimuth[0] + np.mod(azimuth - self.azimuth[0], 2.0 * np.pi)
+        turned = self.azimuth[0] + np.mod(azimuth - self.azimuth[0], 2.0 * np.pi)
+        grid = RegularGridInterpolator(
+            (self.zenith, self.azimuth), self.values, bounds_error=False, fill_value=None
         )
-        if self.values.ndim > 2:
-            down, across = down[..., None], across[..., None]
-        v = self.values
-        upper = (1.0 - across) * v[row, column] + across * v[row, column + 1]
-        lower = (1.0 - across) * v[row + 1, column] + across * v[row + 1, column + 1]
-        found = (1.0 - down) * upper + down * lower
-        return found if v.ndim == 2 else (found[..., 0], found[..., 1])
-
-
-def _place(grid: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Interval of ``grid`` that each angle lies in, and its share of it; NaN stays NaN."""
-    known = np.where(np.isnan(angle), grid[0], np.clip(angle, grid[0], grid[-1]))
-    first = np.clip(np.searchsorted(grid, known, side="right") - 1, 0, len(grid) - 2)
-    return first, np.where(np.isnan(angle), np.nan, (known - grid[first]) / (grid[first + 1] - grid[first]))
+        found = grid((np.clip(zenith, self.zenith[0], self.zenith[-1]), np.minimum(turned, self.azimuth[-1])))
+        return found if self.values.ndim == 2 else (found[..., 0], found[..., 1])
 
 
 @dataclass(frozen=True, eq=False)

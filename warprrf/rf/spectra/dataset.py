@@ -42,14 +42,8 @@ SAME_PLACE_M = 1e-3  # a spectrum measured this near is the same one
 
 @runtime_checkable
 class PathsLike(Protocol):
-    """Paths of one receiver, arrays ``(L,)``, or of several, ``(R, L)``: :class:`warprrf.Paths`."""
+    """Paths of one receiver, arrays ``(L,)``, or of several, ``(R, L)``: what tells :class:`warprrf.Paths`."""
 
-    power: np.ndarray
-    arrival: np.ndarray
-    tau: np.ndarray
-    theta_t: np.ndarray
-    phi_t: np.ndarray
-    kind: np.ndarray
     transmitter: np.ndarray | None
     receiver: np.ndarray | None
     frequency_hz: float | None

@@ -20,7 +20,6 @@ from warprrf.rf.tracing.surface import (
     largest_groups,
     named_faces,
     objects_of,
-    of_elements,
     split_long,
 )
 
@@ -115,8 +114,8 @@ def edited(surface: Surface, room: Room, **slabs: np.ndarray) -> tuple[Surface, 
         plane_normal=planes[0][plane], plane_offset=planes[1][plane], group_names=names, object_names=things,
         material=np.append(s.material, s.material.max() + 1 + np.arange(new)).astype(np.int32),
         appearance=np.concatenate([s.appearance, np.full((new, s.appearance.shape[1]), np.nan)]),
-        patch_group=largest_groups(mesh, own["patch"], own["group"], len(plane)), cell_element=own["element"][first],
-        **of_elements(mesh, own["element"], own["group"]), position_error_m=s.position_error_m, two_sided=s.two_sided,
+        patch_group=largest_groups(mesh, own["patch"], own["group"], len(plane)),
+        position_error_m=s.position_error_m, two_sided=s.two_sided,
     )  # fmt: skip
     return made, lies_on[first]
 

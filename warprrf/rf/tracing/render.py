@@ -99,8 +99,6 @@ def images(gains: PathGains, beam: BeamOperator) -> np.ndarray:
         ValueError: for a view that was traced without a beam.
     """
     view = gains.view
-    if view.beams is None:
-        raise ValueError("view: it was traced without a receiver's beam, expected one of a spectrum")
     count, shape = len(view.receivers), view.tracer.grid.shape
     pixels = np.einsum("...k->...", gains.by_ray().reshape(count, *shape, -1))
     found = np.moveaxis(beam(np.ascontiguousarray(np.moveaxis(pixels, 0, -1))), -1, 0)

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
-from warprrf.checks import LARGEST_M, Expected, check_arrays, check_number, index_to, lengths
+from warprrf.checks import Expected, check_arrays, check_number, index_to, lengths
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh, components, smoothed_normals
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
@@ -56,17 +56,13 @@ ARRAYS = {
     "material": index_to("G", "G"),
     "appearance": Expected("G K", nan=True),
     "patch_group": index_to("G", "P"),
-    "element": index_to("E", "F"),
-    "cell": index_to("X", "F"),
-    "cell_element": index_to("E", "X"),
-    "element_centre": lengths("E 3"),
-    "element_area": Expected("E", 0.0, LARGEST_M**2),
-    "element_group": index_to("G", "E"),
+    "element": index_to("F", "F"),
+    "cell": index_to("F", "F"),
     "thickness_m": Expected("G", 0.0, np.inf, nan=True),
     "dispersion": Expected("G 4", nan=True),
     "face_object": index_to("O", "F", -1),
 }
-"""What the arrays of a :class:`Surface` must be: F faces, P patches, G groups, E elements, X cells, K looks, O objects."""
+"""What the arrays of a :class:`Surface` must be: F faces, P patches, G groups, K looks, O objects."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +82,6 @@ class Surface:
         patch_group: group of each patch, shape ``(P,)`` int32.
         element: surface element of each face, shape ``(F,)`` int32.
         cell: cell of each face, shape ``(F,)`` int32.
-        cell_element: element of each cell, shape ``(X,)`` int32.
-        element_centre, element_area, element_group: of each element, shapes ``(E, 3)`` [m], ``(E,)`` [m^2], ``(E,)``.
         thickness_m: thickness of what each group is a slab of [m], shape ``(G,)``; NaN where nobody knows.
         dispersion: a, b, c and d of each group's relative permittivity a f^b and conductivity c f^d [S/m], f in GHz, shape
             ``(G, 4)``; NaN where ITU-R P.2040-4 tells by the name, or nobody knows.
@@ -113,10 +107,6 @@ class Surface:
     patch_group: np.ndarray
     element: np.ndarray
     cell: np.ndarray
-    cell_element: np.ndarray
-    element_centre: np.ndarray
-    element_area: np.ndarray
-    element_group: np.ndarray
     thickness_m: np.ndarray
     dispersion: np.ndarray
     group_names: tuple[str, ...]
@@ -147,6 +137,31 @@ class Surface:
         own, normal = self.patch >= 0, self.front_normal.copy()
         normal[own] = self.plane_normal[self.patch[own]]
         return normal
+
+    @cached_property
+    def cell_element(self) -> np.ndarray:
+        """Element of each cell, shape ``(X,)`` int32."""
+        found = np.zeros(int(self.cell.max()) + 1, np.int32)
+        found[self.cell] = self.element
+        return found
+
+    @cached_property
+    def element_area(self) -> np.ndarray:
+        """Area of each element [m^2], shape ``(E,)``."""
+        return np.maximum(np.bincount(self.element, self.mesh.areas), 1e-12)
+
+    @cached_property
+    def element_centre(self) -> np.ndarray:
+        """Centre of each element [m], shape ``(E, 3)``."""
+        sums = [np.bincount(self.element, self.mesh.areas * x) for x in self.mesh.triangles.mean(axis=1).T]
+        return np.stack(sums, axis=1) / self.element_area[:, None]
+
+    @cached_property
+    def element_group(self) -> np.ndarray:
+        """Group of each element, shape ``(E,)`` int32."""
+        found = np.zeros(len(self.element_area), np.int32)
+        found[self.element] = self.group
+        return found
 
     @property
     def element_sides(self) -> int:
@@ -237,8 +252,7 @@ class Surface:
         return cls(
             mesh=mesh, normal=mesh.face_normals, patch=patches.face_patch, plane_normal=patches.normal,
             plane_offset=patches.offset, group=material, material=np.arange(groups, dtype=np.int32),
-            appearance=np.full((groups, 4), np.nan), patch_group=faces, element=none, cell=none, cell_element=none[:1],
-            element_centre=mesh.center[None], element_area=np.array([mesh.areas.sum()]), element_group=none[:1],
+            appearance=np.full((groups, 4), np.nan), patch_group=faces, element=none, cell=none,
             **_slabs(mesh, None, groups), group_names=tuple(names), position_error_m=TRUE_ERROR_M, two_sided=True,
         )  # fmt: skip
 
@@ -390,27 +404,8 @@ def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray, width_m: float) 
     cells = np.floor(CELLS * (centre - mesh.bounds[0]) / width_m).astype(np.int64)
     key = np.column_stack([group, patch, cells // CELLS])
     element = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
-    pieces, cell = np.unique(np.column_stack([element, cells]), axis=0, return_inverse=True)
-    found = {
-        "element": element,
-        "cell": cell.reshape(-1).astype(np.int32),
-        "cell_element": pieces[:, 0].astype(np.int32),
-    }
-    return found | of_elements(mesh, element, group)
-
-
-def of_elements(mesh: Mesh, element: np.ndarray, group: np.ndarray) -> dict[str, Any]:
-    """Centre, area and group of each element, by the names of :class:`Surface`."""
-    centre, area = mesh.triangles.mean(axis=1), mesh.areas
-    total = np.maximum(np.bincount(element, area), 1e-12)
-    owner = np.zeros(len(total), np.int32)
-    owner[element] = group
-    return {
-        "element_centre": np.stack([np.bincount(element, area * x) for x in centre.T], axis=1)
-        / total[:, None],
-        "element_area": total,
-        "element_group": owner,
-    }
+    cell = np.unique(np.column_stack([element, cells]), axis=0, return_inverse=True)[1]
+    return {"element": element, "cell": cell.reshape(-1).astype(np.int32)}
 
 
 def largest_groups(mesh: Mesh, patch: np.ndarray, group: np.ndarray, patches: int) -> np.ndarray:

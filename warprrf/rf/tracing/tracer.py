@@ -23,7 +23,6 @@ import numpy as np
 from warprrf.cache import Cache, making
 from warprrf.device import DeviceLike, Progress, resolve
 from warprrf.kernels.radio.records import MIRROR, SCATTER, SLAB, SOURCE
-from warprrf.rf.em.fresnel import slab_passage
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.edge_paths import EdgeFinder
 from warprrf.rf.paths.images import MirrorImages
@@ -108,11 +107,11 @@ class View:
     _beams: list[np.ndarray] = field(init=False, repr=False, default_factory=list)
 
     @property
-    def beams(self) -> np.ndarray | None:
-        """Unit beam of each path over the pixels, shape ``(L, H, W)`` float32; None where the tracer has no beam."""
+    def beams(self) -> np.ndarray:
+        """Unit beam of each path over the pixels, shape ``(L, H, W)`` float32; ValueError where the tracer has no beam."""
         sigma = self.tracer.beam_sigma_rad
         if sigma is None:
-            return None
+            raise ValueError("view: it was traced without a receiver's beam, expected one of a spectrum")
         made = (
             self._beams[0] if self._beams else unit_beams(self.paths.arrival, self.tracer.grid.shape, sigma)
         )
@@ -124,6 +123,12 @@ class View:
     def cell(self) -> np.ndarray:
         """Surface cell that each ray meets, shape ``(R K,)``; any where it meets nothing."""
         return self.tracer.surface.cell.take(self.hits.face, mode="wrap")
+
+    @property
+    def outward(self) -> np.ndarray:
+        """Way of each path of one receiver from the transmitter to its first point [m], shape ``(L, 3)``."""
+        first = self.paths.point[:, 0]
+        return np.where(np.isnan(first), self.receivers[0], first) - self.tracer.transmitter
 
     def single_bounce_m(self) -> np.ndarray:
         """Length from the transmitter over what each ray meets to the receiver [m], shape ``(R K,)``; 0 where that is nothing."""
@@ -234,15 +239,6 @@ class Tracer:
 
         return _TRACED.get(key, make)
 
-    @property
-    def again(self) -> Callable[[], Tracer]:
-        """Makes the same again, in another process: it holds the surface, not what was traced."""
-        g = self._first_grid
-        return partial(
-            Tracer.of, self.surface, self.transmitter, self.frequency_hz, g.shape, g.sub_pixels,
-            beam_sigma_rad=self.beam_sigma_rad, loss_per_m=g.loss_per_m, device=str(g.device),
-        )  # fmt: skip
-
     def on_grid(self, shape: tuple[int, int], sub_pixels: int) -> Tracer:
         """The same for receivers with other rays and no beams; what belongs to the transmitter is shared."""
         other, g = copy(self), self.grid
@@ -259,17 +255,17 @@ class Tracer:
 
     def mirrored(self, most: int = 0) -> MirroredLight:
         """Images of the transmitter that light faces; with ``most`` those that do so through slabs alone, up to that many."""
-        return self.kept.get(("mirrored", most), lambda: MirroredLight(self, self.walls(most)))
+        return self.kept.get(
+            ("mirrored", most), lambda: MirroredLight(self, self.walls(most) if most else None)
+        )
 
     @property
     def images(self) -> MirrorImages:
         """Images of the transmitter in the surface's mirrors."""
         return self.kept.get("images", lambda: images_of(self.surface, self.transmitter, self.grid.device))
 
-    def walls(self, most: int) -> Walls | None:
-        """What may be passed, up to ``most`` slabs on one way; None for none."""
-        if most == 0:
-            return None
+    def walls(self, most: int) -> Walls:
+        """What may be passed, up to ``most`` slabs on one way."""
         make = partial(self.surface.walls, self.frequency_hz, most, self.grid.device)
         return self._walls or self.kept.get(("walls", most), make)
 
@@ -280,35 +276,32 @@ class Tracer:
 
     def paths(self, receivers: np.ndarray, effects: Effects, progress: Progress | None = None) -> MirrorPaths:
         """Line of sight and mirror paths of ``receivers`` (R, 3) that ``effects`` want."""
+        most = effects.transmissions
+        walls = self.walls(most) if most else None
         found = zone_paths(
-            self.images, receivers, effects.mirrors, self.wavelength_m, self.surface.position_error_m, progress,
-            self.walls(effects.transmissions),
+            self.images, receivers, effects.mirrors, self.wavelength_m, self.surface.position_error_m, progress, walls
         )  # fmt: skip
         found = self._delayed(found)
         if not effects.diffractions:
             return found
-        most = effects.transmissions
-        edges = self.kept.get(("edges", most), lambda: self._edges(most))
+        edges = self.kept.get(("edges", most), lambda: self._edges(walls))
         return edges.find(receivers, min(effects.mirrors, 1), progress).beside(found)
 
     def _delayed(self, found: MirrorPaths) -> MirrorPaths:
         """``found`` with what slabs of known materials make them longer by."""
         table, (row, k) = self.surface.table(self.frequency_hz), np.nonzero(found.slab >= 0)
         group, solid = self.surface.group[found.slab[row, k]], found.thickness_m[row, k]
-        thickness = np.where(np.isnan(solid), table.thickness_m[group], solid)
-        longer = slab_passage(found.cosine[row, k], table.permittivity[group], thickness, self.wavelength_m)[
-            2
-        ]
+        longer = table.passage(group, found.cosine[row, k], self.wavelength_m, solid)[2]
         return replace(found, excess_m=np.bincount(row, longer, minlength=len(found)))
 
-    def _edges(self, most: int) -> EdgeFinder:
-        """Paths over edges and a slab, if ``most`` is not 0, between surfaces as they are taken to be before any measurement."""
+    def _edges(self, walls: Walls | None) -> EdgeFinder:
+        """Paths over edges and a slab, if there are ``walls``, between surfaces as they are taken to be before any measurement."""
         images, s = (
             MirrorImages(self.surface.patches, self.transmitter, device=self.grid.device),
             self.surface,
         )
         table = s.table(self.frequency_hz)
-        return EdgeFinder(images, self.wavelength_m, table, walls=self.walls(most), group=s.group)
+        return EdgeFinder(images, self.wavelength_m, table, walls=walls, group=s.group)
 
     def view(
         self, receivers: np.ndarray, effects: Effects, *, paths: MirrorPaths | None = None, keeps: bool = True
@@ -375,10 +368,8 @@ class Tracer:
 
     def lit_through(self, rays: Rays, light: Light, most: int) -> Records:
         """What rays see of surfaces that the transmitter lights through slabs, up to ``most``."""
-        row, walls = light.shaded, self.walls(most)
-        if walls is None:
-            raise ValueError("most: got 0, expected slabs")
-        arrived, slabs = walls.between(self.transmitter, light.point[row])
+        row = light.shaded
+        arrived, slabs = self.walls(most).between(self.transmitter, light.point[row])
         own = np.flatnonzero(slabs.count > 0)
         row, slabs = row[arrived[own]], slabs.take(own)
         before = self._through(slabs, light.point[row] - self.transmitter)
@@ -483,8 +474,6 @@ class Tracer:
     def behind(self, rays: Rays, most: int) -> Rays:
         """``rays`` that go straight on through what they hit, and what they meet behind up to ``most`` slabs."""
         hits, walls = rays.hits, self.walls(most)
-        if walls is None:
-            raise ValueError("most: got 0, expected slabs")
         ray = np.flatnonzero(hits.face >= 0)
         ray = ray[walls.passes[hits.face[ray]]]
         origins = hits.origins[ray // (len(hits.face) // len(hits.origins))]
@@ -524,10 +513,11 @@ class Tracer:
 
 
 def view_of(
-    again: Callable[[], Tracer], effects: Effects, keeps: bool, part: tuple[np.ndarray, MirrorPaths]
+    make: Callable[[], Tracer], effects: Effects, keeps: bool, part: tuple[np.ndarray, MirrorPaths]
 ) -> View:
-    """What a receiver (3,) of known line of sight and mirror paths sees, without what all receivers share."""
-    view = again().view(part[0], effects, paths=part[1], keeps=keeps)
+    """What a receiver (3,) of known line of sight and mirror paths sees, without what all receivers share; ``make`` makes their
+    tracer, in another process too."""
+    view = make().view(part[0], effects, paths=part[1], keeps=keeps)
     view.traced(effects if keeps else SETS["single"])
     none: dict[str, Any] = {"directions": None, "solid_angle": None}
     return replace(view, tracer=None, hits=replace(view.hits, **none))  # type: ignore[arg-type]

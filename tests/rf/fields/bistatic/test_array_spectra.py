@@ -13,8 +13,8 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.measured import ArrayImage, read
-from warprrf.rf.fields.bistatic.observations import Frame
 from warprrf.rf.paths.trace import trace_paths
+from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import directions_from_angles
 from warprrf.rf.tracing.model import SETS, Effects
 from warprrf.rf.tracing.tracer import SPECULAR
@@ -36,7 +36,9 @@ def scene():
 
 @pytest.fixture(scope="module")
 def field(scene):
-    frame = Frame(TX, F, (24, 48), 1e-12, (-120.0, -40.0), np.radians(5.0), None)
+    frame = SpectrumDataset.empty(
+        transmitter=TX, frequency_hz=F, shape=(24, 48), beam_sigma_rad=np.radians(5.0), floor=1e-12
+    )
     prior = BistaticField.prior(scene, frame, effects=SINGLE, sub_pixels=2)
     known = prior.parameters
     share = np.log([1.0 - m.scattering**2 for m in (WALLS, BOX)])

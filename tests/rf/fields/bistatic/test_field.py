@@ -8,7 +8,6 @@ import pytest
 from furnished import MATERIALS, RECEIVERS, ROOM, SHAPE, SIGMA, TX, F, spectra
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths, observation
 
-from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.fresnel import fresnel_curves, slab_transmission
 from warprrf.rf.em.materials import itu_material
 from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT
@@ -58,9 +57,10 @@ def test_spectra_that_would_not_fit_into_memory_are_refused(scene, data, monkeyp
 def test_a_fit_to_many_keeps_no_records_and_is_the_same(scene, data, field, monkeypatch):
     """Of each ray 4 bytes of its face, 8 of its range, and a bit that says whether it is lit; records alone would take 24."""
     monkeypatch.setattr(training, "MOST_KEPT", 0)
-    few = data.subset(np.arange(6))
-    views = trace(scene, few)
-    again = RadioField.fit(scene, few, views=views)
+    traced = []
+    monkeypatch.setattr(fitting, "trace", lambda *a, **o: traced.append(trace(*a, **o)) or traced[-1])
+    again = RadioField.fit(scene, data.subset(np.arange(6)))
+    (views,) = traced
     for view in views.views:
         assert sum(a.nbytes for a in (view.hits.face, view.hits.range_m, *view.lit)) < 13 * len(
             view.hits.face
@@ -312,13 +312,6 @@ def test_duplicate_receivers_change_little(scene, data):
     assert np.sqrt(np.mean((a - b) ** 2)) < 0.5
 
 
-def test_what_was_traced_at_other_places_or_in_other_air_is_refused(scene, data):
-    humid = replace(data.subset([0]), attributes=Air().attributes)
-    for other in (data.subset([1]), humid):
-        with pytest.raises(ValueError, match="views.*air and rays of this fit"):
-            RadioField.fit(scene, other, views=trace(scene, data.subset([0])))
-
-
 def test_the_beam_operator_is_the_beam_of_every_pixel():
     beam = BeamOperator(SHAPE, SIGMA)
     rng = np.random.default_rng(6)
@@ -368,6 +361,6 @@ def test_a_fit_goes_on_after_steps_that_were_cut_short(field, monkeypatch):
     for name, loose in {"WEIGHT_STD": 1e3, "EXCESS_STD": 1e-3, "MIRROR_STD": 1e3}.items():
         monkeypatch.setattr(newton, name, loose)
     found = newton.gauss_newton(problem, replace(true, log_weight=true.log_weight - 9.0), 40)
-    (now,) = problem.errors_db(found.parameters)
+    ((now, *_),) = problem.linearised(found.parameters, newton.layout_of(problem, true))
     assert len(found.losses) > 5
     assert np.abs(now[:lit]).max() < 0.1

@@ -143,7 +143,7 @@ def test_errors_of_a_fit_have_the_slopes_of_differences(field, measured, effects
     p = layout.unpack(x, field.parameters)
     problem = Problem.of([o], effects, np.arange(groups), p, gain_offset=True)
     ((_, table, index),) = problem.linearised(p, layout)
-    slopes = differences(lambda x: next(problem.errors_db(layout.unpack(x, p))), x, 0.02)
+    slopes = differences(lambda x: next(problem.linearised(layout.unpack(x, p), layout))[0], x, 0.02)
     caught = []
     for place, (row, slope) in enumerate(zip(dense(table, index, layout), slopes, strict=True)):
         allowed = 0.1 if place % layout.stride == layout.lobes else 0.01  # that of permittivity is a table's

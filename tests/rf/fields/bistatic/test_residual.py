@@ -12,10 +12,8 @@ from trimesh.remesh import subdivide_to_size
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.links import LinkTracer
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
 from warprrf.rf.fields.bistatic.residual import fit_residual, shares_of
-from warprrf.rf.maps.links import LinkOptions
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.tracing.model import Effects
 
@@ -118,8 +116,7 @@ def test_links_have_the_same_gains(field):
     rng = np.random.default_rng(6)
 
     def totals(asked):
-        tracer, options = asked.tracer(), LinkOptions(asked.beam_sigma_rad, SHAPE)
-        links = LinkTracer(tracer, asked.state, asked.materials_of(tracer), options, SHAPE)(RECEIVERS)
+        links = asked.links(RECEIVERS, beam_sigma_rad=asked.beam_sigma_rad, shape=SHAPE)
         return links.total_path_gain, np.array([asked.spectrum(r).path_gain.sum() for r in RECEIVERS])
 
     bare = totals(field)

@@ -8,7 +8,6 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined
 import warprrf as wr
 from warprrf.rf.em.materials import assumed_permittivity
 from warprrf.rf.fields.bistatic.suggest import Unknowns
-from warprrf.rf.fields.bistatic.training import trace
 
 CARRIER_HZ = 300e9
 TX = np.array([1.0, 2.0, 2.4])
@@ -109,11 +108,3 @@ def test_variances_are_those_of_the_joint_posterior():
     posterior = np.linalg.inv(np.linalg.inv(prior) + np.diag(precision))
     assert unknowns.variance(precision) == pytest.approx(np.diag(posterior))
     assert (unknowns.variance(precision + rng.random(5)) < unknowns.variance(precision)).all()
-
-
-def test_a_part_of_what_was_traced_reads_its_own_spectra(scene):
-    ds = spectra(scene, CANDIDATES)
-    seen, chosen = trace(scene, ds, sub_pixels=1), [4, 1]
-    alone = wr.RadioField.fit(scene, ds.subset(chosen), quick=True)
-    part = wr.RadioField.fit(scene, ds.subset(chosen), quick=True, views=seen.subset(chosen))
-    assert np.allclose(part.spectrum(EAST[1]).path_gain, alone.spectrum(EAST[1]).path_gain, rtol=1e-6)

@@ -18,6 +18,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -43,14 +44,15 @@ from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.materials import Material
 from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import Data, Measured, RadioField, with_settings
+from warprrf.rf.fields.batches import Work
 from warprrf.rf.fields.bistatic import edited, files
 from warprrf.rf.fields.bistatic.fit import fit
-from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
+from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, links, receivers_at_once
+from warprrf.rf.fields.bistatic.links import SHAPE as LINK_SHAPE
 from warprrf.rf.fields.bistatic.locate import locate
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, read
 from warprrf.rf.fields.bistatic.needs import assumed
 from warprrf.rf.fields.bistatic.observations import (
-    Frame,
     Observation,
     Place,
     Target,
@@ -63,10 +65,9 @@ from warprrf.rf.fields.bistatic.options import SUB_PIXELS, FitOptions
 from warprrf.rf.fields.bistatic.paths import paths_of, strongest
 from warprrf.rf.fields.bistatic.suggest import SHAPE as SUGGEST_SHAPE
 from warprrf.rf.fields.bistatic.suggest import Pointings, Sensitivity, Unknowns, suggest
-from warprrf.rf.fields.bistatic.training import TrainingViews
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
 from warprrf.rf.fields.location import Location
-from warprrf.rf.maps.links import LinkOptions, Links
+from warprrf.rf.maps.links import LinkOptions
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.antenna import Pattern
 from warprrf.rf.spectra.beam import BeamOperator, beam_operator
@@ -175,7 +176,6 @@ class BistaticField(RadioField):
         model: str = "bistatic",
         *,
         options: FitOptions | None = None,
-        views: TrainingViews | None = None,
         client: Any = None,
         device: DeviceLike = None,
         progress: Progress | None = None,
@@ -189,7 +189,6 @@ class BistaticField(RadioField):
                 Without any receiver the field is what is known beforehand.
             model: ``"bistatic"``.
             options: what is modelled and how it is fitted.
-            views: what :func:`warprrf.rf.fields.bistatic.training.trace` found for exactly these receivers.
             client: a ``dask.distributed.Client`` whose workers cast the rays; this process by default.
             device: where rays are cast.
             progress: called with the stages ``"patches"``, ``"mirrors"``, ``"transport"`` and ``"fit"``.
@@ -197,8 +196,8 @@ class BistaticField(RadioField):
                 ``options``: ``quick=True``, ``effects="room"``, ``relevance=found``, ...
 
         Raises:
-            ValueError: for options out of range, receivers on a surface or outside the scene, spectra that are all
-                empty, or ``views`` of others.
+            ValueError: for options out of range, receivers on a surface or outside the scene, or spectra that are all
+                empty.
             TypeError: for a geometry without a mesh, or an unknown option.
         """
         chosen, data = with_settings(options or FitOptions(), settings), as_list(ds)
@@ -206,13 +205,13 @@ class BistaticField(RadioField):
             raise ValueError(f"model: got {model!r}, expected 'bistatic'")
         if not any(map(len, data)):
             return cls._unmeasured(geometry, data, chosen, device)
-        found = fit(geometry, data, chosen, views=views, client=client, device=device, progress=progress)
+        found = fit(geometry, data, chosen, client=client, device=device, progress=progress)
         frame = frame_of(data)
         ends = np.concatenate([np.column_stack(kind.ends()) for kind in kinds_of(data)])
         ends = ends[np.sort(np.unique(ends, axis=0, return_index=True)[1])]
         receivers = ends[(ends[:, :3] == frame.transmitter).all(axis=1), 3:]
         fitted = replace(
-            cls.prior(found.surface, frame, effects=found.model.effects, sub_pixels=found.sub_pixels, device=device),
+            cls.prior(found.surface, frame, effects=found.model.effects, sub_pixels=chosen.rays, device=device),
             parameters=replace(found.model.parameters, log_gains=np.zeros(0)), residual=found.model.residual,
             material=found.material, errors=found.errors, report=found.report, fitted_on=ends[:, 3:],
             fitted_under=ends[:, :3],
@@ -254,7 +253,7 @@ class BistaticField(RadioField):
     def prior(
         cls,
         geometry: GeometryLike,
-        ds: SpectrumDataset | Frame,
+        ds: SpectrumDataset,
         *,
         effects: Effects | None = None,
         lobes: tuple[int, ...] | None = None,
@@ -277,24 +276,23 @@ class BistaticField(RadioField):
             TypeError: for a geometry without a mesh.
         """
         surface = Surface.of(geometry)
-        rows, columns = ds.shape if isinstance(ds, Frame) else ds.path_gain.shape[1:]
         return cls(
             surface=surface,
-            transmitter=check_array("ds.transmitter", ds.transmitter, (3,)),
-            frequency_hz=float(ds.frequency_hz),
-            shape=(int(rows), int(columns)),
-            floor=float(ds.floor),
-            range_db=(float(ds.range_db[0]), float(ds.range_db[1])),
-            beam_sigma_rad=float(ds.beam_sigma_rad),
+            transmitter=ds.transmitter,
+            frequency_hz=ds.frequency_hz,
+            shape=ds.shape,
+            floor=ds.floor,
+            range_db=ds.range_db,
+            beam_sigma_rad=ds.beam_sigma_rad,
             effects=replace(SETS["single"], residual=False) if effects is None else effects,
             parameters=replace(
                 Parameters.prior(surface.groups, *([] if lobes is None else [lobes]), reciprocal=reciprocal),
-                log_through=surface.slabs(float(ds.frequency_hz))[2],
+                log_through=surface.slabs(ds.frequency_hz)[2],
             ),
             material=surface.material,
             residual=np.zeros((2, surface.cells)),
             sub_pixels=sub_pixels,
-            air=getattr(ds, "air", None),
+            air=ds.air,
             device=device,
         )
 
@@ -573,11 +571,11 @@ class BistaticField(RadioField):
         floor = self.floor * np.prod(self.shape) / np.prod(SUGGEST_SHAPE)
         return Sensitivity(tracer, self.state, materials, floor), Unknowns.of(tracer, self.material)
 
-    def trace_links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
-        """:meth:`links` at positions that were checked, several at a time."""
-        tracer = self.tracer(transmitter)
-        work = LinkTracer(tracer, self.state, self.materials_of(tracer), options, self.shape)
-        return options.in_batches(receivers, work.batch, work)
+    def _link_work(self, options: LinkOptions) -> tuple[Work, int]:
+        effects, shape = self.effects, options.shape or LINK_SHAPE
+        if options.mirror_order is not None:
+            effects = replace(effects, mirrors=min(effects.mirrors, options.mirror_order))
+        return partial(links, self, effects, shape, options.beam_sigma_rad), receivers_at_once(shape)
 
     @property
     def _beam(self) -> BeamOperator:

@@ -10,27 +10,20 @@ import numpy as np
 from warprrf.checks import check_type
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
+from warprrf.rf.tracing.model import ARRAYS as PARAMETER_ARRAYS
 from warprrf.rf.tracing.model import Effects, Parameters
+from warprrf.rf.tracing.surface import ARRAYS as SURFACE_ARRAYS
 from warprrf.rf.tracing.surface import Surface
 
-_SURFACE = (
-    "normal", "patch", "plane_normal", "plane_offset", "group", "material", "patch_group", "element", "element_centre",
-    "element_area", "element_group", "appearance", "thickness_m", "dispersion", "cell", "cell_element",
-)  # fmt: skip
-_PARAMETERS = ("log_weight", "log_excess", "log_mirror", "log_through")
 _SINGLE = ("lobes", "reciprocal", "log_gain", "roughness")
 
 
 def taken_apart(parts: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Tensors and header of the ``parts`` of a field, by the names of its attributes, but for what every model has."""
     s, p = parts["surface"], parts["parameters"]
-    tensors = {f"surface/{name}": np.asarray(getattr(s, name)) for name in _SURFACE}
-    tensors |= {
-        "mesh/vertices": s.mesh.vertices,
-        "mesh/faces": s.mesh.faces,
-        "surface/face_object": s.face_object,
-    }
-    tensors |= {f"parameters/{name}": getattr(p, name) for name in _PARAMETERS}
+    tensors = {"mesh/vertices": s.mesh.vertices, "mesh/faces": s.mesh.faces}
+    tensors |= {f"surface/{name}": np.asarray(getattr(s, name)) for name in SURFACE_ARRAYS}
+    tensors |= {f"parameters/{name}": getattr(p, name) for name in PARAMETER_ARRAYS}
     tensors |= {name: parts[name] for name in ("residual", "material")}
     if parts["errors"] is not None:
         tensors |= {f"errors/{name}": np.asarray(value) for name, value in vars(parts["errors"]).items()}
@@ -60,10 +53,10 @@ def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict
             check_type(what, name, str)
     errors = {n.removeprefix("errors/"): t for n, t in tensors.items() if n.startswith("errors/")}
     errors.pop("outlier_db", None)  # older files know one, which nothing reads
-    parameters: dict[str, Any] = {name: tensors[f"parameters/{name}"] for name in _PARAMETERS}
+    parameters: dict[str, Any] = {name: tensors[f"parameters/{name}"] for name in PARAMETER_ARRAYS}
     parameters |= {name: header[name] for name in _SINGLE}
-    arrays: dict[str, Any] = {name: tensors[f"surface/{name}"] for name in _SURFACE}
-    arrays["face_object"] = tensors.get("surface/face_object")  # older files know no objects
+    held: dict[str, Any] = {"surface/face_object": None, **tensors}  # older files know no objects
+    arrays = {name: held[f"surface/{name}"] for name in SURFACE_ARRAYS}
     return {
         "surface": Surface(
             mesh=Mesh(tensors["mesh/vertices"], tensors["mesh/faces"]),

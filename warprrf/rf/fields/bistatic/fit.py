@@ -68,7 +68,6 @@ class FitResult:
     surface: Surface
     model: Model
     material: np.ndarray
-    sub_pixels: int
     errors: ErrorModel | None
     report: dict[str, Any]
 
@@ -78,7 +77,6 @@ def fit(
     ds: Data,
     options: FitOptions,
     *,
-    views: TrainingViews | None = None,
     client: Any = None,
     device: DeviceLike = None,
     progress: Progress | None = None,
@@ -89,11 +87,6 @@ def fit(
         if isinstance(one, SpectrumDataset) and len(one) and not (one.path_gain > one.floor).any():
             raise ValueError("ds: got no pixel above the floor, expected spectra with power to fit to")
     places = places_of(data, mesh, device)
-    if views is not None:
-        views.check(places, options.sub_pixels)
-        views = replace(
-            views, places=places
-        )  # of a part of what was traced they say where in the whole readings are
     if options.effects != "auto":  # else these are decided on by what they are worth
         frequency_hz, first = frame_of(data).frequency_hz, places[0]
         effects = options.candidates(frequency_hz)[0]
@@ -104,12 +97,12 @@ def fit(
     look = partial(trace, geometry, sub_pixels=options.rays, client=client, device=device, progress=progress)
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
     with threadpool_limits(1, user_api="blas"):
-        t, found, zeros = _learned(data, places, look, options, views, progress)
+        t, found, zeros = _learned(data, places, look, options, progress)
         offsets = _offsets(t, found)
         if offsets:
             data = [moved(one, offsets[k]) if k in offsets else one for k, one in enumerate(t.data)]  # type: ignore[arg-type]
             places = places_of(data, mesh, device)
-            t, found, _ = _learned(data, places, look, options, None, progress)
+            t, found, _ = _learned(data, places, look, options, progress)
     warn(t.data, found.report)
     places_moved = {
         t.names[k]: [(place.receiver.tolist(), offset.tolist()) for place, offset in own]
@@ -123,7 +116,6 @@ def _learned(
     places: Sequence[Place],
     look: Callable[..., TrainingViews],
     options: FitOptions,
-    views: TrainingViews | None,
     progress: Progress | None,
 ) -> tuple[Training, FitResult, dict[str, dict[str, float]]]:
     """All steps of a fit: what it learned from, what it found, and what :func:`with_zeros` found.
@@ -132,13 +124,12 @@ def _learned(
     """
     rng = np.random.default_rng(options.seed)
     split = Split.of(places, options.quick, rng)
-    if views is None:
-        candidates = options.candidates(frame_of(data).frequency_hz)
-        sought = candidates[0] if len(candidates) == 1 else None
-        decides = options.effects == "auto" and options.relevance is None
-        views = look(data, only=split.deciding, effects=sought, decides=decides)
+    candidates = options.candidates(frame_of(data).frequency_hz)
+    sought = candidates[0] if len(candidates) == 1 else None
+    decides = options.effects == "auto" and options.relevance is None
+    views = look(data, only=split.deciding, effects=sought, decides=decides)
     data, zeros = with_zeros(data, views.places, views.views)
-    t, rays = Training.of(views, split, data, options, rng, progress), views.tracer.grid.sub_pixels
+    t = Training.of(views, split, data, options, rng, progress)
     del views  # and with them records, once the training has none
     started = time.perf_counter()
     choice = choose(t)
@@ -159,7 +150,7 @@ def _learned(
     missed = left_out(t, model)
     report = report_of(t, choice, wrong, time.perf_counter() - started) | {"left_out": missed}
     t.step(last=True)
-    return t, FitResult(t.surface, model, choice.material, rays, errors, report), zeros
+    return t, FitResult(t.surface, model, choice.material, errors, report), zeros
 
 
 def choose(t: Training) -> Choice:

@@ -100,15 +100,11 @@ class Problem:
             materials = Materials(here, tracer.slabs, self.material, device=tracer.grid.device)
             yield batch, materials, batch.power(materials)
 
-    def errors_db(self, p: Parameters) -> Iterator[np.ndarray]:
-        """Of each batch predictions less what was read, as it counts [dB]."""
-        for batch, _, power in self.evaluated(p):
-            yield batch.target.error(batch.gain(p, power) * power)
-
     def linearised(
         self, p: Parameters, layout: Layout
     ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """:meth:`errors_db` ``(N,)``, derivatives ``(C, N)`` float32, and the places of those parameters ``(C,)``."""
+        """Of each batch predictions less what was read, as it counts [dB] ``(N,)``, derivatives ``(C, N)`` float32, and the
+        places of those parameters ``(C,)``."""
         for batch, materials, power in self.evaluated(p):
             table, index = batch.slopes(materials, layout)
             if layout.gain:

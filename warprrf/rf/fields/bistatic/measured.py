@@ -24,6 +24,7 @@ from warprrf.rf.tracing.rays import RayGrid
 from warprrf.rf.tracing.records import Materials, Records
 from warprrf.rf.tracing.render import PathGains
 from warprrf.rf.tracing.tracer import SPECULAR, View
+from warprrf.rows import Rows
 
 DEPARTURES = (60, 120)
 """Rows and columns of the grid of departures that rays are told apart in, where a transmitter's pattern counts."""
@@ -101,8 +102,8 @@ class SpectrumPixels(ByPixels):
 
     @property
     def alike(self) -> object:
-        """Itself: receivers of one data set have one."""
-        return id(self)
+        """Whole spectra through one beam are; of a part, itself."""
+        return id(self.beam if self.pixels is None else self)
 
     def of_bins(self, power: np.ndarray, *, quick: bool = False) -> np.ndarray:
         """Seen through the beam."""
@@ -120,10 +121,7 @@ class SpectrumPixels(ByPixels):
 
     def of_paths(self, view: View) -> np.ndarray:
         """Each path's beam."""
-        beams = view.beams
-        if beams is None:
-            raise ValueError("view: it was traced without a receiver's beam, expected one of a spectrum")
-        beams = beams.reshape(len(beams), int(np.prod(self.beam.shape)))
+        beams = view.beams.reshape(len(view.paths), int(np.prod(self.beam.shape)))
         return beams if self.pixels is None else beams[:, self.pixels]
 
     def part(self, index: np.ndarray) -> SpectrumPixels:
@@ -138,9 +136,7 @@ each, shape ``(N, K)``."""
 
 def direct_paths(view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Directions of arrival and departure (L, 3) and delays (L,) [s] of one receiver's line of sight and mirror paths."""
-    paths, transmitter = view.paths, view.tracer.transmitter
-    first = paths.point[:, 0]
-    toward = np.where(np.isnan(first), view.receivers[0], first) - transmitter
+    paths, toward = view.paths, view.outward
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     return paths.arrival, toward, paths.delay_m / SPEED_OF_LIGHT
 
@@ -266,19 +262,20 @@ def pixel_means(grid: RayGrid) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Superposition:
+class Superposition(Rows):
     """How L line-of-sight and mirror paths add up in N readings of an array, between vertical antennas.
 
     Attributes:
         field: amplitude of each reading for a path of amplitude 1, phase of its length included, and what slabs let through
             before any measurement, shape ``(L, N)``.
         power: what adds in power beside, because lengths are not known so well, shape ``(L, N)`` float32.
-        ends: fields of the antennas at both ends of each path; see :func:`vertical_ends`.
+        sent, heard: fields of the antennas at both ends of each path, shape ``(L, 2)``; see :func:`vertical_ends`.
     """
 
     field: np.ndarray
     power: np.ndarray
-    ends: tuple[np.ndarray, np.ndarray]
+    sent: np.ndarray
+    heard: np.ndarray
 
     def amplitudes(
         self, specular: Records, p: Parameters, material: np.ndarray | None = None
@@ -299,7 +296,7 @@ class Superposition:
         )
         size = np.sqrt(specular.power) * np.exp(0.5 * share.sum(axis=1))
         cosine, turn = specular.angle[..., 0], specular.angle[..., 1]
-        polarised, slope = chain_amplitude(p.log_excess[own], cosine, turn, reflects, self.ends)
+        polarised, slope = chain_amplitude(p.log_excess[own], cosine, turn, reflects, (self.sent, self.heard))
         return size * polarised, size[:, None] * slope
 
     def received(self, amplitude: np.ndarray) -> np.ndarray:
@@ -310,11 +307,6 @@ class Superposition:
         """Derivatives of :meth:`received` to the amplitudes, shape ``(L, N)``."""
         whole = np.conj(amplitude.astype(np.float32) @ self.field)
         return np.asarray(2.0 * ((whole * self.field).real + amplitude[:, None] * self.power))
-
-    def subset(self, chosen: np.ndarray) -> Superposition:
-        """That of some paths."""
-        ends = self.ends[0][chosen], self.ends[1][chosen]
-        return Superposition(self.field[chosen], self.power[chosen], ends)
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,7 +353,7 @@ class ArrayImage(ByPixels):
         together = Superposition(
             (kept * phase[:, None] * heard).astype(np.complex64),
             ((1.0 - kept**2) * np.abs(heard) ** 2).astype(np.float32),
-            _vertical(view),
+            *_vertical(view),
         )
         return cls(steered.astype(np.float32), np.ascontiguousarray(arriving.T, np.float32), together)
 
@@ -390,7 +382,9 @@ def _vertical(view: View) -> tuple[np.ndarray, np.ndarray]:
     """Fields of vertical antennas at both ends of each path of one receiver, shape ``(L, 2)`` each."""
     paths = view.paths
     sent, received = np.zeros((len(paths), 2)), np.zeros((len(paths), 2))
-    for count, own in paths.by_interactions:
+    each = paths.order + paths.slabs
+    for count in np.unique(each):
+        own = np.flatnonzero(each == count)
         ends = np.broadcast_to(view.receivers[0], (len(own), 3))
         stops = stops_of(view.tracer.transmitter, paths.point[own, :count], ends)
         sent[own], received[own] = vertical_ends(stops, paths.normal[own, :count])

@@ -168,7 +168,7 @@ def _mirror_changes(batch: Batch, materials: Materials, unit_of: np.ndarray) -> 
 def _heard(o: Observation, effects: Effects, materials: Materials, changes: np.ndarray) -> np.ndarray:
     """The same of one observation where phases count: of all paths, where groups ``changes`` (G,) become each material."""
     kept, p = o.view.kept_paths(effects), materials.parameters
-    specular, together = o.view.records[SPECULAR].take(np.flatnonzero(kept)), o.together.subset(kept)
+    specular, together = o.view.records[SPECULAR].take(np.flatnonzero(kept)), o.together.take(kept)
     group = np.maximum(specular.index, 0)
     now = np.where(specular.index >= 0, materials.material[group], -1).astype(np.int32)
     own = (specular.index >= 0) & changes[group]

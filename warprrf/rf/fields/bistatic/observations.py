@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.cache import cached_property
+from warprrf.cache import Cache, cached_property
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.kernels.radio.records import EXCESS_COLUMN, MIRROR, MIRRORED_COLUMN, THROUGH_COLUMN
@@ -38,7 +38,7 @@ from warprrf.rf.positions import check_dataset, check_positions, question_unit
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings, fading_db, path_weights, question_readings
-from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, to_db
+from warprrf.rf.spectra.spectrum import to_db
 from warprrf.rf.tracing.model import SETS, Effects, Layout, Model, Parameters
 from warprrf.rf.tracing.records import Bins, Materials
 from warprrf.rf.tracing.render import PathGains, path_gains
@@ -217,7 +217,7 @@ class Observation:
     robust: bool = True
     sight: np.ndarray | None = None
     rows: np.ndarray | None = None
-    _kept: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)
+    _kept: Cache = field(init=False, repr=False, default_factory=lambda: Cache(2))
 
     def part(self, index: np.ndarray) -> Observation:
         """That of some of the readings."""
@@ -246,10 +246,10 @@ class Observation:
         power = np.maximum(read(gains, self.measured), 0.0) / self.floor
         return self.gain(gains.parameters, power) * power
 
-    @property
+    @cached_property
     def path(self) -> np.ndarray:
         """Readings of unit power on each line of sight and mirror path, in units of the floor, shape ``(L, N)``."""
-        return self._once("path", lambda: self.measured.of_paths(self.view) / np.float32(self.floor))
+        return self.measured.of_paths(self.view) / np.float32(self.floor)
 
     def single(self, materials: Materials) -> tuple[np.ndarray, np.ndarray]:
         """What groups scatter straight from the transmitter, in units of the floor: groups ``(A,)``, and readings at unit
@@ -262,7 +262,7 @@ class Observation:
             found = self.measured.of_bins(sums.reshape(count, -1), quick=True) / np.float32(self.floor)
             return groups, np.ascontiguousarray(found.T).reshape(*sums.shape[1:], found.shape[0])
 
-        return self._once((materials.parameters.lobes, materials.parameters.reciprocal), components)
+        return self._kept.get((materials.parameters.lobes, materials.parameters.reciprocal), components)
 
     def further(self, effects: Effects, materials: Materials) -> tuple[np.ndarray, np.ndarray]:
         """What comes over more than one surface, by the group that scatters it last or sends it on: groups ``(C,)``, and
@@ -339,11 +339,6 @@ class Observation:
     def ray_bins(self) -> tuple[np.ndarray, int]:
         """What the readings sum rays in: bin of each ray, -1 for none, and how many bins there are."""
         return self.measured.bins(self.view)
-
-    def _once(self, key: Any, make: Any) -> Any:
-        if key not in self._kept:
-            self._kept[key] = make()
-        return self._kept[key]
 
 
 @dataclass(frozen=True, eq=False)
@@ -461,14 +456,15 @@ class Kind(ABC):
         """Transmitter of each receiver and the receivers [m], shape ``(R, 3)`` each."""
         return self.one.transmitters, self.one.receivers
 
-    def frame(self) -> Frame:
+    def frame(self) -> SpectrumDataset:
         """What a field's spectra are made with, if it is the first: floor and range are those of the powers."""
         one = self.one
         floor = float(np.min(one.floor))
         levels = 10.0 * float(np.log10(floor)), 10.0 * float(np.log10(np.nanmax(one.power)))
-        return Frame(
-            one.transmitters[0], one.frequency_hz, READINGS_SHAPE, floor, levels, BEAM_SIGMA_RAD, one.air
+        none = SpectrumDataset.empty(
+            transmitter=one.transmitters[0], frequency_hz=one.frequency_hz, shape=READINGS_SHAPE, floor=floor
         )
+        return replace(none, range_db=levels, attributes={} if one.air is None else one.air.attributes)
 
 
 @dataclass(eq=False)
@@ -476,7 +472,6 @@ class _Spectra(Kind):
     """Whole spectra: pixels through a beam."""
 
     one: SpectrumDataset
-    _whole: dict[Any, Any] = field(default_factory=dict)
 
     def ends(self) -> tuple[np.ndarray, np.ndarray]:
         return np.broadcast_to(self.one.transmitter, self.one.receivers.shape), self.one.receivers
@@ -490,20 +485,16 @@ class _Spectra(Kind):
         ]  # fmt: skip
 
     def observe(self, place: Place, view: View) -> Observation:
-        one, key = self.one, str(view.tracer.grid.device)
-        if key not in self._whole:
-            self._whole[key] = SpectrumPixels(beam_operator(one.shape, one.beam_sigma_rad, key))
+        one = self.one
+        measured = SpectrumPixels(beam_operator(one.shape, one.beam_sigma_rad, str(view.tracer.grid.device)))
         gain = one.path_gain[place.rows[0]].ravel()
         known = np.isfinite(gain)
         above = to_db(np.where(known, gain, 0.0), one.floor) - 10.0 * np.log10(one.floor)
         target = Target(above, None if known.all() else known.astype(float))
-        return Observation(place, view, self._whole[key], target, float(one.floor), robust=False)
+        return Observation(place, view, measured, target, float(one.floor), robust=False)
 
-    def frame(self) -> Frame:
-        one = self.one
-        return Frame(
-            one.transmitter, one.frequency_hz, one.shape, one.floor, one.range_db, one.beam_sigma_rad, one.air
-        )  # fmt: skip
+    def frame(self) -> SpectrumDataset:
+        return self.one
 
 
 @dataclass(eq=False)
@@ -683,26 +674,9 @@ def _check_places(mesh: Mesh | None, one: Readings | ArraySpectra, device: Devic
         check_positions(mesh, transmitter, receivers, wavelength_m, names=names, device=device)
 
 
-@dataclass(frozen=True)
-class Frame:
-    """What a field's spectra are made with: those of the first data set of spectra, else defaults; and its transmitter.
-
-    Attributes:
-        transmitter: position [m], shape ``(3,)``.
-        frequency_hz, shape, floor, range_db, beam_sigma_rad, air: see :class:`SpectrumDataset`.
-    """
-
-    transmitter: np.ndarray
-    frequency_hz: float
-    shape: tuple[int, int]
-    floor: float
-    range_db: tuple[float, float]
-    beam_sigma_rad: float
-    air: Air | None
-
-
-def frame_of(data: Sequence[Measured]) -> Frame:
-    """That of the first data set of spectra, else of the first."""
+def frame_of(data: Sequence[Measured]) -> SpectrumDataset:
+    """What a field's spectra are made with, and its transmitter: the first data set of spectra, else an empty one that is like
+    the first of readings."""
     return min(kinds_of(data), key=lambda kind: not isinstance(kind, _Spectra)).frame()
 
 

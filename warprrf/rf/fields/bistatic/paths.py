@@ -33,11 +33,6 @@ def paths_of(
     view, found = gains.view, gains.view.paths
     exact = np.flatnonzero(gains.specular > 0)
     specular, vertices = gains.specular[exact], found.point[exact]
-    kinds = np.select(
-        [found.over_edge[exact], found.slabs[exact] > 0, found.order[exact] > 0],
-        ["edge", "slab", "mirror"],
-        "los",
-    ).astype("<U7")
     diffuse = gains.by_ray().reshape(*image.shape, -1).sum(axis=-1)
     point = _bounce_points(view, gains.single, floor)
     kept = diffuse > floor
@@ -61,7 +56,7 @@ def paths_of(
         view.receivers[0],
         np.concatenate([vertices, over]),
         np.sqrt(np.concatenate([specular, power])).astype(complex),
-        np.concatenate([kinds, np.full(len(power), "diffuse", dtype="<U7")]),
+        np.concatenate([found.kind[exact], np.full(len(power), "diffuse", dtype="<U7")]),
         view.tracer.frequency_hz,
         excess_m=np.concatenate([found.excess_m[exact], np.zeros(len(power))]),
         interactions=np.concatenate([found.code[exact], codes]),
@@ -82,14 +77,12 @@ def strongest(gains: PathGains, image: np.ndarray, beam_sigma_rad: float) -> tup
     point = receiver + range_m[..., None] * grid.directions[ray]
     outward = np.where(dark[..., None], 1.0, point - transmitter)
     length = np.where(dark, np.nan, np.linalg.norm(outward, axis=-1) + range_m)
-    if len(power) and view.beams is not None:
+    if len(power):
         beams = power[:, None, None] * view.beams
         which = beams.argmax(axis=0)
         diffuse = np.maximum(image - beams.sum(axis=0), 0.0)
         direct = np.take_along_axis(beams, which[None], axis=0)[0] > PATH_SHARE * diffuse
-        first = view.paths.point[:, 0]
-        first = np.where(np.isnan(first), receiver, first) - transmitter
-        outward = np.where(direct[..., None], first[which], outward)
+        outward = np.where(direct[..., None], view.outward[which], outward)
         length = np.where(direct, view.paths.delay_m[which], length)
     length = np.where(np.isfinite(length), length, np.nan)
     outward = np.where(np.isnan(length)[..., None], 1.0, outward)

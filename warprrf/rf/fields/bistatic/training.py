@@ -17,7 +17,7 @@ import numpy as np
 from warprrf.cache import cached_property
 from warprrf.checks import check_count
 from warprrf.cluster import each
-from warprrf.device import DeviceLike, Progress
+from warprrf.device import DeviceLike, Progress, resolve
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.fields.base import Data, Measured
@@ -96,22 +96,6 @@ class TrainingViews:
         """Surface, transmitter and grid of the first place."""
         return self.views[0].tracer
 
-    def subset(self, indices: Sequence[int] | np.ndarray) -> TrainingViews:
-        """Some of its places."""
-        chosen = [int(i) for i in indices]
-        return replace(self, places=[self.places[i] for i in chosen], views=[self.views[i] for i in chosen])
-
-    def check(self, places: Sequence[Place], sub_pixels: int | None) -> None:
-        """Raise ValueError if they are not those of exactly ``places``."""
-        same = len(self.places) == len(places) and all(
-            a.seen_from == b.seen_from for a, b in zip(self.places, places, strict=True)
-        )
-        if not same or sub_pixels not in (None, self.tracer.grid.sub_pixels):
-            raise ValueError(
-                f"views: got what {len(self.views)} receivers see with {self.tracer.grid.per_pixel} rays a pixel; "
-                f"expected exactly the {len(places)} receivers, transmitter, carrier, grid, beam, air and rays of this fit"
-            )
-
 
 def trace(
     geometry: GeometryLike,
@@ -163,16 +147,17 @@ def trace(
     for own in together.values():
         first = places[own[0]]
         loss_per_m = 0.0 if first.air is None else first.air.loss_per_m(first.frequency_hz)
-        tracer = Tracer.of(
-            surface, first.transmitter, first.frequency_hz, first.shape, sub_pixels,
-            beam_sigma_rad=first.beam_sigma_rad, loss_per_m=loss_per_m, device=device,
+        make = partial(
+            Tracer.of, surface, first.transmitter, first.frequency_hz, first.shape, sub_pixels,
+            beam_sigma_rad=first.beam_sigma_rad, loss_per_m=loss_per_m, device=str(resolve(device)),
         )  # fmt: skip
+        tracer = make()
         receivers = np.stack([places[k].receiver for k in own])
         if effects is None:
             wanted = replace(wanted, mirrors=tracer.images.affordable(receivers, wanted.mirrors))
         found = tracer.paths(receivers, wanted, progress)
-        parts = [(receivers[r], found.subset(np.flatnonzero(found.receiver == r))) for r in range(len(own))]
-        for r, view in each(partial(view_of, tracer.again, wanted, keeps), parts, client):
+        parts = [(receivers[r], found.take(np.flatnonzero(found.receiver == r))) for r in range(len(own))]
+        for r, view in each(partial(view_of, make, wanted, keeps), parts, client):
             views[own[r]] = tracer.adopted(view)
             tell("transport", len(views), len(places))
     seconds = time.perf_counter() - started
@@ -291,7 +276,7 @@ class Training:
         rng: np.random.Generator,
         progress: Progress | None = None,
     ) -> Training:
-        """What ``data`` holds of the places that decide, or of all if those are ``seen``."""
+        """What ``data`` holds of the places that decide, where that is ``seen``."""
         frequency_hz = frame_of(data).frequency_hz
         candidates = _possible(options.candidates(frequency_hz), seen.effects, data)
         steps = 4 + len(candidates) + MERGES + (2 * split.count if split.count <= FEW else 3)
@@ -299,9 +284,7 @@ class Training:
             options, candidates, seen.tracer.surface, split, {}, {},
             chains_of(seen.places), data, options.exponents(frequency_hz), _Steps(progress, split.count, steps),
         )  # fmt: skip
-        return found.and_at(
-            split.deciding if len(seen.places) < split.count else np.arange(split.count), seen, rng
-        )
+        return found.and_at(split.deciding, seen, rng)
 
     def and_at(self, places: np.ndarray, seen: TrainingViews, rng: np.random.Generator) -> Training:
         """With what was read at ``places`` (P,), where that is ``seen``, and readings of them that parameters are fitted to."""

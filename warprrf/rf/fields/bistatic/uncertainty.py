@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from warprrf.checks import Expected, check_arrays, lengths
 
@@ -74,9 +75,8 @@ class ErrorModel:
 
 def steepness(image_db: np.ndarray) -> np.ndarray:
     """Largest difference within 3 x 3 pixels [dB], azimuth wrapped, shape ``(H, W)``."""
-    padded = np.pad(np.pad(image_db, ((1, 1), (0, 0)), mode="edge"), ((0, 0), (1, 1)), mode="wrap")
-    window = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
-    return window.max(axis=(2, 3)) - window.min(axis=(2, 3))
+    largest, least = (f(image_db, 3, mode=("nearest", "wrap")) for f in (maximum_filter, minimum_filter))
+    return np.asarray(largest - least)
 
 
 def bins(image_db: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -170,10 +170,6 @@ class Layer:
         plane = self.loss.plane(image, shape)
         return _BatchTarget(plane, factor, extra, None, self.loss.moments(plane, shape), count)
 
-    def _size(self, pixels: wp.array) -> tuple[int, ...]:
-        """Receivers, rows and columns of the images that ``pixels`` are."""
-        return len(pixels) // self.problem.pixels, *self.problem.transport.shape
-
     def step(self, index: int, coefficients: wp.array) -> float:
         """Loss of batch ``index``; leaves its gradient in ``self.gradient`` (zero for Gaussians it does not see)."""
         p, k, batch, data = self.problem, self.problem.kernels, self.problem.batches[index], self.data[index]
@@ -208,7 +204,8 @@ class Layer:
     def _image_adjoint(self, data: _BatchTarget, moments: tuple[wp.array, wp.array]) -> wp.array:
         """The plane of similarities of the dB image of the sums that lie in ``self.scalars``; leaves errors and adjoint
         there."""
-        p, k, target, shape = self.problem, self.problem.kernels, self.target, self._size(data.factor)
+        p, k, target = self.problem, self.problem.kernels, self.target
+        shape = len(data.factor) // p.pixels, *p.transport.shape
         total, absolute, adjoint = self.scalars
         canvas, rows, width = self.loss.canvas(shape), shape[0] * shape[1], shape[2]
         place = width, len(canvas) // rows, WRAPPED
