@@ -29,6 +29,9 @@ def _measurements() -> str:
     return markdown(("fitted to", *(title for _, title, _ in columns)), lines)
 
 
+WHAT = {"spectrum": "one spectrum", "horn": "readings of a turned horn"}
+
+
 @entry("headline-less")
 def _headline_less() -> str:
     rows = read("measurements")["rows"]
@@ -37,16 +40,16 @@ def _headline_less() -> str:
     )
     at = [r for r in read("locate")["rows"] if r["measured"].startswith(("spectrum", "horn"))]
     lines = [
-        ["one spectrum, of 60 x 120 pixels", f"spectra: PSNR {one['psnr_db']:.1f} dB"],
-        ["a horn's readings at ten places, its gain unknown", f"spectra: PSNR {horn['psnr_db']:.1f} dB"],
-        ["total power at 50 places, the meter's gain unknown", f"total power: {power['total_rms_db']:.1f} dB rms"],
+        ["one spectrum of 60 x 120 pixels", f"spectra: PSNR {one['psnr_db']:.1f} dB"],
+        ["readings of a horn of unknown gain, turned at ten places", f"spectra: PSNR {horn['psnr_db']:.1f} dB"],
+        ["total power at 50 places, by a meter of unknown gain", f"total power: error {power['total_rms_db']:.1f} dB rms"],
         *(
-            [f"{', '.join(['50 spectra', *given])}; of the new receiver: {seen}",
-             f"its position: error {r['median_cm']:.0f} cm (median), {r['p90_cm']:.0f} cm (90th percentile)"]
+            [f"50 spectra, geometry {', '.join(given)}; at the new receiver {WHAT[seen]}",
+             f"position of the receiver: error {r['median_cm']:.0f} cm (median), {r['p90_cm']:.0f} cm (90th percentile)"]
             for r, (seen, *given) in ((r, r["measured"].split(", ")) for r in at)
         ),
     ]  # fmt: skip
-    return markdown(("known", "predicted for receivers held out"), lines)
+    return markdown(("measured", "predicted for receivers held out"), lines)
 
 
 @entry("headline-measured")
@@ -90,7 +93,8 @@ def _headline_measured() -> str:
         rival = f"{best['rms_db']:.1f} ({best['model']})"
         lines.append([said, show(field and field["rms_db"]), rival, show(noise)])
     return markdown(
-        ("power, error [dB rms]", "radio field", "best simple model", "noise of the measurement"), lines
+        ("error of power [dB rms]", "radio field", "best simple model (which)", "noise of the measurement"),
+        lines,
     )
 
 
