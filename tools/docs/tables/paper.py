@@ -301,7 +301,7 @@ def _published() -> str:
 
 @entry("law")
 def _law() -> str:
-    words = {"paper-law": "our own engine with the paper's distance law"}
+    words = {"paper-law": "made with the paper's distance law, path by path"}
     lines = [
         [
             words.get(r["truth"], PLACES.get((r["truth"], "random"), r["truth"])), str(r["count"]),
