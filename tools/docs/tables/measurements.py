@@ -304,7 +304,7 @@ def _reciprocal() -> str:
 @entry("limits")
 def _limits() -> str:
     lines = [[r["what"], f"{r['figure']} {r['unit']}", r["date"]] for r in read("limits")["rows"]]
-    return markdown(("what", "figure", "stated on"), lines)
+    return markdown(("what", "figure", "first stated on"), lines)
 
 
 @entry("arrays")
