@@ -336,17 +336,17 @@ def _bare_mesh() -> str:
 
 EFFECTS = {
     "line_of_sight": "line of sight",
-    "mirrors_1": "mirror reflections, one",
-    "mirrors_2": "mirror reflections, two",
-    "scatterings_1": "scattering, once",
-    "mirror_scatter": "scattering after a mirror",
-    "scatter_mirror": "scattering before a mirror",
-    "scatterings_2": "scattering, twice and more",
-    "lobe_0": "the widest scattering lobe",
+    "mirrors_1": "one mirror",
+    "mirrors_2": "two mirrors",
+    "scatterings_1": "one scattering",
+    "mirror_scatter": "mirror, then scattering",
+    "scatter_mirror": "scattering, then mirror",
+    "scatterings_2": "two scatterings and more",
+    "lobe_0": "the widest scattering lobe (Lambertian)",
     "lobe_4": "scattering lobe of exponent 4",
     "lobe_10": "scattering lobe of exponent 10",
     "gas": "absorption by the air (ITU-R P.676)",
-    "diffraction": "diffraction over one edge",
+    "diffraction": "diffraction at one edge",
     "transmission": "transmission through walls (ITU-R P.2040)",
 }
 
