@@ -183,7 +183,7 @@ def _steps() -> str:
     return _edited(
         "seconds",
         (
-            ("what", "what is computed", "{}"), ("edit_s", "edit [core s]", "{:.2f}"), 
+            ("what", "what is computed", "{}"), ("edit_s", "edit [core s]", "{:.2f}"),
             ("step_s", "after the edit [core s]", "{:.2f}"),
             ("whole_s", "in an unchanged room [core s]", "{:.2f}"), ("share", "edited / unchanged", "{:.2f}"),
         ),
