@@ -154,7 +154,14 @@ def _place() -> str:
 @entry("flat")
 def _flat() -> str:
     found = read("measured_flat")
-    head = ("held out", "model", "error, rms [dB]", "in sight", "behind walls", "worst anchor or room")
+    head = (
+        "held out",
+        "model",
+        "error, rms [dB]",
+        "in sight [dB]",
+        "behind walls [dB]",
+        "worst anchor or room [dB]",
+    )
     keys = ("rms_db", "seen_db", "behind_db", "worst_db")
     lines = [
         [
@@ -178,7 +185,8 @@ def _flat_noise() -> str:
         for name, r in ((n, found[n]) for n in ("all", "in sight", "behind walls"))
     ]
     head = (
-        "links", "means", "noise of a mean, halves by time [dB]", "halves by chance (no drift)", "of a single reading",
+        "links", "number of means", "noise of a mean, halves by time [dB]", "noise of a mean, random halves [dB]",
+        "noise of a single reading [dB]",
     )  # fmt: skip
     return markdown(head, lines)
 
@@ -192,7 +200,9 @@ def _floor_noise() -> str:
 def _floor_heights() -> str:
     rows = read("measured_office")["heights"]
     lines = [[f"{r['height_m']:.1f}", f"{r['later_rms_ns']:.3f}", f"{r['later_most_ns']:.3f}"] for r in rows]
-    return markdown(("receivers at [m]", "straight rays later, rms [ns]", "at most [ns]"), lines)
+    return markdown(
+        ("assumed height of receivers [m]", "change of the direct delay, rms [ns]", "at most [ns]"), lines
+    )
 
 
 @entry("floor-arrivals")
@@ -212,9 +222,9 @@ def _floor() -> str:
         "held out",
         "model",
         "error, rms [dB]",
-        "mean [dB]",
-        "no path",
-        *(f"receiver {k}" for k in range(1, 5)),
+        "mean error [dB]",
+        "links without a path",
+        *(f"receiver {k} [dB]" for k in range(1, 5)),
     )
     lines = [
         [
@@ -253,10 +263,10 @@ def _hall() -> str:
     head = (
         "model",
         "error, rms [dB]",
-        "in sight",
-        "behind walls",
-        "mean",
-        *(f"places {name}" for name in blocks),
+        "in sight [dB]",
+        "behind walls [dB]",
+        "mean error behind walls [dB]",
+        *(f"places {name} [dB]" for name in blocks),
     )
     lines = [
         [
