@@ -201,11 +201,11 @@ def _paper_statement() -> str:
     parts = []
     for truth, name in PAPER_TRUTHS.items():
         own = [r["psnr_db"]["difference"] for r in read("law")["sizes"] if r["truth"] == truth]
-        parts.append(f"{name}: {sum(own) / len(own):+.1f} dB (mean of {len(own)})")
+        parts.append(f"- {name}: {sum(own) / len(own):+.1f} dB (over {len(own)} numbers of spectra)")
     return (
         f"The paper reports that RF-3DGS+ has {published['rf3dgs+'] - published['rf3dgs']:.1f} dB more PSNR than RF-3DGS. Here "
-        "the PSNR of RF-3DGS+ minus that of RF-3DGS, as a mean over numbers of training spectra, is: "
-        f"{'; '.join(parts)}."
+        "the PSNR of RF-3DGS+ minus that of RF-3DGS, as a mean over numbers of training spectra, is:\n\n"
+        + "\n".join(parts)
     )
 
 
