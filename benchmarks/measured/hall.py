@@ -52,25 +52,29 @@ EFFECTS = wr.Effects(
 )
 NOISE = (
     ("part", "links", "{}"), ("links", "number", "{}"), ("found", "line of sight found", "{}"),
-    ("length_m", "length [m]", "{:+.3f}"), ("length_m_spread", "spread", "{:.3f}"),
-    ("departure_deg", "departure [degrees]", "{:+.1f}"), ("departure_deg_spread", "spread", "{:.1f}"),
-    ("arrival_deg", "arrival [degrees]", "{:+.1f}"), ("arrival_deg_spread", "spread", "{:.1f}"),
-    ("gain_db", "over free space [dB]", "{:.1f}"), ("gain_db_spread", "spread", "{:.2f}"),
+    ("length_m", "length error [m]", "{:+.3f}"), ("length_m_spread", "spread", "{:.3f}"),
+    ("departure_deg", "departure error [degrees]", "{:+.1f}"), ("departure_deg_spread", "spread", "{:.1f}"),
+    ("arrival_deg", "arrival error [degrees]", "{:+.1f}"), ("arrival_deg_spread", "spread", "{:.1f}"),
+    ("gain_db", "power over free space, in the file's unit [dB]", "{:.1f}"), ("gain_db_spread", "spread", "{:.2f}"),
 )  # fmt: skip
 UNFITTED = (
-    ("model", "nothing fitted but a gain", "{}"), ("met", "NLOS paths met", "{:.0%}"), ("met_by_chance", "by chance", "{:.0%}"),
-    ("power", "of their power", "{:.0%}"), ("power_by_chance", "by chance", "{:.0%}"), ("length_m", "length off [m]", "{:.2f}"),
-    ("departure_deg", "departure off [degrees]", "{:.1f}"), ("arrival_deg", "arrival off [degrees]", "{:.1f}"),
-    ("level_db", "power off [dB]", "{:.1f}"), ("strongest_db", "strongest pair, rms [dB]", "{:.1f}"),
+    ("model", "nothing fitted but a gain", "{}"), ("met", "NLOS paths matched", "{:.0%}"), ("met_by_chance", "by chance", "{:.0%}"),
+    ("power", "share of NLOS power matched", "{:.0%}"), ("power_by_chance", "by chance", "{:.0%}"),
+    ("length_m", "length error [m]", "{:.2f}"),
+    ("departure_deg", "departure error [degrees]", "{:.1f}"), ("arrival_deg", "arrival error [degrees]", "{:.1f}"),
+    ("level_db", "power error [dB]", "{:.1f}"), ("strongest_db", "power of the strongest pair, rms error [dB]", "{:.1f}"),
 )  # fmt: skip
 BOUNCES = (
-    ("at", "one bounce at", "{}"), ("paths", "NLOS paths", "{}"), ("power", "of their power", "{:.0%}"), ("met", "met", "{:.0%}"),
+    ("at", "one bounce at", "{}"), ("paths", "NLOS paths", "{}"), ("power", "share of NLOS power", "{:.0%}"),
+    ("met", "matched", "{:.0%}"),
 )  # fmt: skip
 FITTED = (
-    ("model", "model", "{}"), ("rms_db", "pairs, rms [dB]", "{:.1f}"), ("sight_db", "line of sight", "{:.1f}"),
-    ("nlos_db", "NLOS", "{:.1f}"), ("nlos_mean_db", "NLOS, mean", "{:+.1f}"), ("lit", "empty pairs lit", "{:.1%}"),
-    ("found", "strongest pair found", "{:.0%}"), ("nlos_found", "if NLOS", "{:.0%}"), ("lost_db", "lost, median [dB]", "{:.1f}"),
-    ("lost_most_db", "90th percentile", "{:.1f}"), ("nlos_lost_db", "median if NLOS", "{:.1f}"),
+    ("model", "model", "{}"), ("rms_db", "power of pairs, rms error [dB]", "{:.1f}"), ("sight_db", "line of sight [dB]", "{:.1f}"),
+    ("nlos_db", "NLOS [dB]", "{:.1f}"), ("nlos_mean_db", "NLOS, mean error [dB]", "{:+.1f}"),
+    ("lit", "empty pairs predicted above noise", "{:.1%}"),
+    ("found", "strongest pair found", "{:.0%}"), ("nlos_found", "the same if NLOS", "{:.0%}"),
+    ("lost_db", "beam loss, median [dB]", "{:.1f}"),
+    ("lost_most_db", "90th percentile [dB]", "{:.1f}"), ("nlos_lost_db", "median if NLOS [dB]", "{:.1f}"),
 )  # fmt: skip
 
 

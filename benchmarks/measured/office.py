@@ -63,17 +63,19 @@ EFFECTS = wr.Effects(
 Spot: TypeAlias = tuple[float, ...]
 Quad: TypeAlias = list[Spot]
 NOISE = (
-    ("receiver", "receiver", "{}"), ("noise_db", "noise [dB]", "{:.1f}"), ("clear_db", "first arrival over it [dB]", "{:.0f}"),
-    ("first_ns", "its delay by noise [ns]", "{:.3f}"), ("first_db", "its power by noise [dB]", "{:.2f}"),
-    ("total_db", "all power by noise [dB]", "{:.2f}"), ("heights_ns", "by height: delay [ns]", "{:.2f}"),
-    ("heights_db", "power [dB]", "{:.1f}"), ("heights_total_db", "all power [dB]", "{:.1f}"),
+    ("receiver", "receiver", "{}"), ("noise_db", "noise [dB]", "{:.1f}"), ("clear_db", "first arrival above noise [dB]", "{:.0f}"),
+    ("first_ns", "error by noise: its delay [ns]", "{:.3f}"), ("first_db", "its power [dB]", "{:.2f}"),
+    ("total_db", "total power [dB]", "{:.2f}"), ("heights_ns", "between heights: its delay [ns]", "{:.2f}"),
+    ("heights_db", "its power [dB]", "{:.1f}"), ("heights_total_db", "total power [dB]", "{:.1f}"),
 )  # fmt: skip
 ARRIVALS = (
-    ("model", "nothing fitted", "{}"), ("missed", "not traced", "{}"), ("first_ns", "first: delay, median [ns]", "{:.2f}"),
-    ("first_db", "power, rms [dB]", "{:.1f}"), ("first_mean_db", "mean [dB]", "{:+.1f}"),
-    ("near_first_ns", "receivers 2 and 4: delay [ns]", "{:.2f}"), ("near_first_db", "power, rms [dB]", "{:.1f}"),
-    ("near_first_mean_db", "mean [dB]", "{:+.1f}"), ("strongest_ns", "strongest: delay, median [ns]", "{:.2f}"),
-    ("strongest_db", "power, rms [dB]", "{:.1f}"), ("met", "strong ones met", "{:.0%}"), ("by_chance", "by chance", "{:.0%}"),
+    ("model", "nothing fitted", "{}"), ("missed", "links not traced", "{}"),
+    ("first_ns", "first arrival: delay, median [ns]", "{:.2f}"),
+    ("first_db", "power, rms [dB]", "{:.1f}"), ("first_mean_db", "power, mean [dB]", "{:+.1f}"),
+    ("near_first_ns", "first arrival, receivers 2 and 4: delay [ns]", "{:.2f}"), ("near_first_db", "power, rms [dB]", "{:.1f}"),
+    ("near_first_mean_db", "power, mean [dB]", "{:+.1f}"), ("strongest_ns", "strongest arrival: delay, median [ns]", "{:.2f}"),
+    ("strongest_db", "power, rms [dB]", "{:.1f}"), ("met", "strong arrivals matched", "{:.0%}"),
+    ("by_chance", "by chance", "{:.0%}"),
 )  # fmt: skip
 
 

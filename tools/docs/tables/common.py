@@ -116,7 +116,7 @@ def _machine(name: str) -> str:
         on = f"{m['processor']}, {m['cores']} cores{device}, Python {m['python']}, Warp {m['versions']['warp-lang']}"
         text = f"Measured on {on}. {text}"
     if old := older(name):
-        text += f" **Not run since these changed: {', '.join(old)}.** Today's code gives other figures."
+        text += f" **Not run since these parts of the code changed: {', '.join(old)}.** Today's code gives other figures."
     return text
 
 

@@ -77,8 +77,9 @@ def _plane_wave() -> str:
 def _city_paths() -> str:
     found = read("city_paths")
     head = (
-        "scene", "triangles", "receivers", "of PathSolver's paths", "delay error [s]", "gain error [dB]", "only ours",
-        "load [s]", "one receiver [s]", "all [s]", "PathSolver, one [s]", "all [s]",
+        "scene", "triangles", "receivers", "PathSolver's paths found", "largest delay difference [s]",
+        "largest gain difference [dB]", "paths only ours", "load [s]", "ours, one receiver [s]", "ours, all [s]",
+        "PathSolver, one [s]", "PathSolver, all [s]",
     )  # fmt: skip
     lines = []
     for r in found["scenes"]:
@@ -93,7 +94,7 @@ def _city_paths() -> str:
         )
     apart = [
         f"`{r['scene']}`: {r['gain_apart']} of {r['found']} gains differ by more than 0.05 dB, by {r['gain_error_db']:.3f} dB "
-        f"at most. It is PathSolver's single precision: solved near the origin they differ by "
+        f"at most. The reason is PathSolver's single precision: solved near the origin they differ by "
         f"{r['gain_apart_near_origin_db']:.4f} dB."
         for r in found["scenes"]
         if r["gain_apart"]
@@ -116,7 +117,7 @@ def _city_verbs() -> str:
         for r in found["verbs"]
     ]
     head = ("scene", "call", "first [s]", "again [s]", "core [s]", "peak memory [GB]")
-    busy = f"Load average of the machine when it ended: {found['load_average']:.1f} on {found['machine']['cores']} cores."
+    busy = f"Load average of the machine at the end: {found['load_average']:.1f} on {found['machine']['cores']} cores."
     return "\n\n".join([markdown(head, lines), busy])
 
 
@@ -159,8 +160,8 @@ def _person() -> str:
     return _edited(
         "person",
         (
-            ("x", "from the transmitter [m]", "{:g}"), ("deepest_db", "deepest [dB]", "{:.1f}"),
-            ("screen_db", "P.526: deepest [dB]", "{:.1f}"),
+            ("x", "person's distance from the transmitter [m]", "{:g}"), ("deepest_db", "deepest fade [dB]", "{:.1f}"),
+            ("screen_db", "by P.526 [dB]", "{:.1f}"),
             ("shadow_rms_db", "difference in the shadow: rms [dB]", "{:.2f}"), ("shadow_most_db", "largest [dB]", "{:.2f}"),
         ),
     )  # fmt: skip
@@ -182,7 +183,8 @@ def _steps() -> str:
     return _edited(
         "seconds",
         (
-            ("what", "step of", "{}"), ("edit_s", "edit [core s]", "{:.2f}"), ("step_s", "then [core s]", "{:.2f}"),
-            ("whole_s", "whole [core s]", "{:.2f}"), ("share", "step / whole", "{:.2f}"),
+            ("what", "what is computed", "{}"), ("edit_s", "edit [core s]", "{:.2f}"),
+            ("step_s", "after the edit [core s]", "{:.2f}"),
+            ("whole_s", "in an unchanged room [core s]", "{:.2f}"), ("share", "edited / unchanged", "{:.2f}"),
         ),
     )  # fmt: skip

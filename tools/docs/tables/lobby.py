@@ -10,15 +10,18 @@ def _lobby_geometry() -> str:
     r = read("lobby")
     g = r["geometry"]
     rows = [
-        ("photos posed", f"{g['posed']} of {g['photos']}"),
+        ("photos for which a pose was found", f"{g['posed']} of {g['photos']}"),
         ("PSNR of photos held out", f"{r['photo_psnr_db']:.1f} dB"),
-        ("PSNR of two renderings of one photo with other noise", f"{r['photo_noise_psnr_db']:.1f} dB"),
         (
-            f"camera positions, rms error, scale from {g['surveyed']} surveyed ones",
+            "PSNR between two renderings of one photo with different noise",
+            f"{r['photo_noise_psnr_db']:.1f} dB",
+        ),
+        (
+            f"camera positions, rms error (scale from {g['surveyed']} surveyed ones)",
             f"{1e3 * r['camera_rms_m']:.1f} mm",
         ),
         (
-            "mesh to the true surface where a photo sees it, median",
+            "distance of the mesh to the true surface, where a photo sees it: median",
             f"{1e3 * r['mesh_distance_median_m']:.1f} mm",
         ),
         ("the same, 90th percentile", f"{1e3 * r['mesh_distance_p90_m']:.1f} mm"),
@@ -36,7 +39,7 @@ SCORES = (
     ("direction_within_3deg", "within 3°", "{:.0%}"),
     ("direction_within_3deg_blocked", "within 3°, blocked", "{:.0%}"),
     ("beam_gain_loss_db", "beam loss [dB]", "{:.1f}"),
-    ("tof_error_median_ns", "delay [ns]", "{:.2g}"),
+    ("tof_error_median_ns", "delay error [ns]", "{:.2g}"),
 )
 
 
@@ -85,10 +88,9 @@ def _stage(name: str) -> str:
 @entry("lobby-seeds")
 def _lobby_seeds() -> str:
     found = read("lobby_seeds")
-    words = {"psnr_db": "PSNR [dB]", "psnr_db_blocked": "PSNR, blocked [dB]"}
     lines = [
         [
-            ": ".join(words.get(w, w) for w in r["figure"].split(": ")),
+            _seeded(r["figure"]),
             *(show(r[k], "{:.4g}") for k in ("mean", "spread", "least", "most")),
         ]
         for r in found["rows"]
@@ -102,15 +104,31 @@ def _lobby_seeds() -> str:
     )
 
 
+def _seeded(figure: str) -> str:
+    """A figure of several seeds in the words of the other tables."""
+    words = {
+        "psnr_db_blocked": "PSNR, blocked [dB]", "psnr_db": "PSNR [dB]", "bistatic (ours)": "bistatic",
+        "truth exact": f"truth of {TRUTHS['exact']}", "truth Sionna RT": f"truth of {TRUTHS['sionna']}",
+        "surveyed-scale camera positions, rms error [m]": "camera positions, rms error [m]",
+        "PSNR between two render seeds of a view (the photos' own noise) [dB]": "PSNR between two renderings of one photo with "
+        "different noise [dB]",
+        "mesh to true surface where a photo sees it, median [m]": "distance of the mesh to the true surface, where a photo sees "
+        "it: median [m]",
+    }  # fmt: skip
+    for word, said in words.items():
+        figure = figure.replace(word, said)
+    return figure
+
+
 @entry("ablation")
 def _ablation() -> str:
     rows = read("bistatic")["ablation"]
     words = {
-        "everything": "everything",
-        "zero spectra": "the same geometry, no spectra at all",
+        "everything": "all parts",
+        "zero spectra": "the field before any fit (no spectra)",
         "RF-3DGS+ with line of sight": "RF-3DGS+ with an explicit line of sight",
         "no residual per element": "no correction per surface element",
-        "true mesh, its materials as groups": "everything, on the true mesh with its materials as groups",
+        "true mesh, its materials as groups": "all parts, on the true mesh with its named materials",
     }
     lines = []
     for model in dict.fromkeys(r["model"] for r in rows):
@@ -131,7 +149,13 @@ def _uncertainty() -> str:
         for r in read("bistatic")["calibration"]
     ]  # fmt: skip
     return markdown(
-        ("truth, training receivers", "rms error [dB]", "within one standard deviation", "within two"), lines
+        (
+            "truth, training receivers",
+            "rms error [dB]",
+            "within one standard deviation",
+            "within two standard deviations",
+        ),
+        lines,
     )
 
 
@@ -144,7 +168,12 @@ def _delays() -> str:
         ]
         for r in read("bistatic")["delays"]
     ]  # fmt: skip
-    head = ("truth, training receivers", "mirror paths found", "their delay error [ns]", "scattering's [ns]")
+    head = (
+        "truth, training receivers",
+        "true mirror paths found",
+        "delay error of mirror paths [ns]",
+        "delay error of scattering [ns]",
+    )
     return markdown(head, lines)
 
 
@@ -158,8 +187,8 @@ def _transmitter() -> str:
         for r in read("transmitter")["second"]
     ]  # fmt: skip
     head = (
-        "model, ten spectra", "PSNR, fitted transmitter [dB]", "PSNR, another one [dB]", "its within 3°",
-        "its within 3°, blocked",
+        "model, ten spectra", "fitted transmitter: PSNR [dB]", "other transmitter: PSNR [dB]", "other transmitter: within 3°",
+        "other transmitter: within 3°, blocked",
     )  # fmt: skip
     return markdown(head, lines)
 

@@ -29,6 +29,9 @@ def _measurements() -> str:
     return markdown(("fitted to", *(title for _, title, _ in columns)), lines)
 
 
+WHAT = {"spectrum": "one spectrum", "horn": "readings of a turned horn"}
+
+
 @entry("headline-less")
 def _headline_less() -> str:
     rows = read("measurements")["rows"]
@@ -37,16 +40,16 @@ def _headline_less() -> str:
     )
     at = [r for r in read("locate")["rows"] if r["measured"].startswith(("spectrum", "horn"))]
     lines = [
-        ["one spectrum, of 60 x 120 pixels", f"spectra: PSNR {one['psnr_db']:.1f} dB"],
-        ["a horn's readings at ten places, its gain unknown", f"spectra: PSNR {horn['psnr_db']:.1f} dB"],
-        ["total power at 50 places, the meter's gain unknown", f"total power: {power['total_rms_db']:.1f} dB rms"],
+        ["one spectrum of 60 x 120 pixels", f"spectra: PSNR {one['psnr_db']:.1f} dB"],
+        ["readings of a horn of unknown gain, turned at ten places", f"spectra: PSNR {horn['psnr_db']:.1f} dB"],
+        ["total power at 50 places, by a meter of unknown gain", f"total power: error {power['total_rms_db']:.1f} dB rms"],
         *(
-            [f"{', '.join(['50 spectra', *given])}; of the new receiver: {seen}",
-             f"its position: error {r['median_cm']:.0f} cm (median), {r['p90_cm']:.0f} cm (90th percentile)"]
+            [f"50 spectra, geometry {', '.join(given)}; at the new receiver {WHAT[seen]}",
+             f"position of the receiver: error {r['median_cm']:.0f} cm (median), {r['p90_cm']:.0f} cm (90th percentile)"]
             for r, (seen, *given) in ((r, r["measured"].split(", ")) for r in at)
         ),
     ]  # fmt: skip
-    return markdown(("known", "predicted for receivers held out"), lines)
+    return markdown(("measured", "predicted for receivers held out"), lines)
 
 
 @entry("headline-measured")
@@ -90,7 +93,8 @@ def _headline_measured() -> str:
         rival = f"{best['rms_db']:.1f} ({best['model']})"
         lines.append([said, show(field and field["rms_db"]), rival, show(noise)])
     return markdown(
-        ("power, error [dB rms]", "radio field", "best simple model", "noise of the measurement"), lines
+        ("error of power [dB rms]", "radio field", "best simple model (which)", "noise of the measurement"),
+        lines,
     )
 
 
@@ -150,7 +154,14 @@ def _place() -> str:
 @entry("flat")
 def _flat() -> str:
     found = read("measured_flat")
-    head = ("held out", "model", "error, rms [dB]", "in sight", "behind walls", "worst anchor or room")
+    head = (
+        "held out",
+        "model",
+        "error, rms [dB]",
+        "in sight [dB]",
+        "behind walls [dB]",
+        "worst anchor or room [dB]",
+    )
     keys = ("rms_db", "seen_db", "behind_db", "worst_db")
     lines = [
         [
@@ -174,7 +185,8 @@ def _flat_noise() -> str:
         for name, r in ((n, found[n]) for n in ("all", "in sight", "behind walls"))
     ]
     head = (
-        "links", "means", "noise of a mean, halves by time [dB]", "halves by chance (no drift)", "of a single reading",
+        "links", "number of means", "noise of a mean, halves by time [dB]", "noise of a mean, random halves [dB]",
+        "noise of a single reading [dB]",
     )  # fmt: skip
     return markdown(head, lines)
 
@@ -188,7 +200,9 @@ def _floor_noise() -> str:
 def _floor_heights() -> str:
     rows = read("measured_office")["heights"]
     lines = [[f"{r['height_m']:.1f}", f"{r['later_rms_ns']:.3f}", f"{r['later_most_ns']:.3f}"] for r in rows]
-    return markdown(("receivers at [m]", "straight rays later, rms [ns]", "at most [ns]"), lines)
+    return markdown(
+        ("assumed height of receivers [m]", "change of the direct delay, rms [ns]", "at most [ns]"), lines
+    )
 
 
 @entry("floor-arrivals")
@@ -208,9 +222,9 @@ def _floor() -> str:
         "held out",
         "model",
         "error, rms [dB]",
-        "mean [dB]",
-        "no path",
-        *(f"receiver {k}" for k in range(1, 5)),
+        "mean error [dB]",
+        "links without a path",
+        *(f"receiver {k} [dB]" for k in range(1, 5)),
     )
     lines = [
         [
@@ -249,10 +263,10 @@ def _hall() -> str:
     head = (
         "model",
         "error, rms [dB]",
-        "in sight",
-        "behind walls",
-        "mean",
-        *(f"places {name}" for name in blocks),
+        "in sight [dB]",
+        "behind walls [dB]",
+        "mean error behind walls [dB]",
+        *(f"places {name} [dB]" for name in blocks),
     )
     lines = [
         [
@@ -300,7 +314,7 @@ def _reciprocal() -> str:
 @entry("limits")
 def _limits() -> str:
     lines = [[r["what"], f"{r['figure']} {r['unit']}", r["date"]] for r in read("limits")["rows"]]
-    return markdown(("what", "figure", "stated on"), lines)
+    return markdown(("what", "figure", "first stated on"), lines)
 
 
 @entry("arrays")
@@ -332,17 +346,17 @@ def _bare_mesh() -> str:
 
 EFFECTS = {
     "line_of_sight": "line of sight",
-    "mirrors_1": "mirror reflections, one",
-    "mirrors_2": "mirror reflections, two",
-    "scatterings_1": "scattering, once",
-    "mirror_scatter": "scattering after a mirror",
-    "scatter_mirror": "scattering before a mirror",
-    "scatterings_2": "scattering, twice and more",
-    "lobe_0": "the widest scattering lobe",
+    "mirrors_1": "one mirror",
+    "mirrors_2": "two mirrors",
+    "scatterings_1": "one scattering",
+    "mirror_scatter": "mirror, then scattering",
+    "scatter_mirror": "scattering, then mirror",
+    "scatterings_2": "two scatterings and more",
+    "lobe_0": "the widest scattering lobe (Lambertian)",
     "lobe_4": "scattering lobe of exponent 4",
     "lobe_10": "scattering lobe of exponent 10",
     "gas": "absorption by the air (ITU-R P.676)",
-    "diffraction": "diffraction over one edge",
+    "diffraction": "diffraction at one edge",
     "transmission": "transmission through walls (ITU-R P.2040)",
 }
 

@@ -16,7 +16,7 @@ PLACES = {
     ("sionna", "region"): "Sionna RT, a region held out",
 }
 PAPER_TRUTHS = {truth: name for (truth, split), name in PLACES.items() if split == "random"}
-PAPER_TRUTHS["paper-law"] = "targets made by the paper's law"
+PAPER_TRUTHS["paper-law"] = "spectra made with the paper's distance law"
 
 
 @cache
@@ -63,7 +63,8 @@ def _headline() -> str:
     head = [f"{room}: {name}" for room, own in shown.values() for name, *_ in own]
     old = {r["method"] for r in older_runs()}.intersection(("bistatic", "rf3dgs+", "rf3dgs", "nearest"))
     said = "".join(
-        f"\n\n*Runs of {NAMES[m].strip('*')} are of earlier code: today's may differ.*" for m in sorted(old)
+        f"\n\n*The figures of {NAMES[m].strip('*')} are of an earlier version of the code; today's may differ.*"
+        for m in sorted(old)
     )
     return markdown(("trained on 100 spectra", *head), lines) + said
 
@@ -125,7 +126,7 @@ def _paper_margins() -> str:
             for r in sorted(rows, key=lambda r: list(NAMES).index(r["method"]))
         ]
         if lines:
-            first = f"{name}, 100 spectra: bistatic minus"
+            first = f"{name}, 100 spectra: bistatic minus ..."
             head = (first, *(f"{label}, all / blocked" for label, *_ in forms))
             parts.append(markdown(head, lines))
     return "\n\n".join(parts)
@@ -135,7 +136,7 @@ def _paper_margins() -> str:
 def _paper_behind() -> str:
     better = {"rmse_db": -1.0, "beam_gain_loss_db": -1.0}  # of the others more is better
     words = {
-        "psnr_db": "PSNR [dB]", "ssim": "SSIM", "rmse_db": "RMSE [dB]", "direction_within_3deg": "within 3°",
+        "psnr_db": "PSNR [dB]", "ssim": "SSIM", "rmse_db": "RMSE [dB]", "direction_within_3deg": "within 3° [%]",
         "beam_gain_loss_db": "beam loss [dB]",
     }  # fmt: skip
     behind: dict[tuple[str, str, str], list[tuple[int, float]]] = {}
@@ -148,7 +149,9 @@ def _paper_behind() -> str:
                 if margin is not None and better.get(figure, 1.0) * margin < 0.0:
                     place = PLACES.get((r["truth"], r["split"]), r["truth"])
                     key = (place, NAMES[r["method"]], word + who)
-                    behind.setdefault(key, []).append((r["count"], margin))
+                    behind.setdefault(key, []).append(
+                        (r["count"], margin * (100.0 if "[%]" in word else 1.0))
+                    )
     text = f"Of {compared} comparisons the bistatic field is behind in {sum(map(len, behind.values()))}"
     if not behind:
         return text + "."
@@ -157,7 +160,13 @@ def _paper_behind() -> str:
         counts, differences = zip(*sorted(found), strict=True)
         worst = f"{max(differences, key=abs):+.2g}"
         lines.append([place, method, figure, ", ".join(map(str, counts)), worst])
-    head = ("truth", "behind", "in which score", "at how many spectra", "largest difference")
+    head = (
+        "truth",
+        "behind this method",
+        "in this score",
+        "at these numbers of spectra",
+        "largest difference, bistatic minus it",
+    )
     return f"{text}:\n\n{markdown(head, lines)}"
 
 
@@ -178,7 +187,8 @@ def _paper_detail() -> str:
         ]  # fmt: skip
         head = (
             f"{name}, 100 spectra", "SSIM", "LPIPS", "RMSE [dB]", "within 3°, all / blocked",
-            "beam loss [dB], all / blocked", "delay [ns]", "training [s]", "a spectrum [ms]", "memory [GiB]", "model [MiB]",
+            "beam loss [dB], all / blocked", "delay error [ns]", "training [s]", "predicting a spectrum [ms]", "peak memory [GiB]",
+            "model [MiB]",
         )  # fmt: skip
         if lines:
             parts.append(markdown(head, lines))
@@ -191,10 +201,11 @@ def _paper_statement() -> str:
     parts = []
     for truth, name in PAPER_TRUTHS.items():
         own = [r["psnr_db"]["difference"] for r in read("law")["sizes"] if r["truth"] == truth]
-        parts.append(f"{name}, {sum(own) / len(own):+.1f} dB ({len(own)} numbers of spectra)")
+        parts.append(f"- {name}: {sum(own) / len(own):+.1f} dB (over {len(own)} numbers of spectra)")
     return (
-        f"The paper reports RF-3DGS+ {published['rf3dgs+'] - published['rf3dgs']:.1f} dB above RF-3DGS. Here the mean difference "
-        f"in PSNR, RF-3DGS+ minus RF-3DGS, is: {'; '.join(parts)}."
+        f"The paper reports that RF-3DGS+ has {published['rf3dgs+'] - published['rf3dgs']:.1f} dB more PSNR than RF-3DGS. Here "
+        "the PSNR of RF-3DGS+ minus that of RF-3DGS, as a mean over numbers of training spectra, is:\n\n"
+        + "\n".join(parts)
     )
 
 
@@ -202,17 +213,26 @@ def _paper_statement() -> str:
 def _paper_runs() -> str:
     hashes = {(r["truth"], r["data"]): None for r in runs()} | {("paper-law", read("law")["data"]): None}
     data = "; ".join(
-        f"{name} {', '.join(own for truth, own in hashes if truth == known)}"
+        f"{name}: {', '.join(own for truth, own in hashes if truth == known)}"
         for known, name in PAPER_TRUTHS.items()
     )
     missing_runs = read("paper")["missing"]
-    left = f" Runs not made: {len(missing_runs)}." if missing_runs else ""
+    left = f" Planned but not run: {', '.join(map(_run, missing_runs))}." if missing_runs else ""
     rooms = {r["room"] for r in runs() if r["truth"] in ("exact", "sionna")}
     if old := older_runs():
         names = "; ".join(dict.fromkeys(NAMES[r["method"]].strip("*") for r in old))
-        left += f" **{len(old)} of {len(runs())} runs ({names}) are of earlier code: today's figures may differ.**"
-    made = f" The lobby's rows are of {len(rooms)} reconstructions from the same photos."
-    return f"Data files by their hash: {data}.{made}{left}"
+        left += (
+            f" **{len(old)} of {len(runs())} runs ({names}) are of an earlier version of the code; "
+            "today's figures may differ.**"
+        )
+    made = f" Rows of the lobby are of {len(rooms)} reconstructions from the same photos."
+    return f"Data files, by the first digits of their SHA-256: {data}.{made}{left}"
+
+
+def _run(key: str) -> str:
+    """A run in words, by its name in the result file."""
+    truth, split, count, _, method = key.split("-", 4)
+    return f"{NAMES[method].strip('*')} on {count} spectra of {PLACES[truth, split]}"
 
 
 @entry("paper-networks")
@@ -231,13 +251,13 @@ def _paper_networks() -> str:
         if (r["truth"], r["split"]) == (truth, split)
     ]  # fmt: skip
     head = (
-        "network", "truth", "spectra", "training [min]", "on", "last loss / first", "last loss / at half time",
+        "network", "truth", "training spectra", "training [min]", "on", "last loss / first loss", "last loss / loss at half time",
         "PSNR [dB]", "LPIPS",
     )  # fmt: skip
     text = (
-        f"NeRF2 trains for {effort['nerf2_iterations']} steps of {effort['nerf2_rays']} rays with "
-        f"{effort['nerf2_samples']} samples each (as published: 30000 of 8192 with 64), the GAN for "
-        f"{effort['cgan_iterations']} steps of {effort['cgan_batch']} spectra."
+        f"NeRF2 was trained for {effort['nerf2_iterations']} steps of {effort['nerf2_rays']} rays, with "
+        f"{effort['nerf2_samples']} samples on a ray. As published it has 30000 steps of 8192 rays, with 64 samples on a ray. "
+        f"The GAN was trained for {effort['cgan_iterations']} steps of {effort['cgan_batch']} spectra."
     )
     return f"{text}\n\n{markdown(head, lines)}"
 
@@ -260,9 +280,9 @@ def _paper_stage2() -> str:
                 )
     for r in read("published")["rows"][:1]:
         lines.append(
-            [NAMES[r["method"]], "as published, NVIDIA RTX 4090", "", "", show(r["train_s"], "{:.0f}")]
+            [NAMES[r["method"]], "the paper's, on an NVIDIA RTX 4090", "", "", show(r["train_s"], "{:.0f}")]
         )
-    return markdown(("stage 2, 700 spectra", "truth", "rays [s]", "fit [s]", "both [s]"), lines)
+    return markdown(("stage 2, 700 spectra", "truth", "tracing rays [s]", "fit [s]", "both [s]"), lines)
 
 
 @entry("published")
@@ -274,12 +294,14 @@ def _published() -> str:
         ]
         for r in read("published")["rows"]
     ]  # fmt: skip
-    return markdown(("as published", "PSNR [dB]", "SSIM", "LPIPS", "training [s]", "a spectrum [ms]"), lines)
+    return markdown(
+        ("as published", "PSNR [dB]", "SSIM", "LPIPS", "training [s]", "predicting a spectrum [ms]"), lines
+    )
 
 
 @entry("law")
 def _law() -> str:
-    words = {"paper-law": "made with the paper's factor, path by path"}
+    words = {"paper-law": "made with the paper's distance law, path by path"}
     lines = [
         [
             words.get(r["truth"], PLACES.get((r["truth"], "random"), r["truth"])), str(r["count"]),
@@ -287,7 +309,9 @@ def _law() -> str:
         ]
         for r in read("law")["sizes"]
     ]  # fmt: skip
-    return markdown(("truth", "spectra", "RF-3DGS+ [dB]", "RF-3DGS [dB]", "difference [dB]"), lines)
+    return markdown(
+        ("truth", "training spectra", "RF-3DGS+: PSNR [dB]", "RF-3DGS: PSNR [dB]", "difference [dB]"), lines
+    )
 
 
 @entry("gap")
@@ -300,7 +324,7 @@ def _gap() -> str:
             cells.append(show(r[key]["difference"], "{:+.1f}"))
         lines.append(cells)
     head = (
-        "changed", "spectra", "RF-3DGS+, PSNR [dB]", "RF-3DGS", "difference", "RF-3DGS+, each picture by its own range",
-        "RF-3DGS", "difference",
+        "changed", "training spectra", "RF-3DGS+: PSNR [dB]", "RF-3DGS: PSNR [dB]", "difference [dB]",
+        "RF-3DGS+: PSNR by own range [dB]", "RF-3DGS: PSNR by own range [dB]", "difference [dB]",
     )  # fmt: skip
     return markdown(head, lines)

@@ -20,7 +20,7 @@ def _batches() -> str:
         ("growth_mb", "growth [MB]", "{:.1f}"),
     )  # fmt: skip
     lines = [[r["figure"], *(show(r.get(key), form) for key, _, form in columns)] for r in found["rows"]]
-    busy = f"Load average of the machine when it ended: {found['load_average']:.1f} on {found['machine']['cores']} cores."
+    busy = f"Load average of the machine at the end: {found['load_average']:.1f} on {found['machine']['cores']} cores."
     return "\n\n".join([markdown(("work", *(title for _, title, _ in columns)), lines), busy])
 
 
@@ -34,9 +34,9 @@ def _cluster_cost() -> str:
     width, cell = (float(n) for n in re.findall(r"([0-9]+) m", plan["verb"]))
     work = (
         ("spectra of 60 x 120 pixels, lobby", 1e6, lobby, sent["back_bytes"]),
-        ("responses, 8 x 8 by 4 x 4, 64 frequencies, lobby", 1e6, response["core_ms"] / 1e3,
+        ("frequency responses, arrays of 8 x 8 and 4 x 4, 64 frequencies, lobby", 1e6, response["core_ms"] / 1e3,
          1e9 * response["gigabytes"] / response["receivers"]),
-        (f"radio map, 10 km wide, cells of {cell:g} m, at Munich's cost", (10e3 / cell) ** 2,
+        (f"radio map, 10 km wide, cells of {cell:g} m, time of a cell as in Munich", (10e3 / cell) ** 2,
          plan["core_s"] / (width / cell) ** 2, 32.0),
     )  # fmt: skip
     lines = [
@@ -45,13 +45,13 @@ def _cluster_cost() -> str:
         for what, n, each, back in work
     ]  # fmt: skip
     head = (
-        "work", "receivers", "core time each", "all, one core", f"all, {THREADS} threads", "back to the client",
-        "on its link",
+        "work", "receivers", "core time each", "all on one core", f"all on {THREADS} threads", "results to the client",
+        "time on its link",
     )  # fmt: skip
     once = (
-        f"Sent once: {sent['once_bytes'] / 1e6:.1f} MB to each worker (the lobby's field); with each part of "
-        f"{sent['part_receivers']} receivers {sent['part_bytes'] / 1e3:.1f} kB, of a million receivers "
-        f"{1e6 / sent['part_receivers'] * sent['part_bytes'] / 1e6:.0f} MB."
+        f"Sent to the workers: {sent['once_bytes'] / 1e6:.1f} MB to each worker once (the lobby's field), and "
+        f"{sent['part_bytes'] / 1e3:.1f} kB with each part of {sent['part_receivers']} receivers, which makes "
+        f"{1e6 / sent['part_receivers'] * sent['part_bytes'] / 1e6:.0f} MB for a million receivers."
     )
     return "\n\n".join([markdown(head, lines), once])
 
