@@ -61,7 +61,8 @@ def _headline() -> str:
         rows = [(find(paper(*place, 100), method=method), own) for place, (_, own) in shown.items()]
         lines.append([NAMES[method], *(with_spread(row, *how) for row, own in rows for _, *how in own)])
     head = [f"{room}: {name}" for room, own in shown.values() for name, *_ in own]
-    old = {r["method"] for r in older_runs()}.intersection(("bistatic", "rf3dgs+", "rf3dgs", "nearest"))
+    of_table = [r for r in older_runs() if (r["truth"], r["split"]) in shown and r["count"] in (100, 0)]
+    old = {r["method"] for r in of_table}.intersection(("bistatic", "rf3dgs+", "rf3dgs", "nearest"))
     said = "".join(
         f"\n\n*The figures of {NAMES[m].strip('*')} are of an earlier version of the code; today's may differ.*"
         for m in sorted(old)
