@@ -220,9 +220,9 @@ class _Lab:
                         yield dict(zip(ABOUT, (self.name, split, count_seen, seed, name), strict=True))
 
     def made(self, method: str) -> Row:
-        """What its figures depend on besides: what it computes, and a network's steps."""
+        """What its figures depend on besides: what it computes, a network's steps, and the data."""
         steps = self.options.steps if METHODS[method].network else None
-        return {"version": METHODS[method].version, "steps": steps}
+        return {"version": METHODS[method].version, "steps": steps, "data": self.key}
 
     def holds(self, row: Row | None, method: str) -> bool:
         """Whether ``row`` is a run as it would be done now."""
@@ -255,7 +255,6 @@ class _Lab:
                 **about,
                 "variant": variant,
                 **self.made(name),
-                "data": self.key,
                 "room": self.geometry.key[:12],
                 "on": f"{resolve(self.job.device)}, {threads()} cores, {processor_name()}",
                 "cores": threads(),

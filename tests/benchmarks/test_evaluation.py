@@ -101,6 +101,10 @@ def test_a_name_stands_for_data_that_some_of_its_runs_are_of(data, tmp_path):
     both = first | {"runs": first["runs"] + more["runs"]}
     (tmp_path / "paper.json").write_text(json.dumps(both))
     assert evaluate(tmp_path, data, **fewer) == both | {"machine": more["machine"]}
+    again = evaluate(
+        tmp_path, data, **fewer | {"data": str(data / "spectra.nc")}
+    )  # of the first data, not yet done
+    assert again["runs"][0] == first["runs"][0] and again["runs"][1] != more["runs"][0]
 
 
 def test_a_killed_command_loses_the_run_at_work_and_says_what_is_missing(data, tmp_path):

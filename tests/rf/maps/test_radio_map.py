@@ -103,6 +103,16 @@ def test_map_is_what_the_spectra_sum_to(whole, found):
         assert found.delay_spread_s[cell] == pytest.approx(truth.delay_spread_s[0], abs=0.2e-9)
 
 
+def test_the_best_path_of_what_is_scattered_is_a_pixel_of_the_field_s_spectrum(scene):
+    field = prior(scene, Effects(line_of_sight=False, mirrors=0, scatterings=1, residual=False))
+    paths = field.paths(PLACES)
+    best = (np.abs(paths.gain) ** 2 * paths.valid).max(axis=-1)
+    assert db(field.links(PLACES, shape=SHAPE).best_path_gain / best).max() < 0.5
+    # the mean of four pixels is no less than a quarter of the strongest, and no more than it
+    coarse = field.links(PLACES, shape=(SHAPE[0] // 2, SHAPE[1] // 2)).best_path_gain / best
+    assert (coarse > 0.25).all() and (coarse < 1.05).all()
+
+
 def test_more_rays_come_closer(whole):
     truth = np.array([whole.spectrum(p).total_path_gain for p in PLACES])
     error = [
