@@ -35,7 +35,7 @@ PACKAGES = (
 )
 
 VERSIONS = {
-    "geometry": 3,
+    "geometry": 4,
     "renderer": 1,
     "metrics": 1,
     "exact": 2,

@@ -56,7 +56,7 @@ from warprrf.geometry.reconstruction import (
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.steps import Attempt, Steps
 
-VERSIONS = {**sfm.VERSIONS, "initial": 2, "refined": 2, "surface": 5}
+VERSIONS = {**sfm.VERSIONS, "initial": 3, "refined": 2, "surface": 6}
 """Of all steps: counted up by whoever changes what a step computes."""
 
 MUCH_UNKNOWN = 0.25  # share of a surface that is worth a warning
@@ -250,7 +250,6 @@ def _steps(
             config=config,
             seed=seed,
             progress=attempt.progress,
-            device=device,
         )
         return of_planes(planes) | of_gaussians(gaussians)
 
@@ -283,7 +282,6 @@ def _steps(
 
     settings = [
         config.planes,
-        config.sweep,
         config.plain,
         config.gaussians,
         seed,
@@ -291,7 +289,9 @@ def _steps(
     first = _kept(steps, "initial", initial, [sparse, list(fitted), masks, *settings])
     planes = to_planes(first)
     gaussians = to_gaussians(_kept(steps, "refined", refined, [steps.key("initial"), config.refine]))
-    inputs: list[Any] = [steps.key("refined"), config.stereo, config.surface, config.completion]
+    inputs: list[Any] = [
+        steps.key("refined"), config.stereo, config.segments, config.surface, config.completion,
+    ]  # fmt: skip
     if measured:
         inputs.append({name: [file.path, file.unit_m] for name, file in measured.items()})
     kept = _kept(steps, "surface", surface, inputs)

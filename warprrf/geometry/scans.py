@@ -50,44 +50,55 @@ ALIKE = 0.95  # cosine between the normals of planes that are nearly parallel
 FLAT_M = 1e-6  # faces of a snapped patch lie this near to its plane
 DRAWN = 100_000  # faces are enough to find planes among
 SCAN_NOISE_M = 2e-3  # vertices whose errors are larger are a scanner's
-SMOOTHED = 5  # rounds of smoothing a scan
+SMOOTHED = 5  # rounds of smoothing
 SHRINK, GROW = 0.5, -0.53  # Taubin (1995): noise goes, nothing shrinks
 
 
 def find_patches(
     mesh: Mesh, planes: Sequence[Plane] = (), config: SurfaceConfig | None = None
 ) -> PlanarPatches:
-    """Which faces of ``mesh`` lie on which of the given planes, or where none are given, on planes found among its faces.
+    """Which faces of ``mesh`` lie on which of the given planes, and which others on planes found among them.
 
     A patch gathers the faces near its plane that face its way; islands too small to matter are left out. Patch k lies
-    on ``planes[k]``.
+    on ``planes[k]``; those of planes found here come after them.
     """
     config = config or SurfaceConfig()
     normals, areas = smoothed_normals(mesh, 3), mesh.areas
     centres = mesh.triangles.mean(axis=1)
-    if not planes:
-        among_faces = PlaneConfig(
-            distance_m=0.4 * config.patch_distance_m,
-            angle_deg=PATCH_ANGLE_DEG,
-            min_points=2 * MIN_PATCH_M2,
-            max_planes=40,
-        )
-        drawn = (
-            drawn_by_place(centres, np.ones(len(centres)), DRAWN, 0) if len(centres) > DRAWN else slice(None)
-        )
-        weights = areas[drawn] * (areas.sum() / max(areas[drawn].sum(), 1e-30))
-        planes = detect_planes(centres[drawn], normals[drawn], weights=weights, config=among_faces)
     label = np.full(len(centres), -1, dtype=np.int64)
-    best = np.full(len(centres), config.patch_distance_m)
-    for k, plane in enumerate(planes):
-        gap = np.abs(plane.distance(centres))
-        better = (gap < best) & (normals @ plane.normal > np.cos(np.radians(PATCH_ANGLE_DEG)))
-        label[better], best[better] = k, gap[better]
-    piece = connected_pieces(mesh, label)
-    label[np.bincount(piece, weights=areas)[piece] < 0.2 * MIN_PATCH_M2] = -1
-    return PlanarPatches.from_planes(
-        mesh, label, [p.normal for p in planes], [p.offset for p in planes], tolerance_m=FLAT_M
+
+    def gather(planes: Sequence[Plane], first: int) -> None:
+        best = np.where(label < 0, config.patch_distance_m, 0.0)
+        for k, plane in enumerate(planes):
+            gap = np.abs(plane.distance(centres))
+            better = (gap < best) & (normals @ plane.normal > np.cos(np.radians(PATCH_ANGLE_DEG)))
+            label[better], best[better] = first + k, gap[better]
+        piece = connected_pieces(mesh, label)
+        label[np.bincount(piece, weights=areas)[piece] < 0.2 * MIN_PATCH_M2] = -1
+
+    gather(planes, 0)
+    among_faces = PlaneConfig(
+        distance_m=0.4 * config.patch_distance_m,
+        angle_deg=PATCH_ANGLE_DEG,
+        min_points=2 * MIN_PATCH_M2,
+        max_planes=40,
     )
+    free = np.flatnonzero(label < 0)
+    drawn = free
+    if len(free) > DRAWN:
+        drawn = free[drawn_by_place(centres[free], np.ones(len(free)), DRAWN, 0)]
+    weights = areas[drawn] * (areas[free].sum() / max(areas[drawn].sum(), 1e-30))
+    found = detect_planes(centres[drawn], normals[drawn], weights=weights, config=among_faces)
+    gather(found, len(planes))
+    every = [*planes, *found]
+    return PlanarPatches.from_planes(
+        mesh, label, [p.normal for p in every], [p.offset for p in every], tolerance_m=FLAT_M
+    )
+
+
+def snapped(mesh: Mesh, planes: Sequence[Plane], config: SurfaceConfig) -> PlanarPatches:
+    """Planar patches of a noisy mesh, on a mesh without its noise: smoothed, its patches flattened."""
+    return flattened(find_patches(_smoothed(mesh), planes, config))
 
 
 def is_scan(mesh: Mesh) -> bool:
@@ -102,7 +113,7 @@ def scanned_patches(mesh: Mesh) -> PlanarPatches:
     Args:
         mesh: noisy, with holes, of any number of faces.
     """
-    patches = simplified(flattened(find_patches(_smoothed(mesh), config=SurfaceConfig())))
+    patches = simplified(snapped(mesh, (), SurfaceConfig()))
     return replace(largest_first(patches, MIN_PATCH_M2), two_sided=True)
 
 

@@ -12,7 +12,12 @@ from warprrf.geometry.photos.targets import PosedPhotos
 look = partial(views.look, width=160, height=120, f=130.0)
 LOW, HIGH = np.array([-2.0, -2.0, 0.0]), np.array([2.0, 2.0, 2.5])
 PLAIN_X = HIGH[0]  # the wall there shows nothing
-mended = partial(stereo.mended, progress=lambda *told: None)
+search = partial(stereo.mended, progress=lambda *told: None)
+
+
+def mended(*given):
+    """The depth maps alone."""
+    return search(*given)[0]
 
 
 def truth(camera):
@@ -52,9 +57,14 @@ def spoiled(room):
 
 
 @pytest.fixture(scope="module")
-def found(room, spoiled):
+def searched(room, spoiled):
     cameras, _, photos = room
-    return np.array(mended(spoiled[0], cameras, photos))
+    return [np.array(part) for part in search(spoiled[0], cameras, photos)]
+
+
+@pytest.fixture(scope="module")
+def found(searched):
+    return searched[0]
 
 
 def shown_x(room):
@@ -78,6 +88,14 @@ def test_photos_mend_wrong_depths(room, spoiled, found):
     after = np.abs(found / true - 1)[wrong & (found > 0)]
     assert (found[wrong] > 0).mean() > 0.8
     assert np.median(after) < 0.01 and (after < 0.03).mean() > 0.9
+
+
+def test_what_photos_prove_is_right(room, searched):
+    found, proved = searched
+    error = np.abs(found / np.array(room[1]) - 1)[proved]
+    assert (error < 0.02).mean() > 0.98
+    plain = shown_x(room) > PLAIN_X - 1e-6
+    assert proved[patterned(room)].mean() > 0.8 and proved[plain].mean() < 0.2
 
 
 def test_right_depths_stay_as_they_are(room, spoiled, found):

@@ -110,13 +110,16 @@ def test_a_plane_is_empty_where_one_sees_through_it():
     assert closed.area() > found.area() + 0.5
 
 
-def test_faces_go_to_the_planes_that_are_given():
+def test_faces_go_to_the_planes_that_are_given_and_others_to_planes_of_their_own():
     vertices, faces = subdivide_to_size(*box_mesh([0, 0, 0], [4, 3, 2.5], inward=True), 0.2)
     mesh = Mesh(vertices + 0.004 * np.random.default_rng(0).standard_normal(vertices.shape), faces)
     planes = [Plane(np.eye(3)[a], 0.0, np.zeros(0, dtype=int)) for a in (2, 0)]
     patches = find_patches(mesh, planes)
-    np.testing.assert_array_equal(patches.normal, [[0, 0, 1], [1, 0, 0]])
-    assert patches.area == pytest.approx([12, 7.5], rel=0.05)
+    np.testing.assert_array_equal(patches.normal[:2], [[0, 0, 1], [1, 0, 0]])
+    assert patches.area[:2] == pytest.approx([12, 7.5], rel=0.05)
+    rest = np.argsort(-patches.area[2:]) + 2  # ceiling, two long walls and a short one
+    assert patches.area[rest] == pytest.approx([12, 10, 10, 7.5], rel=0.05)
+    np.testing.assert_allclose(patches.normal[rest[[0, 3]]], [[0, 0, -1], [-1, 0, 0]], atol=2e-3)
 
 
 def test_a_depth_map_with_few_known_pixels_does_not_end_the_fusion():

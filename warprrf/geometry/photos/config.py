@@ -83,11 +83,11 @@ class ReconstructionConfig:
         pairs: ``"exhaustive"`` matches every pair of photos; ``"auto"`` only those that a coarse comparison of their
             largest features finds promising, once there are more than 2000 pairs.
         planes: how planes are found among sparse points.
-        sweep: whether planes are corrected and completed by comparing the photos.
         plain: whether surfaces without features are found from their edges.
         gaussians: Gaussians to start the refinement from (about).
         refine: photometric refinement.
         stereo: whether depth maps are mended by comparing the photos.
+        segments: whether they are then made flat where one colour shows one surface.
         surface: from Gaussians to a mesh.
         completion: whether holes are closed and borders straightened where the planes allow it.
     """
@@ -97,10 +97,10 @@ class ReconstructionConfig:
     max_pixels: int = 1_000_000
     pairs: str = "auto"
     planes: PlaneConfig = field(default_factory=PlaneConfig)
-    sweep: bool = True
     plain: bool = True
     gaussians: int = 32_000
     refine: RefineConfig = field(default_factory=RefineConfig)
     stereo: bool = True
+    segments: bool = True
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     completion: bool = True

@@ -19,7 +19,8 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.completion import complete
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.photo_files import spread
-from warprrf.geometry.photos.stereo import mended
+from warprrf.geometry.photos.segments import with_segments
+from warprrf.geometry.photos.stereo import kept_pixels, mended
 from warprrf.geometry.photos.targets import PosedPhotos
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.planes import Plane
@@ -27,10 +28,9 @@ from warprrf.geometry.rays import open3d
 from warprrf.geometry.scans import (
     MIN_PATCH_M2,
     SurfaceConfig,
-    find_patches,
-    flattened,
     largest_first,
     simplified,
+    snapped,
 )
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -75,8 +75,27 @@ def fuse_gaussians(
     )
     if photos is not None and config.stereo:
         seen = photos.subset(chosen)
-        depths = mended(depths, views, seen, progress=report, device=device)
+        depths, proved = mended(depths, views, seen, progress=report, device=device)
+        if config.segments:
+            depths = _flat(depths, proved, views, seen, planes, report)
     return fuse_maps(views, depths, planes=planes, config=config, progress=report)
+
+
+def _flat(
+    depths: Sequence[np.ndarray],
+    proved: Sequence[np.ndarray],
+    views: Sequence[Camera],
+    photos: PosedPhotos,
+    planes: Sequence[Plane],
+    progress: Progress,
+) -> list[np.ndarray]:
+    """``depths`` with the flat segments of their photos on planes."""
+    result = []
+    for k, (depth, view, image) in enumerate(zip(depths, views, photos.images, strict=True)):
+        progress("segments", k, len(views))
+        result.append(with_segments(depth, proved[k], kept_pixels(photos, k, view), image, view, planes))
+    progress("segments", len(views), len(views))
+    return result
 
 
 def fuse_maps(
@@ -93,7 +112,7 @@ def fuse_maps(
     report("surface", 0, 4)
     mesh = fuse_depth(depths, views, config=_with_voxels(config.surface, views, depths))
     report("surface", 1, 4)
-    patches = flattened(find_patches(mesh, planes, config.surface))
+    patches = snapped(mesh, planes, config.surface)
     report("surface", 2, 4)
     whole = complete(patches, views, depths, planes=planes) if config.completion else patches
     report("surface", 3, 4)

@@ -40,8 +40,9 @@ def mended(
     *,
     progress: Progress,
     device: DeviceLike = None,
-) -> list[np.ndarray]:
-    """Depth maps of what photos prove, and elsewhere of what was there, where no photo sees through it.
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Depth maps of what photos prove, and elsewhere of what was there, where no photo sees through it; and the pixels that
+    photos prove.
 
     Args:
         depths: ranges [m], ``(height, width)`` of each of ``views``, 0 where unknown.
@@ -50,7 +51,7 @@ def mended(
     """
     known = [depth[depth > 0] for depth in depths]
     if sum(map(len, known)) == 0:
-        return list(depths)
+        return list(depths), [np.zeros(depth.shape, dtype=bool) for depth in depths]
     near, far = np.percentile(np.concatenate(known), [0.5, 99.5])
     bounds = 1 / (1.6 * float(far)), 1 / (0.6 * float(near))
     comparison = _Comparison.of(views, photos, bounds, device)
@@ -69,14 +70,15 @@ def mended(
         moved = (plane[..., 0] != started[k][..., 0]) | (depth == 0)
         there = np.where(moved, 1 / (np.maximum(plane[..., 0], 1e-6) * ahead(view)), depth)
         found.append(np.where((costs[k] < PROVED) & comparison.kept[k], there, 0.0))
-    result = []
+    result, proved = [], []
     for k, (view, depth) in enumerate(zip(views, depths, strict=True)):
         checked = _companions(k, views, depths, np.ones(len(views)), CHECKED)
         maps = [(views[s], found[s]) for s in checked]
         agreed, _ = _votes(found[k], view, maps, TOLERANCE)
         _, crossed = _votes(depth, view, maps, 2 * TOLERANCE)
+        proved.append(agreed > 0)
         result.append(np.where(agreed > 0, found[k], np.where(crossed > 0, 0.0, depth)))
-    return result
+    return result, proved
 
 
 def ahead(camera: Camera) -> np.ndarray:
@@ -85,10 +87,14 @@ def ahead(camera: Camera) -> np.ndarray:
     return cosine
 
 
-def _sampled(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """A depth map at the size of ``camera``."""
+def kept_pixels(photos: PosedPhotos, number: int, camera: Camera) -> np.ndarray:
+    """The pixels of a photo that are not masked, at the size of ``camera``, bool."""
+    mask = photos.masks[number] if photos.masks else None
+    if mask is None:
+        return np.full((camera.height, camera.width), True)
     rows, columns = ((np.arange(n) + 0.5) / n for n in (camera.height, camera.width))
-    return depth[np.ix_((rows * depth.shape[0]).astype(int), (columns * depth.shape[1]).astype(int))]
+    inside = (rows * mask.shape[0]).astype(int), (columns * mask.shape[1]).astype(int)
+    return np.asarray(np.asarray(mask)[np.ix_(*inside)] == 0)
 
 
 @dataclass(frozen=True)
@@ -125,12 +131,8 @@ class _Comparison:
         grey, kept = [], []
         for k, (photo, camera) in enumerate(zip(photos.images, cameras, strict=True)):
             whole = image.fromarray(np.asarray(photo, dtype=np.float32) @ LUMA)
-            small = np.asarray(whole.resize((camera.width, camera.height), image.BOX))
-            mask = photos.masks[k] if photos.masks else None
-            grey.append(small)
-            kept.append(
-                np.full(small.shape, True) if mask is None else _sampled(np.asarray(mask), camera) == 0
-            )
+            grey.append(np.asarray(whole.resize((camera.width, camera.height), image.BOX)))
+            kept.append(kept_pixels(photos, k, camera))
         ends = np.cumsum([0, *(g.size for g in grey)])[:-1]
         sizes = np.array(
             [(end, g.shape[1], g.shape[0]) for end, g in zip(ends, grey, strict=True)], dtype=np.int32

@@ -1,0 +1,114 @@
+"""Depth maps made flat where a photo's colours say that one surface is there.
+
+Nothing can be matched within a bare cabinet door, and what is matched on a poster is noisy. But both have one colour, or
+few, up to their edges. A photo is cut into segments of like colour (Felzenszwalb and Huttenlocher, "Efficient
+graph-based image segmentation", 2004). Where many of the depths that photos prove in a segment lie on one plane, all of
+the segment does (in the spirit of Bleyer and Gelautz, "A layered stereo matching algorithm using image segmentation and
+global visibility constraints", 2005), as far as these depths fix the plane. Inverse depth along the optical axis is
+linear in the image on a plane.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from warprrf.device import require
+from warprrf.geometry.planes import Plane
+from warprrf.geometry.splats.camera import Camera
+
+COARSENESS, BLUR_PX, LEAST_PX = (
+    60.0,
+    0.6,
+    80,
+)  # of the segments (the first: scikit-image's ``scale``, of 8 bit colours)
+PROVED_PX, PROVED_SHARE = 15, 0.04  # so many pixels of a segment, and such a part of it, must be proved
+TOLERANCE = 0.02  # a depth that differs from a plane's by less than this part lies on it
+ON_ONE_PLANE = 0.4  # part of the proved depths of a segment that must lie on its plane
+TRIALS, DRAWN = (
+    48,
+    300,
+)  # planes through three proved pixels that are tried, and pixels that they are judged by
+KNOWN = 0.9  # a plane of the room with this part of the best one's pixels is preferred: it is known better
+UNSURE = 0.02  # where a plane's standard deviation is larger than this part of the depth, it says nothing
+ALIKE_PX = 25.0  # neighbouring pixels, of which errors are alike
+NEAR = 0.12  # proved depths that differ by more than this part from the plane are something else, and stay
+
+
+def with_segments(
+    depth: np.ndarray,
+    proved: np.ndarray,
+    shown: np.ndarray,
+    photo: np.ndarray,
+    view: Camera,
+    planes: Sequence[Plane],
+) -> np.ndarray:
+    """A depth map with the pixels of each flat segment on its plane.
+
+    Args:
+        depth: ranges [m], 0 where unknown, shape ``(height, width)`` of ``view``.
+        proved: pixels whose depth photos prove, same shape, bool.
+        shown: pixels that may have a depth: what is not masked, same shape, bool.
+        photo: in [0, 1], shape ``(H, W, 3)``, of any size.
+        view: pinhole camera of the depth map.
+        planes: of the room.
+    """
+    image = require("PIL.Image", extra="photos")
+    segmentation = require("skimage.segmentation", extra="photos")
+    bytes_ = np.round(255 * np.asarray(photo)).astype(np.uint8)
+    colours = np.asarray(image.fromarray(bytes_).resize((view.width, view.height), image.BOX))
+    segment = segmentation.felzenszwalb(colours, scale=COARSENESS, sigma=BLUR_PX, min_size=LEAST_PX).ravel()
+    rays = np.stack([view.directions() @ axis for axis in view.rotation], axis=-1).reshape(-1, 3)
+    ahead = rays[:, 2]
+    rays = rays / ahead[:, None]  # one deep: inverse depth is their product with a plane's coefficients
+    inverse = np.where(depth.ravel() > 0, 1 / np.maximum(depth.ravel() * ahead, 1e-9), 0.0)
+    known = _coefficients(planes, view)
+    result, sure = depth.flatten(), proved.ravel()
+    order = np.argsort(segment, kind="stable")
+    for pixels in np.split(order, np.flatnonzero(np.diff(segment[order])) + 1):
+        own = pixels[sure[pixels]]
+        if len(own) < max(PROVED_PX, PROVED_SHARE * len(pixels)):
+            continue
+        found = _plane(rays[own], inverse[own], known, np.random.default_rng(int(pixels[0])))
+        if found is None:
+            continue
+        plane, covariance = found
+        there = rays[pixels] @ plane
+        spread = np.sqrt(np.einsum("ni,ij,nj->n", rays[pixels], covariance, rays[pixels]))
+        put = shown.ravel()[pixels] & (there > 1e-6) & (spread < UNSURE * there)
+        put &= ~sure[pixels] | (np.abs(there - inverse[pixels]) < NEAR * inverse[pixels])
+        result[pixels[put]] = 1 / (there[put] * ahead[pixels[put]])
+    return result.reshape(depth.shape)
+
+
+def _coefficients(planes: Sequence[Plane], view: Camera) -> np.ndarray:
+    """What the inverse depths of planes that face the camera are along its rays, a row each, shape ``(K, 3)``."""
+    facing = [(p, float(p.distance(view.position))) for p in planes if p.occupied.any()]
+    rows = [-(view.rotation @ p.normal) / away for p, away in facing if away > 1e-3]
+    return np.array(rows).reshape(-1, 3)
+
+
+def _plane(
+    rays: np.ndarray, inverse: np.ndarray, known: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The plane on which many of a segment's depths lie, its coefficients and their covariance (zero for a ``known`` one);
+    None if few lie on one."""
+    drawn = rng.permutation(len(rays))[:DRAWN]
+    three = drawn[rng.integers(0, len(drawn), (TRIALS, 3))]
+    tried = np.einsum("nij,nj->ni", np.linalg.pinv(rays[three]), inverse[three])
+    tried = np.concatenate([known, tried])
+    off = np.abs(tried @ rays[drawn].T / inverse[drawn] - 1)
+    support = (off < TOLERANCE).mean(axis=1)
+    best = int(support[: len(known)].argmax()) if len(known) else 0
+    if len(known) and support[best] >= max(KNOWN * support.max(), ON_ONE_PLANE):
+        return known[best], np.zeros((3, 3))
+    plane = tried[support.argmax()]
+    for _ in range(4):
+        weight = 1 / (1 + ((rays @ plane / inverse - 1) / TOLERANCE) ** 2) / inverse
+        plane = np.linalg.lstsq(rays * weight[:, None], inverse * weight, rcond=None)[0]
+    left = rays @ plane - inverse
+    on = np.abs(left) < TOLERANCE * inverse
+    if on.mean() < ON_ONE_PLANE:
+        return None
+    return plane, ALIKE_PX * left[on].var() * np.linalg.pinv(rays[on].T @ rays[on])
