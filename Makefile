@@ -2,7 +2,7 @@
 #
 #   make lobby      install what is missing, then photos -> geometry -> radio -> evaluation into runs/lobby/ (resumable)
 #   make test       lint, types, import rules, documentation, tests: what CI runs
-#   make long       the tests of a minute and more that the others leave out
+#   make long       the tests of a minute and more, and more cases of the others
 #   make quick      every public verb and the main laws once: two minutes on two cores with compiled kernels cached, on a
 #                   fresh clone a few more while they compile (tests/quick.txt)
 #   make lint       the first three alone

@@ -21,14 +21,22 @@ def test_kernels_are_looked_for_where_they_are():
     assert {name: set(labels) for name, labels in HOT.items()} == {k: set(v) for k, v in written.items()}
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_kernels_compile_for_cuda_and_do_not_get_worse(name, tmp_path):
+SOURCES = {name: inspect.getsource(importlib.import_module(name)) for name in MODULES}
+BOTH = [name for name, source in SOURCES.items() if "real: type" in source and "wp.kernel" in source]
+DOUBLE = [pytest.param(name, True, marks=pytest.mark.long) for name in BOTH]
+"""The same code in float64, which a CPU runs in other tests."""
+
+
+@pytest.mark.parametrize(("name", "double"), [*((name, False) for name in MODULES), *DOUBLE])
+def test_kernels_compile_for_cuda_and_do_not_get_worse(name, double, tmp_path):
     """Figures are those of tests/golden/cuda_kernels.json: `python tests/helpers/cuda_code.py` writes it anew."""
-    kernels, tree = kernels_of(name), ast.parse(inspect.getsource(importlib.import_module(name)))
+    every, tree = kernels_of(name), ast.parse(SOURCES[name])
     functions = [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)]
     in_source = {f.name for f in functions if any("wp.kernel" in ast.unparse(d) for d in f.decorator_list)}
-    assert {k.func.__name__ for k in kernels.values()} == in_source  # none is missed
-    if name not in HOT:
+    assert {k.func.__name__ for k in every.values()} == in_source  # none is missed
+    kernels = {label: kernel for label, kernel in every.items() if ("float64" in label) == double}
+    assert kernels or not in_source
+    if double or name not in HOT:
         assert translated(kernels, tmp_path) == kernels.keys()
         return
     code = compiled(kernels, tmp_path)

@@ -22,8 +22,8 @@ from typing import Any
 
 import tests.conftest  # noqa: F401 (it says where helpers lie)
 from fuzz.place import Place
-from fuzz.trial import KINDS, Case, Trial, stream, targets
-from fuzz.workers import LIMIT_S, Workers
+from fuzz.trial import Case, Trial, stream, targets
+from fuzz.workers import KINDS, LIMIT_S, Workers
 from warprrf.cli.output import Output
 from warprrf.device import threads
 from warprrf.files import write_json

@@ -1,8 +1,6 @@
 """Some fuzzing: part of what `python -m tests.fuzz` tries, the same in every run; and what was found before."""
 
-import os
 import re
-import time
 from collections import Counter
 from functools import partial
 from itertools import islice
@@ -14,7 +12,7 @@ from fuzz import calls, trial
 from fuzz.answers import complaint, differs, leaves, wrong
 from fuzz.files import CODECS, FORMATS
 from fuzz.laws import LAWS
-from fuzz.trial import FILE, LAW, Case, Outcome, Trial
+from fuzz.trial import FILE, LAW, Case, Trial
 from fuzz.workers import Workers
 
 
@@ -35,25 +33,25 @@ def found(place, cases, **how):
     return findings, tried
 
 
-@pytest.mark.parametrize("cases", [200, pytest.param(600, marks=pytest.mark.long)])
+@pytest.mark.parametrize("cases", [60, pytest.param(600, marks=pytest.mark.long)])
 def test_some_fuzzing_finds_nothing(place, cases):
-    """Up to about a minute of one process, the same cases wherever they run."""
+    """The first ones of seed 0, the same cases wherever they run."""
     findings, tried = found(place, islice(trial.stream(place, 0), cases))
     assert tried["answered"] > cases // 12 and tried["refused"] > cases // 12
     assert not findings, "\n".join(findings)
 
 
-@pytest.mark.parametrize("times", [1, pytest.param(5, marks=pytest.mark.long)])
+@pytest.mark.parametrize("times", [1, pytest.param(20, marks=pytest.mark.long)])
 def test_damage_of_files_with_a_checksum_is_refused_or_changes_nothing(place, times):
     """Flipped bits, a third of them early, and cuts; where there is no place for a checksum, a flipped bit changes one value
     at most, and a cut nothing."""
-    kinds = [*["flip early"] * 13, *["flip"] * 27, *["cut"] * 12] * times
+    kinds = [*["flip early"] * 3, *["flip"] * 7, *["cut"] * 3] * times
     draw = np.random.default_rng(0).integers(0, 2**31, (len(kinds), 2)).tolist()
     names = [FILE + name for name, form in FORMATS.items() if form.law]
     cases = (Case(name, ((kind, a, b),)) for name in names for kind, (a, b) in zip(kinds, draw, strict=True))
     findings, tried = found(place, cases, limit_s=10.0)
     assert not findings, "\n".join(findings)
-    assert tried["refused"] > 40 * times * len(names) and tried.total() == len(kinds) * len(names)
+    assert tried["refused"] > 10 * times * len(names) and tried.total() == len(kinds) * len(names)
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -148,26 +146,13 @@ def test_what_was_found_once_ends_as_it_should(attempt, target, edits, kind):
     assert outcome.kind == kind, outcome
 
 
+@pytest.mark.parametrize("more", [2, pytest.param(20, marks=pytest.mark.long)])
 @pytest.mark.parametrize("law", LAWS)
-def test_a_law_holds(attempt, law):
+def test_a_law_holds(attempt, law, more):
     plain = [Case(LAW + law, ((name, 0, 0),)) for name in dict.fromkeys(LAWS[law].edits)]
-    for case in plain + trial.drawn(LAW + law, [], 6, 0):
+    for case in plain + trial.drawn(LAW + law, [], more, 0):
         outcome = attempt(case)
         assert outcome.kind in ("answered", "unfit"), f"{case}: {outcome.text}"
-
-
-def misbehaving(scratch):
-    asked = {"answers": Outcome, "dies": lambda case: os.abort(), "hangs": lambda case: time.sleep(60.0)}
-    return lambda case: asked[case](case)
-
-
-def test_a_crash_and_a_hang_are_seen_and_others_go_on():
-    asked = ["answers", "dies", "answers", "hangs", "answers", "answers"]
-    with Workers(misbehaving, 1, 2.0) as workers:
-        found = dict(workers.run(asked))
-    assert found["answers"] == Outcome("answers")
-    assert "exit code -6" in found["dies"].text
-    assert "took more than 2 s" in found["hangs"].text
 
 
 def test_errors_of_other_kinds_or_without_a_name_are_findings():

@@ -16,8 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from hypothesis import HealthCheck, Phase, given, seed, settings
-from hypothesis import strategies as st
 
 from fuzz import calls
 from fuzz.answers import Leaves, asked, changes, complaint, differs, origin, wrong
@@ -25,11 +23,11 @@ from fuzz.files import BYTES, FORMATS, TREE, Unfit, damage
 from fuzz.laws import LAWS
 from fuzz.place import Place
 from fuzz.values import NOT_FINITE, SAME, VALUES, names_for
+from fuzz.workers import Outcome
 
 FILE, LAW = "file: ", "law: "
-KINDS = ("answered", "refused", "unfit", "finding")
 DRAWN = 40
-"""Cases of each target that Hypothesis draws at a time."""
+"""Cases of each target that are drawn at a time."""
 
 
 @dataclass(frozen=True)
@@ -46,14 +44,6 @@ class Case:
 
     def __str__(self) -> str:
         return f"{self.target}: {json.dumps(self.edits)}"
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What came of a case, one of :data:`KINDS`, and what it says; ``unfit``: there is no such value or file."""
-
-    kind: str
-    text: str = ""
 
 
 class Trial:
@@ -162,37 +152,18 @@ def choices(place: Place, target: str) -> list[tuple[str, str]]:
     return [(argument, name) for argument, value in known.items() for name in names_for(value)]
 
 
-def strategy(target: str, known: list[tuple[str, str]]) -> st.SearchStrategy[Case]:
-    """Cases of one target: one or two arguments, or one to three edits."""
-    number = st.integers(0, 2**31 - 1)
-    if target.startswith((FILE, LAW)):
-        law = LAWS.get(target.removeprefix(LAW))
-        names = (
-            law.edits if law else [*BYTES, *(TREE * 3 if FORMATS[target.removeprefix(FILE)].codec else ())]
-        )
-        edits = st.lists(
-            st.tuples(st.sampled_from(names), number, number), min_size=1, max_size=law.most if law else 3
-        )
-    else:
-        edits = st.lists(st.sampled_from(known), min_size=1, max_size=2, unique_by=lambda pair: pair[0])
-    return edits.map(lambda found: Case(target, tuple(found)))
-
-
 def drawn(target: str, known: list[tuple[str, str]], count: int, number: int) -> list[Case]:
-    """``count`` cases of one target that Hypothesis draws; ``number`` is the seed."""
-    cases: list[Case] = []
-
-    @seed(int.from_bytes(_digest(number, target)[:8], "little"))
-    @settings(
-        max_examples=count, database=None, deadline=None, phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )  # fmt: skip
-    @given(strategy(target, known))
-    def collect(case: Case) -> None:
-        cases.append(case)
-
-    collect()
-    return cases
+    """``count`` cases of one target by chance, of one or two arguments, or one to three edits; ``number`` is the seed."""
+    rng = np.random.default_rng(int.from_bytes(_digest(number, target)[:8], "little"))
+    if not target.startswith((FILE, LAW)):
+        pairs = [[known[k] for k in rng.integers(len(known), size=rng.integers(1, 3))] for _ in range(count)]
+        return [Case(target, tuple(dict(found).items())) for found in pairs]
+    law = LAWS.get(target.removeprefix(LAW))
+    names = law.edits if law else [*BYTES, *(TREE * 3 if FORMATS[target.removeprefix(FILE)].codec else ())]
+    # Small numbers as often as large ones.
+    numbers = 2.0 ** rng.uniform(0.0, 31.0, (count, law.most if law else 3, 2)) - 1.0
+    edits = [[(names[rng.integers(len(names))], int(a), int(b)) for a, b in one] for one in numbers]
+    return [Case(target, tuple(found[: rng.integers(1, len(found) + 1)])) for found in edits]
 
 
 def stream(place: Place, number: int, only: str = "") -> Iterator[Case]:

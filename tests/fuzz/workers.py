@@ -15,13 +15,22 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-from fuzz.trial import Outcome
-
+KINDS = ("answered", "refused", "unfit", "finding")
 LIMIT_S = 30.0
 """How long a case may take, of which an undamaged one takes a tenth at most; as much longer as others keep the machine busy."""
 START_S = 180.0
 MEMORY = 12 << 30
 """Bytes of address space of a worker: more is refused by the system, which the worker survives."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a case, one of :data:`KINDS`, and what it says; ``unfit``: there is no such value or file."""
+
+    kind: str
+    text: str = ""
+
+
 Make = Callable[[Path], Callable[[Any], Outcome]]
 SPAWN = multiprocessing.get_context("spawn")
 

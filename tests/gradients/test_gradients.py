@@ -399,10 +399,15 @@ def random_camera(rng: np.random.Generator, means: np.ndarray, *, spherical: boo
 
 
 SCENES = {Pictures: 32, Rays: 32, PathRecords: 60, SpecularPaths: 60}
+EVERY_TIME = 20  # of each on the CPU
 ON_A_GPU = 8  # of each: launches there are other ones, derivatives are not
 EVERY = pytest.mark.parametrize("kind", SCENES)
 CASES = [
-    *((kind, k, "cpu") for kind, count in SCENES.items() for k in range(count)),
+    *(
+        pytest.param(kind, k, "cpu", marks=[pytest.mark.long] * (k >= EVERY_TIME))
+        for kind, count in SCENES.items()
+        for k in range(count)
+    ),
     *(pytest.param(kind, k, "cuda:0", marks=pytest.mark.cuda) for kind in SCENES for k in range(ON_A_GPU)),
 ]
 

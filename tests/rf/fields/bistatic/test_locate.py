@@ -81,7 +81,7 @@ def profiles(field, place, late_s, bandwidth_hz=2e9):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("k", [0, 1])
+@pytest.mark.parametrize("k", [1, pytest.param(0, marks=pytest.mark.long)])
 def test_profiles_of_delay_tell_the_place_and_how_late_their_clock_is(field, k):
     found = field.locate(profiles(field, UNSEEN[k], 137e-9))
     assert np.linalg.norm(found.position - UNSEEN[k]) < 0.05
