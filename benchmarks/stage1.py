@@ -39,6 +39,7 @@ examples:
 FULL = ReconstructionConfig()
 STAGES: Mapping[str, tuple[ReconstructionConfig, tuple[str, ...]]] = {
     "nothing": (FULL, ()),
+    "sweep": (replace(FULL, sweep=False), ("photos.sweep",)),
     "segments": (replace(FULL, segments=False), ("photos.segments",)),
     "plain": (replace(FULL, plain=False), ("photos.plain", "photos.edges")),
     "refine": (replace(FULL, refine=replace(FULL.refine, iterations=1)), ("photos.refine", "photos.densify")),

@@ -16,7 +16,7 @@ FEWER = {
         "\n    110, 113, 114, 117, 119,\n": "*range(20, 30)",
         '(DATA / "surveyed.json")': 'Path("{surveyed}")',
         'DATA.parent.parent / "runs" / "notebook"': 'Path("{work}")',
-        "gaussians=8000": "gaussians=2000, stereo=False, completion=False",
+        "gaussians=8000": "gaussians=2000, sweep=False, stereo=False, completion=False",
         "iterations=100": "iterations=4",
         "iterations=60": "iterations=4",
         'model="bistatic"': 'model="bistatic", quick=True',

@@ -56,7 +56,7 @@ from warprrf.geometry.reconstruction import (
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.steps import Attempt, Steps
 
-VERSIONS = {**sfm.VERSIONS, "initial": 3, "refined": 2, "surface": 6}
+VERSIONS = {**sfm.VERSIONS, "initial": 2, "refined": 2, "surface": 6}
 """Of all steps: counted up by whoever changes what a step computes."""
 
 MUCH_UNKNOWN = 0.25  # share of a surface that is worth a warning
@@ -250,6 +250,7 @@ def _steps(
             config=config,
             seed=seed,
             progress=attempt.progress,
+            device=device,
         )
         return of_planes(planes) | of_gaussians(gaussians)
 
@@ -282,6 +283,7 @@ def _steps(
 
     settings = [
         config.planes,
+        config.sweep,
         config.plain,
         config.gaussians,
         seed,

@@ -10,6 +10,8 @@ surface normal diffusion", ICCV 2015. That a plane also costs what it contradict
 
 import warp as wp
 
+from warprrf.kernels.photo_consistency import bilinear
+
 wp.set_module_options({"enable_backward": False})
 
 SIDE = 5  # pixels along a window's side
@@ -29,21 +31,6 @@ LOST = wp.constant(0.5)  # a pixel of more cost tries any depth, once
 UNLIKE = wp.constant(0.02)  # depths of two photos that differ by this part contradict each other in full
 STEEPEST = wp.constant(6.0)  # tangent of a plane's largest angle to the image
 window = wp.types.vector(length=SIDE * SIDE, dtype=wp.float32)
-
-
-@wp.func
-def bilinear(images: wp.array(dtype=wp.float32), first: int, width: int, u: float, v: float) -> float:
-    """Grey value at pixel coordinates (u, v), pixel centres at +0.5; the place must lie inside the photo."""
-    x = u - 0.5
-    y = v - 0.5
-    j = int(wp.floor(x))
-    i = int(wp.floor(y))
-    fx = x - float(j)
-    fy = y - float(i)
-    k = first + i * width + j
-    top = images[k] * (1.0 - fx) + images[k + 1] * fx
-    low = images[k + width] * (1.0 - fx) + images[k + width + 1] * fx
-    return top * (1.0 - fy) + low * fy
 
 
 @wp.func

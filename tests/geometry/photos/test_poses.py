@@ -21,7 +21,7 @@ NAMES = [f"view_{k:03d}.jpg" for k in range(8)]
 PHOTOS = [LOBBY / "photos" / name for name in NAMES]
 LENS = {"fl_x": 395.0, "fl_y": 395.0, "cx": 320.0, "cy": 240.0, "w": 640, "h": 480}
 QUICK = ReconstructionConfig(
-    max_features=1500, gaussians=2000, completion=False,
+    max_features=1500, sweep=False, gaussians=2000, completion=False,
     refine=RefineConfig(iterations=2, downscale=8, max_gaussians=2000), surface=SurfaceConfig(min_component_faces=50),
 )  # fmt: skip
 

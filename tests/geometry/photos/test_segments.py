@@ -7,7 +7,6 @@ import pytest
 import views
 
 from warprrf.geometry.photos.segments import UNSURE, with_segments
-from warprrf.geometry.planes import Plane
 
 pytest.importorskip("skimage")
 LOW, HIGH = np.array([-2.0, -2.0, 0.0]), np.array([2.0, 2.0, 2.5])
@@ -29,7 +28,7 @@ RIM = np.zeros_like(ALL)  # what photos prove: near edges of walls
 for shift, axis in ((4, 0), (-4, 0), (4, 1), (-4, 1)):
     RIM |= np.roll(WALL, shift, axis) != WALL
 BACK = WALL == 4  # what the camera looks at
-flat = partial(with_segments, shown=ALL, photo=PHOTO, view=CAMERA, planes=[])
+flat = partial(with_segments, shown=ALL, photo=PHOTO, view=CAMERA)
 
 
 def rough(noise=0.01):
@@ -44,18 +43,6 @@ def test_walls_are_whole_and_smooth_where_their_rims_alone_are_known():
     assert RIM.mean() < 0.4
     assert (found > 0).mean() > 0.95
     assert np.median(error[found > 0]) < 0.003 and np.percentile(error[found > 0], 95) < UNSURE
-
-
-def test_known_planes_are_taken_as_they_are():
-    planes = []
-    for axis in range(3):
-        for side, at in ((1.0, LOW), (-1.0, HIGH)):
-            normal = side * np.eye(3)[axis]
-            planes.append(
-                Plane(normal, side * at[axis], np.zeros(0, dtype=int), occupied=np.ones((1, 1), bool))
-            )
-    found = flat(rough(), RIM, planes=planes)
-    assert (np.abs(found / TRUE - 1) < 1e-9).mean() > 0.95
 
 
 def test_depths_on_a_line_fix_no_plane():

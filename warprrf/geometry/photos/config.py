@@ -83,6 +83,7 @@ class ReconstructionConfig:
         pairs: ``"exhaustive"`` matches every pair of photos; ``"auto"`` only those that a coarse comparison of their
             largest features finds promising, once there are more than 2000 pairs.
         planes: how planes are found among sparse points.
+        sweep: whether planes are corrected and completed by comparing the photos.
         plain: whether surfaces without features are found from their edges.
         gaussians: Gaussians to start the refinement from (about).
         refine: photometric refinement.
@@ -97,6 +98,7 @@ class ReconstructionConfig:
     max_pixels: int = 1_000_000
     pairs: str = "auto"
     planes: PlaneConfig = field(default_factory=PlaneConfig)
+    sweep: bool = True
     plain: bool = True
     gaussians: int = 32_000
     refine: RefineConfig = field(default_factory=RefineConfig)

@@ -77,7 +77,7 @@ def fuse_gaussians(
         seen = photos.subset(chosen)
         depths, proved = mended(depths, views, seen, progress=report, device=device)
         if config.segments:
-            depths = _flat(depths, proved, views, seen, planes, report)
+            depths = _flat(depths, proved, views, seen, report)
     return fuse_maps(views, depths, planes=planes, config=config, progress=report)
 
 
@@ -86,14 +86,13 @@ def _flat(
     proved: Sequence[np.ndarray],
     views: Sequence[Camera],
     photos: PosedPhotos,
-    planes: Sequence[Plane],
     progress: Progress,
 ) -> list[np.ndarray]:
     """``depths`` with the flat segments of their photos on planes."""
     result = []
     for k, (depth, view, image) in enumerate(zip(depths, views, photos.images, strict=True)):
         progress("segments", k, len(views))
-        result.append(with_segments(depth, proved[k], kept_pixels(photos, k, view), image, view, planes))
+        result.append(with_segments(depth, proved[k], kept_pixels(photos, k, view), image, view))
     progress("segments", len(views), len(views))
     return result
 

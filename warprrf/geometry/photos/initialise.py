@@ -16,13 +16,14 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from warprrf.checks import check_array
-from warprrf.device import Progress
+from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.photos.cells import meeting, occupancy, plane_mesh, seen_cells, visible_from
 from warprrf.geometry.photos.completion.room_planes import directions
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.plain import plain_surfaces, with_plain
 from warprrf.geometry.photos.points import clean_points, detect_room_planes, estimate_normals
 from warprrf.geometry.photos.sparse import SparseModel
+from warprrf.geometry.photos.sweep import GreyPhotos, choose_views, joined, level_planes, proven_cells
 from warprrf.geometry.planes import Plane, aligned, plane_axes
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Y00, Gaussians, quaternions_of
@@ -31,8 +32,6 @@ OPACITY = 0.95
 SPREAD = 0.65  # standard deviation of a disc in units of the spacing: little light leaks between neighbours
 FLATNESS = 0.05  # thickness over radius
 MIN_SCALE, MAX_SCALE = 0.004, 0.12  # of a disc on a sparse point [m]
-VIEWS = 5  # photos that tell the colour of a place,
-MIN_ANGLE_DEG = 6.0  # no two of them in nearly the same direction
 ON_PLANE_M = 0.02  # a sparse point this close to an occupied cell gives way to the plane's own discs
 
 
@@ -137,30 +136,6 @@ def _blocks(
     ]  # fmt: skip
 
 
-def choose_views(
-    points: np.ndarray, normal: np.ndarray, seen: np.ndarray, cameras: Sequence[Camera]
-) -> np.ndarray:
-    """For each point on a plane of this ``normal`` the photos that show it largest among those that see it, no two from
-    nearly the same direction.
-
-    Returns:
-        Camera indices, shape ``(N, VIEWS)`` int32, -1 padded.
-    """
-    line = np.array([c.position for c in cameras])[None] - points[:, None]
-    distance = np.linalg.norm(line, axis=2)
-    line /= np.maximum(distance, 1e-9)[..., None]
-    worth = np.where(seen, line @ normal / distance**2, -1.0)  # pixels on a square metre
-    chosen = np.full((len(points), VIEWS), -1, dtype=np.int32)
-    rows = np.arange(len(points))
-    for k in range(VIEWS):
-        best = worth.argmax(axis=1)
-        good = worth[rows, best] > 0
-        chosen[good, k] = best[good]
-        close = np.einsum("nci,ni->nc", line, line[rows, best]) > np.cos(np.radians(MIN_ANGLE_DEG))
-        worth = np.where(close, -1.0, worth)
-    return chosen
-
-
 def _largest(values: np.ndarray, count: int) -> np.ndarray:
     """Mask of the ``count`` largest positive ``values``."""
     chosen = np.zeros(len(values), dtype=bool)
@@ -192,6 +167,7 @@ def initialise(
     config: ReconstructionConfig,
     seed: int = 0,
     progress: Progress | None = None,
+    device: DeviceLike = None,
 ) -> tuple[list[Plane], Gaussians]:
     """Planes of the sparse points, and the Gaussians that refinement starts from.
 
@@ -202,12 +178,13 @@ def initialise(
         config: settings.
         seed: of the plane detection.
         progress: called with ``"planes"``.
+        device: Warp device of the sweeps.
 
     Raises:
         ValueError: for fewer than three points.
     """
     report = progress or (lambda stage, done, total: None)
-    report("planes", 0, 3)
+    report("planes", 0, 6)
     if len(sparse.points) < 3:
         raise ValueError(
             f"photos: only {len(sparse.points)} points were reconstructed; more overlap is needed"
@@ -223,11 +200,22 @@ def initialise(
     points, viewpoints = sparse.points, sparse.viewpoints()
     normals = estimate_normals(points, viewpoints)
     planes = detect_room_planes(points, normals, viewpoints, config=config.planes, seed=seed)
-    planes = aligned(planes, points) if sparse.metric and sparse.upright else planes
+    level = sparse.metric and sparse.upright
+    planes = aligned(planes, points) if level else planes
     eyes = np.array([c.position for c in sparse.cameras.values()])[sparse.track_camera]
     lines = eyes, np.repeat(points, sparse.track_length, axis=0)
     planes = occupancy(planes, points, *lines, config=config.planes)
-    report("planes", 1, 3)
+    report("planes", 1, 6)
+    if config.sweep and len(cameras) > 2 and planes:
+        photos = GreyPhotos.upload(list(cameras.values()), images, device)
+        planes = proven_cells(planes, points, photos)
+        report("planes", 2, 6)
+        if level:
+            levels = []
+            for k, up in enumerate((True, False)):
+                levels += level_planes(planes, points, photos, lines, cell_m=config.planes.cell_m, up=up)
+                report("planes", 3 + k, 6)
+            planes = joined(planes, levels)
     real = np.ones(len(points), dtype=bool)
     axes = _axes(planes) if config.plain else None
     if axes is not None:
@@ -236,7 +224,7 @@ def initialise(
         sight = lines[0][~reflected], lines[1][~reflected]
         planes = with_plain(planes, plain.planes, points, sight)
         real = np.add.reduceat(reflected, sparse.track_start[:-1]) < 0.5 * sparse.track_length
-    report("planes", 2, 3)
+    report("planes", 5, 6)
     planes = seen_cells(meeting(planes), list(sparse.cameras.values()))
     gaussians = initial_gaussians(
         points[real],
@@ -247,7 +235,7 @@ def initialise(
         images,
         count=config.gaussians,
     )
-    report("planes", 3, 3)
+    report("planes", 6, 6)
     return planes, gaussians
 
 

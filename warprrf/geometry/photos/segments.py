@@ -10,12 +10,9 @@ linear in the image on a plane.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from warprrf.device import require
-from warprrf.geometry.planes import Plane
 from warprrf.geometry.splats.camera import Camera
 
 COARSENESS, BLUR_PX, LEAST_PX = (
@@ -30,19 +27,13 @@ TRIALS, DRAWN = (
     48,
     300,
 )  # planes through three proved pixels that are tried, and pixels that they are judged by
-KNOWN = 0.9  # a plane of the room with this part of the best one's pixels is preferred: it is known better
 UNSURE = 0.02  # where a plane's standard deviation is larger than this part of the depth, it says nothing
 ALIKE_PX = 25.0  # neighbouring pixels, of which errors are alike
 NEAR = 0.12  # proved depths that differ by more than this part from the plane are something else, and stay
 
 
 def with_segments(
-    depth: np.ndarray,
-    proved: np.ndarray,
-    shown: np.ndarray,
-    photo: np.ndarray,
-    view: Camera,
-    planes: Sequence[Plane],
+    depth: np.ndarray, proved: np.ndarray, shown: np.ndarray, photo: np.ndarray, view: Camera
 ) -> np.ndarray:
     """A depth map with the pixels of each flat segment on its plane.
 
@@ -52,7 +43,6 @@ def with_segments(
         shown: pixels that may have a depth: what is not masked, same shape, bool.
         photo: in [0, 1], shape ``(H, W, 3)``, of any size.
         view: pinhole camera of the depth map.
-        planes: of the room.
     """
     image = require("PIL.Image", extra="photos")
     segmentation = require("skimage.segmentation", extra="photos")
@@ -63,14 +53,13 @@ def with_segments(
     ahead = rays[:, 2]
     rays = rays / ahead[:, None]  # one deep: inverse depth is their product with a plane's coefficients
     inverse = np.where(depth.ravel() > 0, 1 / np.maximum(depth.ravel() * ahead, 1e-9), 0.0)
-    known = _coefficients(planes, view)
     result, sure = depth.flatten(), proved.ravel()
     order = np.argsort(segment, kind="stable")
     for pixels in np.split(order, np.flatnonzero(np.diff(segment[order])) + 1):
         own = pixels[sure[pixels]]
         if len(own) < max(PROVED_PX, PROVED_SHARE * len(pixels)):
             continue
-        found = _plane(rays[own], inverse[own], known, np.random.default_rng(int(pixels[0])))
+        found = _plane(rays[own], inverse[own], np.random.default_rng(int(pixels[0])))
         if found is None:
             continue
         plane, covariance = found
@@ -82,28 +71,15 @@ def with_segments(
     return result.reshape(depth.shape)
 
 
-def _coefficients(planes: Sequence[Plane], view: Camera) -> np.ndarray:
-    """What the inverse depths of planes that face the camera are along its rays, a row each, shape ``(K, 3)``."""
-    facing = [(p, float(p.distance(view.position))) for p in planes if p.occupied.any()]
-    rows = [-(view.rotation @ p.normal) / away for p, away in facing if away > 1e-3]
-    return np.array(rows).reshape(-1, 3)
-
-
 def _plane(
-    rays: np.ndarray, inverse: np.ndarray, known: np.ndarray, rng: np.random.Generator
+    rays: np.ndarray, inverse: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """The plane on which many of a segment's depths lie, its coefficients and their covariance (zero for a ``known`` one);
-    None if few lie on one."""
+    """The plane on which many of a segment's depths lie, its coefficients and their covariance; None if few lie on one."""
     drawn = rng.permutation(len(rays))[:DRAWN]
     three = drawn[rng.integers(0, len(drawn), (TRIALS, 3))]
     tried = np.einsum("nij,nj->ni", np.linalg.pinv(rays[three]), inverse[three])
-    tried = np.concatenate([known, tried])
     off = np.abs(tried @ rays[drawn].T / inverse[drawn] - 1)
-    support = (off < TOLERANCE).mean(axis=1)
-    best = int(support[: len(known)].argmax()) if len(known) else 0
-    if len(known) and support[best] >= max(KNOWN * support.max(), ON_ONE_PLANE):
-        return known[best], np.zeros((3, 3))
-    plane = tried[support.argmax()]
+    plane = tried[(off < TOLERANCE).sum(axis=1).argmax()]
     for _ in range(4):
         weight = 1 / (1 + ((rays @ plane / inverse - 1) / TOLERANCE) ** 2) / inverse
         plane = np.linalg.lstsq(rays * weight[:, None], inverse * weight, rcond=None)[0]

@@ -1,0 +1,92 @@
+"""Photo consistency of small square patches: do several photos show the same texture there?"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+SIDE = 5  # samples along a patch's side
+SAMPLES = wp.constant(SIDE * SIDE)
+patch = wp.types.vector(length=SIDE * SIDE, dtype=wp.float32)
+
+
+@wp.func
+def bilinear(images: wp.array(dtype=wp.float32), first: int, width: int, u: float, v: float) -> float:
+    """Grey value at pixel coordinates (u, v), pixel centres at +0.5; the place must lie inside the photo."""
+    x = u - 0.5
+    y = v - 0.5
+    j = int(wp.floor(x))
+    i = int(wp.floor(y))
+    fx = x - float(j)
+    fy = y - float(i)
+    k = first + i * width + j
+    top = images[k] * (1.0 - fx) + images[k + 1] * fx
+    low = images[k + width] * (1.0 - fx) + images[k + width + 1] * fx
+    return top * (1.0 - fy) + low * fy
+
+
+@wp.kernel
+def patch_agreement(
+    offset: int,
+    centers: wp.array(dtype=wp.vec3),
+    first_axis: wp.vec3,
+    second_axis: wp.vec3,
+    step: float,
+    views: wp.array2d(dtype=wp.int32),
+    projections: wp.array2d(dtype=wp.vec4),
+    images: wp.array(dtype=wp.float32),
+    width: int,
+    height: int,
+    agreement: wp.array(dtype=wp.float32),
+    contrast: wp.array(dtype=wp.float32),
+):
+    """Mean normalised cross-correlation over all pairs of views, and the mean contrast of the patch in them.
+
+    With unit, zero-mean patches p_i of V views, the mean over pairs is (|sum p_i|^2 - V) / (V (V - 1)).
+    """
+    n = offset + wp.tid()
+    center = centers[n]
+    total = patch()
+    used = int(0)
+    spread = float(0.0)
+    for s in range(views.shape[1]):
+        c = views[n, s]
+        if c >= 0:
+            values = patch()
+            mean = float(0.0)
+            inside = int(1)
+            for k in range(SAMPLES):
+                a = float(k % wp.static(SIDE)) - wp.static(0.5 * (SIDE - 1))
+                b = float(k // wp.static(SIDE)) - wp.static(0.5 * (SIDE - 1))
+                p = center + first_axis * (a * step) + second_axis * (b * step)
+                h = wp.vec4(p[0], p[1], p[2], 1.0)
+                z = wp.dot(projections[c, 2], h)
+                if z > 0.05:
+                    u = wp.dot(projections[c, 0], h) / z
+                    v = wp.dot(projections[c, 1], h) / z
+                    if u > 0.5 and v > 0.5 and u < float(width) - 0.51 and v < float(height) - 0.51:
+                        grey = bilinear(images, c * width * height, width, u, v)
+                        values[k] = grey
+                        mean = mean + grey
+                    else:
+                        inside = int(0)
+                else:
+                    inside = int(0)
+            if inside == 1:
+                mean = mean / float(SAMPLES)
+                square = float(0.0)
+                for k in range(SAMPLES):
+                    d = values[k] - mean
+                    values[k] = d
+                    square = square + d * d
+                size = wp.sqrt(square)
+                if size > 1.0e-6:
+                    total = total + values / size
+                    used = used + 1
+                    spread = spread + size
+    if used > 1:
+        count = float(used)
+        agreement[n] = (wp.dot(total, total) - count) / (count * (count - 1.0))
+        contrast[n] = spread / (count * wp.sqrt(float(SAMPLES)))
+    else:
+        agreement[n] = float(-1.0)
+        contrast[n] = float(0.0)
