@@ -122,6 +122,18 @@ def test_faces_go_to_the_planes_that_are_given_and_others_to_planes_of_their_own
     np.testing.assert_allclose(patches.normal[rest[[0, 3]]], [[0, 0, -1], [-1, 0, 0]], atol=2e-3)
 
 
+def test_faces_of_a_given_plane_do_not_go_to_one_that_is_found_near_it():
+    floor = subdivide_to_size(
+        np.array([[0, 0, 0], [4, 0, 0], [4, 3, 0], [0, 3, 0.0]]), [[0, 1, 2], [0, 2, 3]], 0.2
+    )
+    step = floor[0] * [0.5, 0.5, 1] + [1, 1, 0.05], floor[1] + len(floor[0])
+    mesh = Mesh(np.concatenate([floor[0], step[0]]), np.concatenate([floor[1], step[1]]))
+    given = Plane(np.array([0.0, 0, 1]), -0.015, np.zeros(0, dtype=int))
+    patches = find_patches(mesh, [given])
+    assert patches.area == pytest.approx([12, 3])
+    assert patches.offset == pytest.approx([-0.015, 0.05])
+
+
 def test_a_depth_map_with_few_known_pixels_does_not_end_the_fusion():
     few = np.zeros_like(WALL)
     few[9:12, 9:12] = WALL[9:12, 9:12]

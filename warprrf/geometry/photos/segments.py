@@ -4,8 +4,8 @@ Nothing can be matched within a bare cabinet door, and what is matched on a post
 few, up to their edges. A photo is cut into segments of like colour (Felzenszwalb and Huttenlocher, "Efficient
 graph-based image segmentation", 2004). Where many of the depths that photos prove in a segment lie on one plane, all of
 the segment does (in the spirit of Bleyer and Gelautz, "A layered stereo matching algorithm using image segmentation and
-global visibility constraints", 2005), as far as these depths fix the plane. Inverse depth along the optical axis is
-linear in the image on a plane.
+global visibility constraints", 2005), as far as these depths fix the plane. On a plane inverse range is a linear
+function of the direction of the ray: ``1 / r = c . d`` where ``c . x = 1`` is the plane seen from the camera.
 """
 
 from __future__ import annotations
@@ -15,18 +15,12 @@ import numpy as np
 from warprrf.device import require
 from warprrf.geometry.splats.camera import Camera
 
-COARSENESS, BLUR_PX, LEAST_PX = (
-    60.0,
-    0.6,
-    80,
-)  # of the segments (the first: scikit-image's ``scale``, of 8 bit colours)
+COARSENESS = 60.0  # of the segments: scikit-image's ``scale``, of colours from 0 to 255
+BLUR_PX, LEAST_PX = 0.6, 80  # before a photo is cut, and pixels of the smallest segment
 PROVED_PX, PROVED_SHARE = 15, 0.04  # so many pixels of a segment, and such a part of it, must be proved
 TOLERANCE = 0.02  # a depth that differs from a plane's by less than this part lies on it
 ON_ONE_PLANE = 0.4  # part of the proved depths of a segment that must lie on its plane
-TRIALS, DRAWN = (
-    48,
-    300,
-)  # planes through three proved pixels that are tried, and pixels that they are judged by
+TRIALS, DRAWN = 48, 300  # planes through three proved pixels, and pixels that they are judged by
 UNSURE = 0.02  # where a plane's standard deviation is larger than this part of the depth, it says nothing
 ALIKE_PX = 25.0  # neighbouring pixels, of which errors are alike
 NEAR = 0.12  # proved depths that differ by more than this part from the plane are something else, and stay
@@ -49,10 +43,8 @@ def with_segments(
     bytes_ = np.round(255 * np.asarray(photo)).astype(np.uint8)
     colours = np.asarray(image.fromarray(bytes_).resize((view.width, view.height), image.BOX))
     segment = segmentation.felzenszwalb(colours, scale=COARSENESS, sigma=BLUR_PX, min_size=LEAST_PX).ravel()
-    rays = np.stack([view.directions() @ axis for axis in view.rotation], axis=-1).reshape(-1, 3)
-    ahead = rays[:, 2]
-    rays = rays / ahead[:, None]  # one deep: inverse depth is their product with a plane's coefficients
-    inverse = np.where(depth.ravel() > 0, 1 / np.maximum(depth.ravel() * ahead, 1e-9), 0.0)
+    rays = view.directions().reshape(-1, 3)
+    inverse = np.where(depth.ravel() > 0, 1 / np.maximum(depth.ravel(), 1e-9), 0.0)
     result, sure = depth.flatten(), proved.ravel()
     order = np.argsort(segment, kind="stable")
     for pixels in np.split(order, np.flatnonzero(np.diff(segment[order])) + 1):
@@ -67,7 +59,7 @@ def with_segments(
         spread = np.sqrt(np.einsum("ni,ij,nj->n", rays[pixels], covariance, rays[pixels]))
         put = shown.ravel()[pixels] & (there > 1e-6) & (spread < UNSURE * there)
         put &= ~sure[pixels] | (np.abs(there - inverse[pixels]) < NEAR * inverse[pixels])
-        result[pixels[put]] = 1 / (there[put] * ahead[pixels[put]])
+        result[pixels[put]] = 1 / there[put]
     return result.reshape(depth.shape)
 
 
