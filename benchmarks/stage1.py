@@ -97,7 +97,7 @@ class Room:
         root = Path(folder)
         if not (root / "scene.xml").is_file():
             film = Film.open(folder)
-            every = max(1, len(film.stems) // count)
+            every = max(1, round(len(film.stems) / count))
             film, reference = film.levelled(film.surface(max(1, len(film.stems) // FUSED), progress))
             chosen = range(0, len(film.stems), every)
             known = {film.photo(k).name: film.poses[k][:3, 3] for k in chosen}
