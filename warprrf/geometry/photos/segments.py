@@ -6,6 +6,9 @@ graph-based image segmentation", 2004). Where many of the depths that photos pro
 the segment does (in the spirit of Bleyer and Gelautz, "A layered stereo matching algorithm using image segmentation and
 global visibility constraints", 2005), as far as these depths fix the plane. On a plane inverse range is a linear
 function of the direction of the ray: ``1 / r = c . d`` where ``c . x = 1`` is the plane seen from the camera.
+
+Constants were chosen on a filmed kitchen (7-Scenes) and looked at again on a filmed lounge and on drawn rooms with bare
+walls; the figures change little with any of them.
 """
 
 from __future__ import annotations
