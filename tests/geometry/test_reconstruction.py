@@ -75,7 +75,7 @@ def whole(tmp_path_factory):
     workspace = tmp_path_factory.mktemp("whole")
     rec, told = made(workspace)
     posed = ["features", "matching", "mapping", "undistorting"]
-    check_told(told, [*posed, "planes", "refine", "depth", "stereo", "surface"])
+    check_told(told, [*posed, "planes", "refine", "depth", "stereo", "segments", "surface"])
     return workspace, rec
 
 
@@ -108,7 +108,7 @@ def test_a_killed_run_continues_to_the_same_result(whole, monkeypatch):
             made(workspace)
     (workspace / "surface.safetensors.partial").write_bytes(b"half")
     resumed, told = made(workspace)
-    assert steps(told) == {"depth", "stereo", "surface"}
+    assert steps(told) == {"depth", "stereo", "segments", "surface"}
     np.testing.assert_array_equal(resumed.gaussians.means, rec.gaussians.means)
     np.testing.assert_array_equal(resumed.mesh.vertices, rec.mesh.vertices)
 
