@@ -80,6 +80,21 @@ def test_total_is_continuous_where_paths_and_their_mirror_images_end(bare):
         assert jumps[0] > 0.5 and jumps[1] < 0.01
 
 
+@pytest.mark.parametrize("at_once", [0, 30])
+def test_receivers_looked_at_together_get_what_each_gets_alone(monkeypatch, at_once):
+    receivers = np.array([[6.0, -4, 1.5], [3, -9, 1.5], [6.0, -4, 1.5], [-25, -8, 3], [8.0, 5, 0.5]])
+    ways = [LINK | {"receivers": r, "diffractions": 1} for r in (receivers, *receivers[:, None])]
+    together, *alone = (wr.trace_paths(house(), **way) for way in ways)
+    monkeypatch.setattr("warprrf.rf.paths.edge_paths.AT_ONCE", at_once)
+    few = wr.trace_paths(house(), **ways[0])
+    for k, own in enumerate(alone):
+        count = int(own.valid.sum())
+        assert count > 3
+        for found in (together, few):
+            assert np.array_equal(found.gain[k][found.valid[k]], own.gain[0][own.valid[0]])
+            assert np.array_equal(found.vertices[k][:count], own.vertices[0][:count], equal_nan=True)
+
+
 def test_what_a_path_over_an_edge_says_of_itself(tmp_path):
     receivers = np.array([[6.0, -4, 1.5], [-25.0, -8, 3]])
     p = wr.trace_paths(house(), **LINK, receivers=receivers, diffractions=1)

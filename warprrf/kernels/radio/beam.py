@@ -63,6 +63,41 @@ def beam_normaliser(
     total[k] = weight
 
 
+@wp.kernel(enable_backward=False)
+def separate_beams(
+    offset: int,
+    directions: wp.array(dtype=wp.vec3d),
+    cells: wp.array(dtype=wp.int32),
+    nearest: wp.array(dtype=wp.float64),
+    total: wp.array(dtype=wp.float64),
+    pixels: wp.array2d(dtype=wp.vec3d),
+    solid_angles: wp.array(dtype=wp.float64),
+    half_widths: wp.array2d(dtype=wp.int32),
+    kappa: wp.float64,
+    chord_limit: wp.float64,
+    images: wp.array3d(dtype=wp.float32),
+):
+    """The beam of each path by itself, whose pixels sum to one."""
+    k = offset + wp.tid()
+    rows = pixels.shape[0]
+    columns = pixels.shape[1]
+    d = directions[k]
+    cell_row = cells[k] / columns
+    cell_column = cells[k] - cell_row * columns
+    for row in range(rows):
+        half = half_widths[row, cell_row]
+        if half >= 0:
+            start = column_start(cell_column, half, columns)
+            for step in range(window_width(half, columns)):
+                column = start + step
+                if column >= columns:
+                    column = column - columns
+                c = wp.length_sq(d - pixels[row, column])
+                if c <= chord_limit:
+                    value = wp.exp(wp.float64(0.5) * kappa * (nearest[k] - c)) * solid_angles[row]
+                    images[k, row, column] = wp.float32(value / total[k])
+
+
 @wp.kernel
 def gather_beams(
     offset: int,

@@ -149,11 +149,15 @@ def build(real: type) -> Any:
         return rise
 
     @wp.func
-    def turned(t: Table, r: vec2, i: int, k: int):
-        """Jones matrix of interaction k of record i, which makes ``r`` of (TE, TM): the axes turn into its plane first."""
-        c = wp.cos(t.angle[i, k][1])
-        s = wp.sin(t.angle[i, k][1])
-        return wp.diag(r) * mat2(c, s, -s, c)
+    def turned(t: Table, r: vec2, i: int, k: int, begin: int):
+        """Jones matrix of interaction k of record i, which makes ``r`` of (TE, TM): the axes turn into its plane first. What
+        comes to the first one, ``begin``, is unpolarised: how that is turned does not count."""
+        found = wp.diag(r)
+        if k > begin:
+            c = wp.cos(t.angle[i, k][1])
+            s = wp.sin(t.angle[i, k][1])
+            found = found * mat2(c, s, -s, c)
+        return found
 
     @wp.func
     def raised(
@@ -170,7 +174,7 @@ def build(real: type) -> Any:
                     r = fields_slope(t, m, excess[m.row[g]], i, k)
                 else:
                     r = fields(t, m, excess[m.row[g]], i, k)
-                whole = turned(t, r, i, k) * whole
+                whole = turned(t, r, i, k, begin) * whole
         return whole
 
     @wp.func
@@ -234,9 +238,17 @@ def build(real: type) -> Any:
         return (real(1.0) - s) * table[row, i] + s * table[row, i + 1]
 
     @wp.func
-    def lobe(m: Materials, row: int, which: int, angle: vec3, half_width: real):
-        """f_s / cos(theta_s) [1/sr] of a lobe; exponent 0 is Lambertian, whose cosine cancels. Else 1 / cos(theta_s) is
-        replaced by its mean over what the ray stands for, what lies below the horizon left out."""
+    def narrowed(angle: vec3, half_width: real):
+        """What lobes of all exponents share: ln((1 + cos psi) / 2), and the mean of 1 / cos(theta_s) over what the ray stands for,
+        what lies below the horizon left out."""
+        high = angle[1] + half_width
+        low = wp.max(angle[1] - half_width, real(0.01) * half_width)
+        base = wp.max(real(0.5) * (real(1.0) + angle[2]), real(1e-30))
+        return vec2(wp.log(base), wp.log(high / low) / (high - low))
+
+    @wp.func
+    def lobe(m: Materials, row: int, which: int, angle: vec3, shared: vec2):
+        """f_s / cos(theta_s) [1/sr] of a lobe; exponent 0 is Lambertian, whose cosine cancels. ``shared``: see ``narrowed``."""
         value = real(0.3183098861837907)
         n = int(m.exponent[which])
         if n > 0:
@@ -244,10 +256,8 @@ def build(real: type) -> Any:
             if m.reciprocal[row] == 1:
                 scale *= at(m.scale, which, angle[1])
             else:
-                high = angle[1] + half_width
-                low = wp.max(angle[1] - half_width, real(0.01) * half_width)
-                scale *= wp.log(high / low) / (high - low)
-            value = wp.pow(wp.max(real(0.5) * (real(1.0) + angle[2]), real(0.0)), real(n)) * scale
+                scale *= shared[1]
+            value = wp.exp(real(n) * shared[0]) * scale
         return value
 
     @wp.func
@@ -264,8 +274,10 @@ def build(real: type) -> Any:
     def mixed(t: Table, m: Materials, weight: wp.array2d(dtype=real), i: int, row: int):
         """Sum of weight times lobe at the rough interaction of record i."""
         value = real(0.0)
+        angle = t.angle[i, t.rough]
+        shared = narrowed(angle, t.half_width)
         for j in range(m.exponent.shape[0]):
-            value += weight[row, j] * lobe(m, row, j, t.angle[i, t.rough], t.half_width)
+            value += weight[row, j] * lobe(m, row, j, angle, shared)
         return value
 
     @wp.func
@@ -346,10 +358,11 @@ def build(real: type) -> Any:
                 if kind_of(t, i, t.rough) == wp.static(SCATTER):
                     row = m.row[t.index[i, t.rough]]
                     angle = t.angle[i, t.rough]
+                    shared = narrowed(angle, t.half_width)
                     sum = mixed(t, m, m.weight, i, row)
                     for j in range(lobes):
                         slope[b, place[row] + j] += (
-                            p * m.weight[row, j] * lobe(m, row, j, angle, t.half_width) / sum
+                            p * m.weight[row, j] * lobe(m, row, j, angle, shared) / sum
                         )
                     r = half_space(m.excess[row], angle[0])
                     rise = wp.dot(r, half_space_slope(m.excess[row], angle[0]))
@@ -389,8 +402,9 @@ def build(real: type) -> Any:
             angle = t.angle[i, t.rough]
             row = m.row[t.index[i, t.rough]]
             base = place[t.index[i, t.rough]] * lobes * wp.static(MOMENTS)
+            shared = narrowed(angle, t.half_width)
             for j in range(lobes):
-                value = t.power[i] * lobe(m, row, j, angle, t.half_width)
+                value = t.power[i] * lobe(m, row, j, angle, shared)
                 for c in range(wp.static(MOMENTS)):
                     part = at(moments, c, angle[0])
                     if m.reciprocal[row] == 1:

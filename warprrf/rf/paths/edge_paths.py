@@ -9,7 +9,6 @@ coefficient's terms, and the rest is tested as mirror paths are. Slabs do not be
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -26,6 +25,9 @@ from warprrf.rf.paths.mirror_paths import MirrorPaths, distinct, passed, unobstr
 from warprrf.rf.paths.slabs import Walls
 from warprrf.rf.spectra.spectrum import transverse_basis
 from warprrf.rows import Rows
+
+AT_ONCE = 100_000
+"""Pairs of an edge and mirrors from which on no further receiver is looked at in the same pass."""
 
 
 @dataclass(frozen=True)
@@ -143,39 +145,45 @@ class EdgeFinder:
         """
         check_count("mirrors", mirrors, 0, 1)
         points = np.asarray(receivers, float).reshape(-1, 3)
-        place = self.images.transmitter
-        none = _Ways.over(
-            self.edges, np.zeros(0, int), np.zeros((0, 2), int), self.images.patches, place, place
-        )
-        parts = [self._described(none, none.edge)]
+        nothing = np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2), int)
+        parts, waiting = list[EdgePaths](), [nothing]
         for k, receiver in enumerate(points):
-            ways = self._ways(receiver, mirrors)
-            part = self._described(ways, np.full(len(ways.edge), k))
-            parts.append(part.take(np.argsort(part.length_m, kind="stable")))
+            waiting += self._candidates(k, receiver, mirrors)
+            if sum(len(edge) for _, edge, _ in waiting) > AT_ONCE:
+                parts.append(self._paths(points, waiting))
+                waiting = [nothing]
             if progress is not None:
                 progress("edges", k + 1, len(points))
-        return EdgePaths.joined(parts)
+        return EdgePaths.joined([*parts, self._paths(points, waiting)])
 
-    def _ways(self, receiver: np.ndarray, mirrors: int) -> _Ways:
-        """What reaches a receiver, unobstructed."""
-        images, patches, parts = self.images, self.images.patches, []
-        for side in range(1 + 2 * mirrors):  # no mirror; one before the edge; one behind it
+    def _candidates(
+        self, k: int, receiver: np.ndarray, mirrors: int
+    ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """What may reach receiver ``k``, without a mirror, with one before the edge, and one behind it: of each ``k`` (L,), edges
+        (L,) and patches of mirrors (L, 2)."""
+        images, parts = self.images, []
+        for side in range(1 + 2 * mirrors):
             seen, end = (images, receiver) if side < 2 else (images.seen_from(receiver), images.transmitter)
             edge, chain = seen.over_edges(self._leaves, end, min(side, 1))
             patch = np.full((len(edge), 2), -1)
             if side:
                 patch[:, side - 1] = chain[:, 0]
-            parts.append((edge, patch))
-        edge, patch = (np.concatenate(column) for column in zip(*parts, strict=True))
-        ways = _Ways.over(self.edges, edge, patch, patches, images.transmitter, receiver)
-        direct = float(np.linalg.norm(receiver - images.transmitter))
-        for sieve in (self._in_reach, partial(self._strong, direct), self._on_mirrors):
+            parts.append((np.full(len(edge), k), edge, patch))
+        return parts
+
+    def _paths(self, points: np.ndarray, found: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> EdgePaths:
+        """Those candidates that are paths to receivers at ``points`` (R, 3), unobstructed or through a slab."""
+        row, edge, patch = (np.concatenate(column) for column in zip(*found, strict=True))
+        ends = np.stack([np.broadcast_to(self.images.transmitter, (len(row), 3)), points[row]], axis=1)
+        ways = _Ways.over(self.edges, row, edge, patch, self.images.patches, ends)
+        for sieve in (self._in_reach, self._strong, self._on_mirrors):
             ways = ways.take(np.flatnonzero(sieve(ways)))
         free = self._unobstructed(ways)
         ways = _Ways.joined([ways.take(free), self._passing(ways.take(~free))])
         # Wedges before the borders of their faces.
         ways = ways.take(np.argsort(self.edges.n[ways.edge], kind="stable"))
-        return ways.take(ways.distinct(3.0 * patches.tolerance_m))
+        paths = self._described(ways.take(ways.distinct(3.0 * self.images.patches.tolerance_m)))
+        return paths.take(np.lexsort((paths.length_m, paths.receiver)))
 
     def _in_reach(self, ways: _Ways) -> np.ndarray:
         """Whether the point lies on the edge, both legs in the air and what is mirrored not in the mirror's own plane."""
@@ -188,10 +196,10 @@ class EdgeFinder:
             found &= (ways.patch[:, j] < 0) | (height > 2.0 * self.images.patches.tolerance_m)
         return found
 
-    def _strong(self, direct: float, ways: _Ways) -> np.ndarray:
+    def _strong(self, ways: _Ways) -> np.ndarray:
         """Whether paths reach -80 dB of an unobstructed straight path between the ends, even if every face and mirror reflects
         all."""
-        most = np.abs(boundary_fields(self._rays(ways))).sum(axis=0) * direct / ways.leg.sum(axis=1)
+        most = np.abs(boundary_fields(self._rays(ways))).sum(axis=0) * ways.direct / ways.leg.sum(axis=1)
         return np.asarray(20.0 * np.log10(np.maximum(most, 1e-300)) > -80.0)
 
     def _on_mirrors(self, ways: _Ways) -> np.ndarray:
@@ -251,7 +259,7 @@ class EdgeFinder:
             return -np.ones(len(patch)), np.ones(len(patch))
         return self.table.reflection(self.images.patches.group[patch], cosine, self.wavelength_m)
 
-    def _described(self, ways: _Ways, receiver: np.ndarray) -> EdgePaths:
+    def _described(self, ways: _Ways) -> EdgePaths:
         edges, patches, rays = self.edges.take(ways.edge), self.images.patches, self._rays(ways)
         faces, cosines = patches.face_patch[edges.face], rays.incidence_cosines()
         reflected = [self._reflection(faces[:, j], cosines[2 + j]) for j in range(2)]
@@ -296,19 +304,19 @@ class EdgeFinder:
         )
         code, point = ways.stops()
         return EdgePaths(
-            receiver, ways.patch, code, point, length, excess,
-            length - np.linalg.norm(ways.end[:, 1] - ways.end[:, 0], axis=1), departure, arrival, matrix,
+            ways.receiver, ways.patch, code, point, length, excess, length - ways.direct, departure, arrival, matrix,
             size * sign / np.maximum(np.abs(sign), 1e-300), self.wavelength_m,
         )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class _Ways(Rows):
-    """L ways over an edge each: the ``patch`` that mirrors or the face of the ``slab`` (L, 2) before and behind, -1 for none, where
-    that ``stop`` is (L, 2, 3), and the ``thickness_m`` of a solid (L, 2); the ``point`` on the edge (L, 3) and ``at`` how far along
-    (L,); and of both legs, unfolded at mirrors, lengths ``leg`` (L, 2), ``angle`` about the edge (L, 2) and ``direction`` of
-    propagation (L, 2, 3); the ``end`` points (L, 2, 3)."""
+    """L ways over an edge each: the index of the ``receiver`` (L,) and of the ``edge`` (L,); the ``patch`` that mirrors or the face
+    of the ``slab`` (L, 2) before and behind, -1 for none, where that ``stop`` is (L, 2, 3), and the ``thickness_m`` of a solid
+    (L, 2); the ``point`` on the edge (L, 3) and ``at`` how far along (L,); and of both legs, unfolded at mirrors, lengths ``leg``
+    (L, 2), ``angle`` about the edge (L, 2) and ``direction`` of propagation (L, 2, 3); the ``end`` points (L, 2, 3)."""
 
+    receiver: np.ndarray
     edge: np.ndarray
     patch: np.ndarray
     slab: np.ndarray
@@ -325,15 +333,15 @@ class _Ways(Rows):
     def over(
         cls,
         edges: Edges,
+        receiver: np.ndarray,
         edge: np.ndarray,
         patch: np.ndarray,
         patches: PlanarPatches,
-        transmitter: np.ndarray,
-        receiver: np.ndarray,
+        end: np.ndarray,
     ) -> _Ways:
-        """Between two points over the edges ``edge`` (L,), by images of either in ``patch`` (L, 2)."""
+        """Of indices ``receiver`` (L,), between two points ``end`` (L, 2, 3) each, over the edges ``edge`` (L,), by images of
+        either in ``patch`` (L, 2)."""
         e = edges.take(edge)
-        end = np.broadcast_to(np.stack([transmitter, receiver]), (len(edge), 2, 3))
         normal, offset = patches.normal[patch], patches.offset[patch]
         mirrored = (patch >= 0)[..., None]
         height = ((end * normal).sum(axis=2) - offset)[..., None]
@@ -355,14 +363,19 @@ class _Ways(Rows):
         share = np.divide(depth, between, out=np.zeros_like(depth), where=between != 0)
         stop = np.where(mirrored, point[:, None] + share * (image - point[:, None]), np.nan)
         slab, solid = np.full(patch.shape, -1), np.full(patch.shape, np.nan)
-        return cls(edge, patch, slab, stop, solid, point, at, leg, angle, direction, end)
+        return cls(receiver, edge, patch, slab, stop, solid, point, at, leg, angle, direction, end)
+
+    @property
+    def direct(self) -> np.ndarray:
+        """Length of the straight line between the ends [m], shape ``(L,)``."""
+        return np.linalg.norm(self.end[:, 1] - self.end[:, 0], axis=1)
 
     def distinct(self, distance_m: float) -> np.ndarray:
-        """Indices of ways that no earlier one repeats, with mirrors on the same sides and all points within ``distance_m``: edges
-        that lie so close are one."""
+        """Indices of ways that no earlier one of the same receiver repeats, with mirrors on the same sides and all points within
+        ``distance_m``: edges that lie so close are one."""
         side = (self.patch >= 0) @ np.array([1, 2]) + (self.slab >= 0) @ np.array([4, 8])
         points = np.stack([self.stop[:, 0], self.point, self.stop[:, 1]], axis=1)
-        return distinct(side, np.nan_to_num(points), distance_m)
+        return distinct(side + 16 * self.receiver, np.nan_to_num(points), distance_m)
 
     def stops(self) -> tuple[np.ndarray, np.ndarray]:
         """Codes ``(L, 2)`` and points ``(L, 2, 3)`` of the interactions, from the transmitter on."""

@@ -297,15 +297,21 @@ def beam_sums(
     """Squared chord from each unit vector ``directions`` (L, 3) to its pixel's centre, and the sum of its beam over all
     pixels, one there, shape ``(L, 2)``."""
     where = _device.resolve(device)
+    grid, toward, cells = _ends_of_beams(directions, shape, sigma, where)
+    sums = [wp.zeros(len(directions), dtype=wp.float64, device=where) for _ in range(2)]
+    _device.launch(beam_kernels.beam_normaliser, len(directions), [toward, cells, *grid, *sums], device=where)
+    return np.stack([one.numpy() for one in sums], axis=1)
+
+
+def _ends_of_beams(
+    directions: np.ndarray, shape: tuple[int, int], sigma: float, where: wp.Device
+) -> tuple[list[Any], wp.array, wp.array]:
+    """What kernels take of the grid and the beam, the unit vectors (L, 3), and the pixels that these fall in."""
     grid = _beam_grid(shape, float(sigma), str(where))
     row, column = pixel_of(directions, shape)
-    sums = [wp.zeros(len(directions), dtype=wp.float64, device=where) for _ in range(2)]
-    inputs = [
-        wp.array(directions, dtype=wp.vec3d, device=where), wp.array(row * shape[1] + column, dtype=wp.int32, device=where),
-        grid.pixels, grid.solid_angles, grid.half_widths, grid.kappa, grid.chord_limit, *sums,
-    ]  # fmt: skip
-    _device.launch(beam_kernels.beam_normaliser, len(directions), inputs, device=where)
-    return np.stack([one.numpy() for one in sums], axis=1)
+    beam = [grid.pixels, grid.solid_angles, grid.half_widths, grid.kappa, grid.chord_limit]
+    toward = wp.array(directions, dtype=wp.vec3d, device=where)
+    return beam, toward, wp.array(row * shape[1] + column, dtype=wp.int32, device=where)
 
 
 def strongest_rays(
@@ -345,23 +351,24 @@ def strongest_rays(
     return best.numpy().reshape(rows, columns)
 
 
-def unit_beams(directions: np.ndarray, shape: tuple[int, int], sigma: float) -> np.ndarray:
+def unit_beams(
+    directions: np.ndarray, shape: tuple[int, int], sigma: float, *, device: DeviceLike = None
+) -> np.ndarray:
     """The beam of each unit vector ``directions`` (L, 3) by itself, shape ``(L, H, W)`` float32; each sums to one.
 
     The same beams as :func:`spread`, all images at once: for tens of paths, not for thousands.
     """
     rows, columns = check_shape(shape)
-    out = np.zeros((len(directions), rows * columns), np.float32)
-    pixels = pixel_directions(shape).reshape(-1, 3)
-    solid_angle = np.repeat(pixel_solid_angles(shape), columns)
-    limit = 4.0 * np.sin(0.5 * _cutoff(shape, sigma)) ** 2 * (1.0 + 1e-12)
-    for k, d in enumerate(directions):
-        near = np.flatnonzero(pixels @ d >= 1.0 - 0.5 * limit - 1e-9)
-        chord = ((pixels[near] - d) ** 2).sum(axis=1)
-        near, chord = near[chord <= limit], chord[chord <= limit]
-        value = np.exp(-0.5 * (chord - chord.min()) / sigma**2) * solid_angle[near]
-        out[k, near] = value / value.sum()
-    return out.reshape(-1, rows, columns)
+    where = _device.resolve(device)
+    grid, toward, cells = _ends_of_beams(directions, (rows, columns), sigma, where)
+    images = wp.zeros((len(directions), rows, columns), dtype=wp.float32, device=where)
+    known = [
+        wp.array(np.ascontiguousarray(own), dtype=wp.float64, device=where)
+        for own in beam_sums(directions, shape, sigma, device=where).T
+    ]
+    inputs = [toward, cells, *known, *grid, images]
+    _device.launch(beam_kernels.separate_beams, len(directions), inputs, device=where)
+    return images.numpy()
 
 
 def _cutoff(shape: tuple[int, int], sigma: float) -> float:

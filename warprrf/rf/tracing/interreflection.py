@@ -47,7 +47,7 @@ class Interreflection:
             known = np.union1d(known, surface.side_met(face[ray], grid.directions[ray]))
         shift = np.random.default_rng(0).random((2, len(surface.element_area)))
         scale = np.float32(np.pi / RAYS * (4.0 * np.pi / tracer.wavelength_m) ** 2)
-        self.lit, self.through, self.behind = list[Records](), list[Records](), list[Records]()
+        lit, through, behind = list[Records](), list[Records](), list[Records]()
         rows, columns, values, new = [], [], [], known
         while len(new):
             directions = _hemispheres(normal[new], shift[:, new % shift.shape[1]])
@@ -56,12 +56,12 @@ class Interreflection:
             side, met = np.repeat(new, RAYS), surface.side_met(hits.face[hit], directions[hit])
             rays = Rays(hits, side)
             light = tracer.light(rays)
-            tables = [(self.lit, tracer.lit(rays, light))]
+            tables = [(lit, tracer.lit(rays, light))]
             if most:
                 onward = tracer.behind(rays, most)
                 tables += [
-                    (self.through, tracer.lit_through(rays, light, most)),
-                    (self.behind, tracer.lit(onward, tracer.light(onward))),
+                    (through, tracer.lit_through(rays, light, most)),
+                    (behind, tracer.lit(onward, tracer.light(onward))),
                 ]
             for table, found in tables:
                 table.append(replace(found, power=scale * found.power))
@@ -70,6 +70,11 @@ class Interreflection:
             values.append(np.pi / RAYS * np.broadcast_to(grid.transmittance(hits.range_m[hit]), len(hit)))
             new = np.setdiff1d(met, known)
             known = np.union1d(known, new)
+        self.lit = Records.joined(lit)
+        self.through, self.behind = (
+            Records.joined(tables) if tables else self.lit.take(np.zeros(0, int))
+            for tables in (through, behind)
+        )
         pairs = tuple(map(np.concatenate, (rows, columns)))
         self.between = csr_matrix((np.concatenate(values), pairs), shape=(surface.element_sides,) * 2)
 
@@ -83,7 +88,7 @@ def irradiance(tracer: Tracer, p: Parameters, effects: Effects) -> np.ndarray | 
     light = tracer.kept.get(("interreflection", most), lambda: Interreflection(tracer.of_transmitter, most))
     materials = Materials(p, tracer.slabs, device=tracer.grid.device)
     share = p.scattered_share[tracer.surface.side_group] / np.pi
-    tables = [*light.lit, *light.through, *(light.behind if effects.scatter_mirror else [])]
+    tables = [light.lit, light.through] + [light.behind] * effects.scatter_mirror
     got = sum(np.bincount(r.ray, r.powers(materials), minlength=sides) for r in tables)
     if effects.mirror_scatter:
         for onto in (tracer.mirrored(slabs).onto for slabs in {0, most}):

@@ -112,6 +112,8 @@ class Records:
 
         def column(name: str, nothing: int) -> np.ndarray:
             arrays = [getattr(table, name) for table in tables]
+            if name == "kind":
+                arrays = [np.broadcast_to(own, t.index.shape) for own, t in zip(arrays, tables, strict=True)]
             more = [[(0, 0), (0, most - a.shape[1]), (0, 0)][: a.ndim] for a in arrays]
             return np.concatenate(
                 [np.pad(a, pad, constant_values=nothing) for a, pad in zip(arrays, more, strict=True)]

@@ -112,12 +112,11 @@ class View:
         sigma = self.tracer.beam_sigma_rad
         if sigma is None:
             raise ValueError("view: it was traced without a receiver's beam, expected one of a spectrum")
-        made = (
-            self._beams[0] if self._beams else unit_beams(self.paths.arrival, self.tracer.grid.shape, sigma)
-        )
+        grid = self.tracer.grid
+        made = self._beams or [unit_beams(self.paths.arrival, grid.shape, sigma, device=grid.device)]
         if self.keeps:
-            self._beams[:] = [made]
-        return made
+            self._beams[:] = made
+        return made[0]
 
     @property
     def cell(self) -> np.ndarray:

@@ -9,7 +9,7 @@ from itertools import pairwise
 from math import ceil
 
 import numpy as np
-from scipy.sparse import csr_matrix
+from scipy.sparse import block_diag, csr_matrix
 
 from warprrf.cache import cached_property
 from warprrf.rf.fields.bistatic.observations import OWN_GAIN, Columns, Observation, Target, huber
@@ -114,13 +114,8 @@ class Batch:
     @cached_property
     def path(self) -> csr_matrix:
         """Readings of unit power on each of them, in units of the floor, shape ``(L, N)``."""
-        tables = [o.path[own] for o, own in zip(self.observations, self.kept, strict=True)]
-        columns = [
-            np.tile(np.arange(own.start, own.stop), len(x)) for x, own in zip(tables, self.own, strict=True)
-        ]
-        first = np.cumsum([0, *np.repeat(self.counts, [len(table) for table in tables])])
-        values = np.concatenate([table.ravel() for table in tables])
-        return csr_matrix((values, np.concatenate(columns), first), (len(first) - 1, self.own[-1].stop))
+        each = zip(self.observations, self.kept, strict=True)
+        return block_diag([csr_matrix(o.path[own]) for o, own in each], format="csr")
 
     def power(self, materials: Materials) -> np.ndarray:
         """Predictions ``(N,)`` in units of each floor, without the gains of chains."""
