@@ -116,13 +116,6 @@ class RayGrid:
         """Rays of a pixel."""
         return self.sub_pixels**2
 
-    def spread(self, count: int) -> tuple[np.ndarray, float]:
-        """Which of a pixel's rays are about ``count``, evenly spread, shape ``(per_pixel,)`` bool, and how many rays each of
-        them stands for."""
-        chosen = np.zeros(self.per_pixel, bool)
-        chosen[((np.arange(count) + 0.5) * self.per_pixel / count).astype(int)] = True
-        return chosen, self.per_pixel / int(chosen.sum())
-
     def transmittance(self, length_m: ArrayLike) -> np.ndarray | float:
         """Share of power that ``length_m`` [m] of air lets through; 1.0 without absorption."""
         return np.exp(-self.loss_per_m * np.asarray(length_m)) if self.loss_per_m else 1.0

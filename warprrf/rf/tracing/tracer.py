@@ -380,8 +380,10 @@ class Tracer:
         through slabs alone, up to that many."""
         chosen, times = np.flatnonzero(rays.hits.face >= 0), 1.0
         if rays.after is None:
-            some, times = self.grid.spread(THROUGH_MIRRORS)
-            chosen = chosen[some[chosen % len(some)]]
+            places = ((np.arange(THROUGH_MIRRORS) + 0.5) * self.grid.per_pixel / THROUGH_MIRRORS).astype(int)
+            places = np.unique(places)
+            times = self.grid.per_pixel / len(places)
+            chosen = chosen[np.isin(chosen % self.grid.per_pixel, places)]
         m = self.mirrored(most)
         row, image = m.pairs(rays.hits.face[chosen])
         row = chosen[row]
