@@ -278,9 +278,7 @@ class ExactEngine:
             way, plane = point[own] - image, self.surface.plane_normal[patch[chosen, 0][k]]
             before = tracer.specular(mirrors).interactions
             seen = Rays(rays.hits, np.arange(len(rays.ray)))
-            records = tracer.scattered(
-                seen, ray[own], every * light.strength[k], light.angle[k], before
-            )
+            records = tracer.scattered(seen, ray[own], every * light.strength[k], light.angle[k], before)
             departure = way - 2.0 * (way * plane).sum(axis=1)[:, None] * plane
             yield self._paths(rays, records, np.linalg.norm(way, axis=1), departure, name)
 

@@ -15,7 +15,7 @@ from warprrf.geometry.mesh import vectors_across
 from warprrf.rf.tracing.model import Effects, Parameters
 from warprrf.rf.tracing.records import Materials, Records
 from warprrf.rf.tracing.surface import Surface
-from warprrf.rf.tracing.tracer import LIFT_M, Rays, Tracer
+from warprrf.rf.tracing.tracer import Rays, Tracer
 
 RAYS = 128  # from each element, over its hemisphere
 
@@ -51,7 +51,9 @@ class Interreflection:
         rows, columns, values, new = [], [], [], known
         while len(new):
             directions = _hemispheres(normal[new], shift[:, new % shift.shape[1]])
-            hits = grid.hit_along(point[new] + LIFT_M * normal[new], directions, np.ones(len(directions)))
+            hits = grid.hit_along(
+                point[new] + surface.position_error_m * normal[new], directions, np.ones(len(directions))
+            )
             hit = np.flatnonzero(hits.face >= 0)
             side, met = np.repeat(new, RAYS), surface.side_met(hits.face[hit], directions[hit])
             rays = Rays(hits, side)
