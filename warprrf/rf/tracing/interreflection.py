@@ -18,6 +18,7 @@ from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import Rays, Tracer
 
 RAYS = 128  # from each element, over its hemisphere
+LIFT_M = 0.02  # rays of elements start so far off the surface
 
 
 class Interreflection:
@@ -51,9 +52,7 @@ class Interreflection:
         rows, columns, values, new = [], [], [], known
         while len(new):
             directions = _hemispheres(normal[new], shift[:, new % shift.shape[1]])
-            hits = grid.hit_along(
-                point[new] + surface.position_error_m * normal[new], directions, np.ones(len(directions))
-            )
+            hits = grid.hit_along(point[new] + LIFT_M * normal[new], directions, np.ones(len(directions)))
             hit = np.flatnonzero(hits.face >= 0)
             side, met = np.repeat(new, RAYS), surface.side_met(hits.face[hit], directions[hit])
             rays = Rays(hits, side)
