@@ -108,8 +108,10 @@ def beamed(power: np.ndarray) -> np.ndarray:
 
 
 ROOMS = {"floor": (floor_and_mirror, 1), "lobby": (lobby, 3)}  # and scatterings that are compared
-LOOK, LIT = "4 rays a pixel look into mirrors", "mirrors light whole faces"
-ELEMENTS = "elements are lit evenly"
+LOOK = "9 rays a pixel where a mirror shows the ceiling beside the transmitter: 0.14 dB where 0.10 are asked"
+FEW = "3 rays a pixel see what mirrors light: 0.36 dB where 0.14 are asked"
+LIT = "mirrors light whole faces, or none of them: -2.9 % where 1 are asked, 2.4 dB where 0.44"
+ELEMENTS = "elements are lit evenly, by 128 rays: 0.65 dB of SS where 0.20 are asked, -2.2 % of SSS where 1, 0.37 dB where 0.22"
 
 
 def cases(**wrong: str) -> list[object]:
@@ -158,7 +160,7 @@ def test_mitsuba_follows_closed_forms():
         assert found.total == pytest.approx(exact[sequence], rel=1e-4, abs=4.0 * found.error)
 
 
-@pytest.mark.parametrize(("room", "sequence"), cases(lobby_SM=LOOK, lobby_MS=LIT, lobby_SSS=ELEMENTS))
+@pytest.mark.parametrize(("room", "sequence"), cases(lobby_MS=LIT, lobby_SSS=ELEMENTS))
 def test_totals_are_those_of_mitsuba(room, sequence):
     sionna_or_skip()
     ours, found = compared(room, sequence)
@@ -168,7 +170,7 @@ def test_totals_are_those_of_mitsuba(room, sequence):
 
 @pytest.mark.parametrize(
     ("room", "sequence"),
-    cases(floor_SM=LOOK, floor_MS=LIT, lobby_SM=LOOK, lobby_MS=LIT, lobby_SS=ELEMENTS, lobby_SSS=ELEMENTS),
+    cases(floor_MS=FEW, lobby_SM=LOOK, lobby_MS=LIT, lobby_SS=ELEMENTS, lobby_SSS=ELEMENTS),
 )  # fmt: skip
 def test_images_are_those_of_mitsuba(room, sequence):
     sionna_or_skip()

@@ -6,13 +6,17 @@ import numpy as np
 import pytest
 from furnished import RECEIVERS, TX, F, furnished, spectra
 from path_makers import random_directions
+from places import LOBBY
 from radio_scenes import SlabMaterial
 from twin_fields import known_field
 
+import warprrf as wr
 from warprrf.rf.em.fresnel import lobe
 from warprrf.rf.em.materials import NARROWEST_LOBE
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
+from warprrf.rf.tracing.model import Effects
 
 WAVELENGTH = SPEED_OF_LIGHT / F
 RX = RECEIVERS[0]
@@ -56,6 +60,26 @@ def test_a_fields_scattered_power_is_the_same_both_ways():
 
     assert total(field, TX, RX) == pytest.approx(total(field, RX, TX), rel=5e-3)
     assert abs(total(plain, TX, RX) / total(plain, RX, TX) - 1.0) > 0.05
+
+
+@pytest.mark.parametrize("receiver", [7, *(pytest.param(k, marks=pytest.mark.long) for k in (0, 20))])
+def test_the_exact_engine_is_reciprocal_by_sequence_and_in_total(receiver):
+    """The seventh receiver is blocked, and gets more than a third of its scattered power by way of mirrors."""
+    ds, scene = wr.SpectrumDataset.load(LOBBY / "spectra.nc"), wr.Scene.load(LOBBY / "scene.xml")
+    scene = scene.with_materials([replace(m, reciprocal=True) for m in scene.materials])
+    effects = Effects(mirrors=1, scatterings=1, transmissions=0, diffractions=0, residual=False)
+    ends = np.stack([ds.transmitter, ds.receivers[receiver]])
+
+    def powers(transmitter, receiver):
+        known = {"transmitter": transmitter, "frequency_hz": ds.frequency_hz, "shape": (60, 120)}
+        engine = ExactEngine(scene, **known, effects=effects)
+        found = {paths.sequence: paths.power.sum() for paths in engine.sequences(receiver)}
+        return found | {"total": sum(found.values())}
+
+    there, back = powers(*ends), powers(*ends[::-1])
+    for name in ("S", "MS", "SM"):
+        assert abs(10.0 * np.log10(there[name] / back[name[::-1]])) < 0.05, name
+    assert abs(10.0 * np.log10(there["total"] / back["total"])) < 0.05
 
 
 def test_a_fit_takes_reciprocal_lobes_and_its_file_says_so(tmp_path):

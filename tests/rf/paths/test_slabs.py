@@ -123,7 +123,7 @@ def test_what_scatters_before_and_behind_a_slab_is_the_integral_over_the_floor()
     scene = Scene(mesh, [FLOORING, GLASS, itu_material("metal")], part)
     engine = ExactEngine(scene, transmitter=TX, frequency_hz=F, shape=(90, 180), effects=effects)
     found = {p.sequence: p.power.sum() for p in engine.sequences(RX)}
-    tracer = engine._fine
+    tracer = engine._tracer
     by_field = tracer.view(RX, effects).traced(effects)["MTS3"].powers(engine.materials)
     step = 0.02
     x, y = np.meshgrid(*2 * [np.arange(-6 + step / 2, 6, step)], indexing="ij")

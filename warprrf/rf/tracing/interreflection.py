@@ -15,9 +15,10 @@ from warprrf.geometry.mesh import vectors_across
 from warprrf.rf.tracing.model import Effects, Parameters
 from warprrf.rf.tracing.records import Materials, Records
 from warprrf.rf.tracing.surface import Surface
-from warprrf.rf.tracing.tracer import LIFT_M, Rays, Tracer
+from warprrf.rf.tracing.tracer import Rays, Tracer
 
 RAYS = 128  # from each element, over its hemisphere
+LIFT_M = 0.02  # rays of elements start so far off the surface
 
 
 class Interreflection:

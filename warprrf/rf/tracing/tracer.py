@@ -37,9 +37,7 @@ from warprrf.rf.tracing.surface import Surface
 
 MIRROR_SLACK_M = 0.1
 """How far beside its faces a patch may still mirror [m]: outlines of a reconstructed mesh are torn."""
-LIFT_M = 0.02  # rays that start on a surface start so far off it
 THROUGH_MIRRORS = 3  # rays of a pixel that look for light by way of mirrors
-INTO_MIRRORS = 2  # square root of the rays of a pixel that go on at mirrors: what these show is seen a second time already
 UNMODELLED = {("MTS", "M"), ("MTS", "T")}
 """Ways of light and of sight that are not traced together."""
 SPECULAR = "specular"
@@ -377,12 +375,10 @@ class Tracer:
     def lit_by_mirrors(self, rays: Rays, most: int = 0) -> Records:
         """What some rays of each pixel see of surfaces that images of the transmitter light; with ``most`` those that they light
         through slabs alone, up to that many."""
-        chosen, times = np.flatnonzero(rays.hits.face >= 0), 1.0
-        if rays.after is None:
-            places = ((np.arange(THROUGH_MIRRORS) + 0.5) * self.grid.per_pixel / THROUGH_MIRRORS).astype(int)
-            places = np.unique(places)
-            times = self.grid.per_pixel / len(places)
-            chosen = chosen[np.isin(chosen % self.grid.per_pixel, places)]
+        places = ((np.arange(THROUGH_MIRRORS) + 0.5) * self.grid.per_pixel / THROUGH_MIRRORS).astype(int)
+        places = np.unique(places)
+        times = self.grid.per_pixel / len(places)
+        chosen = np.flatnonzero((rays.hits.face >= 0) & np.isin(rays.ray % self.grid.per_pixel, places))
         m = self.mirrored(most)
         row, image = m.pairs(rays.hits.face[chosen])
         row = chosen[row]
@@ -484,26 +480,17 @@ class Tracer:
         return Rays(found, rays.ray[ray[row]], after)
 
     def _turned(self, view: View) -> Rays:
-        """Rays of a coarser lattice turned at the mirrors that they hit, and what they hit there. Of the receiver's grid each
-        belongs to a ray of the same pixel that hits something, if one does."""
-        s, per_pixel = self.surface, self.grid.per_pixel
-        shape, sub_pixels = self.grid.shape, min(INTO_MIRRORS, self.grid.sub_pixels)
-        grid = self.kept.get((shape, sub_pixels), lambda: self.on_grid(shape, sub_pixels).grid)
-        hits = grid.hit(view.receivers)
-        ray = np.flatnonzero(hits.face >= 0)
-        ray = ray[s.patch[hits.face[ray]] >= 0]
+        """Rays turned at the mirrors that they hit, and what they hit there."""
+        s, grid, hits = self.surface, self.grid, view.hits
+        ray = np.flatnonzero((hits.face >= 0) & (s.patch[hits.face] >= 0))
         face, each = hits.face[ray], ray % len(grid.directions)
         direction, normal = grid.directions[each], s.plane_normal[s.patch[face]]
         normal = np.where((direction * normal).sum(axis=1, keepdims=True) > 0, -normal, normal)
         cosine = -(direction * normal).sum(axis=1)
         turned = direction + 2.0 * cosine[:, None] * normal
         solid_angle = grid.solid_angle[each] * grid.transmittance(hits.range_m[ray])
-        found = grid.hit_along(hits.points(ray) + LIFT_M * normal, turned, solid_angle)
-        pixel, place = np.divmod(ray, grid.per_pixel)
-        place = ((place + 0.5) * per_pixel / grid.per_pixel).astype(int)
-        met = view.hits.face.reshape(-1, per_pixel) >= 0
-        place = np.where(met[pixel, place], place, met.argmax(axis=1)[pixel])
-        return Rays(found, pixel * per_pixel + place, Interactions.of_mirrors(s.group[face], cosine))
+        found = grid.hit_along(hits.points(ray) + s.position_error_m * normal, turned, solid_angle)
+        return Rays(found, ray, Interactions.of_mirrors(s.group[face], cosine))
 
     def adopted(self, view: View) -> View:
         """What :func:`view_of` found, as a view of this tracer."""
