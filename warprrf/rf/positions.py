@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_positive, checked, users_level
+from warprrf.checks import Positive, check_array, checked, users_level
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -101,7 +101,7 @@ def quotients(answers: Any, step_m: float) -> np.ndarray:
 
 @checked
 def retraced_slope(
-    answer: Callable[[np.ndarray], Any], points: ArrayLike, *, step_m: float = 0.01
+    answer: Callable[[np.ndarray], Any], points: ArrayLike, *, step_m: Positive = 0.01
 ) -> np.ndarray:
     """Slopes of what is traced anew on either side of each place: central differences.
 
@@ -125,15 +125,15 @@ def retraced_slope(
 
         wr.paths.retraced_slope(total_db, [3.0, 2.0, 1.5])  # [dB/m], shape (3,)
     """
-    at, step = check_receivers("points", points), check_positive("step_m", step_m)
-    places = beside(at, step).reshape(-1, 3)
+    at = check_receivers("points", points)
+    places = beside(at, step_m).reshape(-1, 3)
     found = np.asarray(answer(places))
     if found.ndim == 0 or len(found) != len(places):
         raise ValueError(
             f"answer: got shape {found.shape} for {len(places)} positions, expected a row for each"
         )
     found = found.reshape(*at.shape[:-1], 6, *found.shape[1:])
-    return quotients(np.moveaxis(found, at.ndim - 1, 0), step)
+    return quotients(np.moveaxis(found, at.ndim - 1, 0), step_m)
 
 
 def check_positions(

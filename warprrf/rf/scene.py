@@ -15,12 +15,13 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_arrays, check_number, check_type, checked, index_to
+from warprrf.checks import NotNegative, check_array, check_arrays, check_type, checked, index_to
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import MeshOptions, is_mesh_file
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.materials import Material
+from warprrf.rf.em.waves import Hertz
 from warprrf.rf.positions import is_free
 from warprrf.rf.scene_parts import MaterialChoice, Materials, ScenePart, read_mesh_scene
 from warprrf.rf.scene_sionna import parts_of, to_sionna_scene
@@ -191,7 +192,7 @@ class Scene:
             **options,
         )
 
-    def to_sionna(self, *, frequency_hz: float = 3.5e9) -> Any:
+    def to_sionna(self, *, frequency_hz: Hertz = 3.5e9) -> Any:
         """The scene as a ``sionna.rt.Scene``, with scattering patterns, transmitters, receivers and their antennas.
 
         Objects keep their names (with ``_`` for ``.``) and are not merged; one of several materials becomes one object
@@ -245,7 +246,7 @@ class Scene:
         return self.mesh.bounds
 
     def is_free(
-        self, points: ArrayLike, *, clearance_m: float = 0.0, device: DeviceLike = None
+        self, points: ArrayLike, *, clearance_m: NotNegative = 0.0, device: DeviceLike = None
     ) -> np.ndarray:
         """Whether points lie in the air of a room or a city, shape ``(N,)``, bool.
 
@@ -253,7 +254,6 @@ class Scene:
         besides.
         """
         points = check_array("points", points, (None, 3))
-        check_number("clearance_m", clearance_m, 0.0)
         return is_free(self.mesh, points, clearance_m=clearance_m, device=device)
 
 

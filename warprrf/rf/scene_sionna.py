@@ -27,7 +27,6 @@ from warprrf.checks import checked, users_level
 from warprrf.device import require
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.materials import Band, Material, itu_material
-from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.scene_parts import MaterialChoice, ScenePart
 from warprrf.rf.spectra.antenna import PATTERNS, SLANTS_RAD, Antenna, as_antenna
 from warprrf.rf.spectra.spectrum import directions_from_angles, pixel_directions
@@ -204,7 +203,6 @@ def to_sionna_scene(
     frequency_hz: float,
 ) -> Any:
     """A ``sionna.rt.Scene`` of these objects, devices and antennas; see :meth:`Scene.to_sionna`."""
-    frequency = check_frequency(frequency_hz)
     rt = sionna_rt()
     mi = select_variant()
     taken = {*transmitters, *receivers}  # Sionna's objects, materials and devices share one set of names
@@ -218,7 +216,7 @@ def to_sionna_scene(
     names = [free(part.name.replace(".", "_"), "_") for part in parts]  # Mitsuba parts its paths by dots
     materials = {id(part.material): part.material for part in parts}
     radio = {
-        key: _radio_material(rt, one, free(one.name, "-material"), frequency)
+        key: _radio_material(rt, one, free(one.name, "-material"), frequency_hz)
         for key, one in materials.items()
     }
     shapes: dict[str, Any] = {"type": "scene"}
@@ -234,7 +232,7 @@ def to_sionna_scene(
         mesh.set_bsdf(radio[id(part.material)])
         shapes[name] = mesh
     scene = rt.Scene(mi.load_dict(shapes, optimize=False))
-    scene.frequency = frequency
+    scene.frequency = frequency_hz
     for key, material in materials.items():  # not before: a new scene has Sionna's default frequency
         _follow_frequency(radio[key], material)
     ends = (rt.Transmitter, transmitters, "tx_array"), (rt.Receiver, receivers, "rx_array")

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from importlib.metadata import version
-from typing import Any, ClassVar, Self, TypeAlias, TypeVar, Unpack, cast
+from typing import Annotated, Any, ClassVar, Self, TypeAlias, TypeVar, Unpack, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,13 +21,14 @@ from warprrf import tensor_files
 from warprrf.cache import Cache
 from warprrf.checks import (
     LARGEST_M,
+    Count,
     check_array,
     check_choice,
-    check_count,
     check_number,
     check_positive,
     check_type,
     checked,
+    one_of,
 )
 from warprrf.device import DeviceLike, Progress, resolve
 from warprrf.geometry.mesh import GeometryLike, Mesh
@@ -48,6 +49,7 @@ from warprrf.rf.spectra.antenna import Antenna, Pattern, samples_of
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.spectra.spectrum import (
+    GridShape,
     Spectra,
     Spectrum,
     check_beam,
@@ -196,7 +198,7 @@ class RadioField(ABC):
         receivers: ArrayLike,
         transmitter: ArrayLike | None = None,
         *,
-        shape: tuple[int, int] | None = None,
+        shape: GridShape | None = None,
     ) -> Spectrum:
         """The spatial spectrum of every receiver.
 
@@ -230,17 +232,17 @@ class RadioField(ABC):
     def _trace_spectrum(self, receiver: np.ndarray, transmitter: np.ndarray) -> Spectrum:
         """:meth:`spectrum` at a position (3,) that was checked."""
 
-    def on_grid(self, shape: tuple[int, int] | None) -> Self:
+    def on_grid(self, shape: GridShape | None) -> Self:
         """The same field, its spectra of ``shape`` rows and columns; None for its own.
 
         Floor and range, which are those of a pixel, go with the pixels' size.
         """
-        if shape is None or check_shape(shape) == tuple(self.shape):
+        if shape is None or shape == tuple(self.shape):
             return self
         smaller = float(np.prod(self.shape) / np.prod(shape))
         low, high = (level + 10.0 * float(np.log10(smaller)) for level in self.range_db)
-        new = {"shape": check_shape(shape), "floor": self.floor * smaller, "range_db": (low, high)}
-        return self._grids.get(new["shape"], lambda: replace(cast(Any, self), **new))
+        new = {"shape": shape, "floor": self.floor * smaller, "range_db": (low, high)}
+        return self._grids.get(shape, lambda: replace(cast(Any, self), **new))
 
     def spectra(
         self,
@@ -284,7 +286,7 @@ class RadioField(ABC):
         self,
         receivers: ArrayLike,
         transmitter: ArrayLike | None = None,
-        max_paths: int | None = None,
+        max_paths: Count | None = None,
         *,
         store: str | os.PathLike[str] | None = None,
         client: Any = None,
@@ -313,8 +315,6 @@ class RadioField(ABC):
         Raises:
             ValueError: as for :meth:`spectra`, for a ``max_paths`` below 1, and for a store without one.
         """
-        if max_paths is not None:
-            check_count("max_paths", max_paths)
         ends = self.check_positions(receivers, transmitter)
         if ends.single and store is None and client is None:  # in a hurry
             return self._trace_paths(ends.receivers[0], ends.transmitters[0], max_paths)
@@ -422,7 +422,7 @@ class RadioField(ABC):
         receivers: ArrayLike,
         transmitter: ArrayLike | None = None,
         *,
-        quantity: str = "total",
+        quantity: Annotated[str, one_of("total", "spectrum")] = "total",
         step_m: float = 0.01,
     ) -> np.ndarray:
         """How what arrives changes with a receiver's place, by differences of spectra traced anew on either side of it, so that the
@@ -444,7 +444,6 @@ class RadioField(ABC):
 
             field.slope([7.0, 4.0, 1.5])  # of the total [dB/m]
         """
-        check_choice("quantity", quantity, ("total", "spectrum"))
         ends = self.check_positions(receivers, transmitter)
 
         def decibels(at: np.ndarray) -> np.ndarray:

@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from itertools import combinations
 from math import comb
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_choice, check_count, check_number
+from warprrf.checks import check_array, check_count, checked, one_of, within
 from warprrf.device import Progress
 from warprrf.rf.maps.radio_map import MapOptions, radio_map
 
@@ -28,13 +28,14 @@ MOST_SETS = 50_000  # seconds; pairs of 300 candidates
 LEAST_DB = -300.0  # of a cell that gets nothing
 
 
+@checked
 def place(
     field: Any,
     candidates: ArrayLike,
     n: int = 1,
     *,
-    objective: str = "share",
-    level_db: float = 10.0,
+    objective: Annotated[str, one_of(*OBJECTIVES)] = "share",
+    level_db: Annotated[float, within()] = 10.0,
     height: float = 1.5,
     cell: float = 0.5,
     progress: Progress | None = None,
@@ -66,14 +67,12 @@ def place(
     """
     places = check_array("candidates", candidates, (None, 3))
     check_count("n", n, 1, len(places))
-    check_choice("objective", objective, OBJECTIVES)
-    level = check_number("level_db", level_db)
     found = []
     for k, source in enumerate(places):
         found.append(radio_map(field, height, cell, source, MapOptions(**options)).best_beam_snr_db)
         if progress is not None:
             progress("place", k + 1, len(places))
-    return best_set(np.stack(found), n, objective, level)
+    return best_set(np.stack(found), n, objective, level_db)
 
 
 def best_set(

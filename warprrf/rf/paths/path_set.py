@@ -34,7 +34,7 @@ from warprrf.rf.channel import dispersion as dispersions
 from warprrf.rf.channel import response
 from warprrf.rf.channel.path_arrays import PADDING, PathArrays, turned
 from warprrf.rf.em.absorption import Air
-from warprrf.rf.em.waves import carrier_phase
+from warprrf.rf.em.waves import Hertz, carrier_phase
 from warprrf.rf.paths import doppler, sionna
 from warprrf.tensor_files import named
 
@@ -81,7 +81,7 @@ class Paths(PathArrays):
 
     @classmethod
     def from_sionna(
-        cls, paths: Any, *, frequency_hz: float, transmitter: int = 0, drop_repeated: bool = False
+        cls, paths: Any, *, frequency_hz: Hertz, transmitter: int = 0, drop_repeated: bool = False
     ) -> Paths:
         """Paths that Sionna RT solved, with their Jones matrices, arrays ``(R, L)``, strongest path first.
 

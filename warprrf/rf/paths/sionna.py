@@ -21,7 +21,7 @@ from warprrf.checks import check_array, check_count, check_positive, checked, on
 from warprrf.rf.channel.arrays import End
 from warprrf.rf.channel.path_arrays import EDGE, SCATTER, SLAB, PathArrays, turned
 from warprrf.rf.channel.response import channel_taps, frequency_response, impulse_response
-from warprrf.rf.em.waves import carrier_phase, check_frequency
+from warprrf.rf.em.waves import carrier_phase
 
 MOST_TIME_STEPS = 1_000_000
 
@@ -196,7 +196,7 @@ def from_sionna(
     paths: Any, frequency_hz: float, transmitter: int, drop_repeated: bool
 ) -> list[dict[str, Any]]:
     """Arrays of the paths of ``sionna.rt.Paths`` from one transmitter, of each receiver; see ``Paths.from_sionna``."""
-    each = by_delay(paths, check_frequency(frequency_hz), transmitter, drop_repeated)
+    each = by_delay(paths, frequency_hz, transmitter, drop_repeated)
     return [vars(p.select(np.argsort(-np.abs(p.gain), kind="stable"))) for p in each]
 
 

@@ -21,7 +21,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,7 +29,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 from warprrf.cache import cached_property
-from warprrf.checks import check_array, check_number, check_positive, checked
+from warprrf.checks import Positive, check_array, checked, one_of, within
 from warprrf.rf.spectra.antenna_files import read_cuts
 from warprrf.rf.spectra.spectrum import (
     angles_from_directions,
@@ -73,17 +73,13 @@ class Antenna:
     """
 
     pattern: str | Shape | Sequence[Shape] = "isotropic"
-    polarisation: str | None = None
+    polarisation: Annotated[str | None, one_of(None, *SLANTS_RAD)] = None
     orientation: ArrayLike = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if isinstance(self.pattern, str) and self.pattern not in PATTERNS:
             raise ValueError(
                 f"pattern: got {self.pattern!r}, expected {', '.join(PATTERNS)}, an Antenna, a function or samples"
-            )
-        if self.polarisation is not None and self.polarisation not in SLANTS_RAD:
-            raise ValueError(
-                f"polarisation: got {self.polarisation!r}, expected None, {', '.join(SLANTS_RAD)}"
             )
         _ = self.rotation, self._probed
 
@@ -352,7 +348,8 @@ def check_rotation(orientation: ArrayLike) -> np.ndarray:
     return value
 
 
-def horn(width_rad: float, floor_db: float = -60.0) -> Antenna:
+@checked
+def horn(width_rad: Positive, floor_db: Annotated[float, within(-200.0, 0.0)] = -60.0) -> Antenna:
     """A horn whose gain is Gaussian in the angle off boresight, lossless.
 
     Args:
@@ -362,15 +359,14 @@ def horn(width_rad: float, floor_db: float = -60.0) -> Antenna:
     Raises:
         ValueError: for other numbers.
     """
-    width, low = check_positive("width_rad", width_rad), check_number("floor_db", floor_db, -200.0, 0.0)
-    if width > 2.0 * np.pi / 3.0:
+    if width_rad > 2.0 * np.pi / 3.0:
         raise ValueError(
-            f"width_rad: got {width:g}, expected radians, at most 2.09: "
-            f"horn(np.radians({width:g})) is {width:g} degrees wide"
+            f"width_rad: got {width_rad:g}, expected radians, at most 2.09: "
+            f"horn(np.radians({width_rad:g})) is {width_rad:g} degrees wide"
         )
     angle = np.linspace(0.0, np.pi, 20_001)
-    mean = 0.5 * np.trapezoid(_horn_gain(width, low, 1.0, angle) * np.sin(angle), angle)
-    return Antenna(_OffBoresight(partial(_horn_gain, width, low, mean)))
+    mean = 0.5 * np.trapezoid(_horn_gain(width_rad, floor_db, 1.0, angle) * np.sin(angle), angle)
+    return Antenna(_OffBoresight(partial(_horn_gain, width_rad, floor_db, mean)))
 
 
 def main_lobe(antenna: Antenna) -> Antenna:

@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_choice, check_positive, checked
+from warprrf.checks import Positive, check_array, checked, one_of
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.metrics import psnr, unit_image
 from warprrf.rf.spectra.spectrum import Spectrum, check_whole, to_db
@@ -62,7 +63,12 @@ def nearest(train: SpectrumDataset) -> Lookup:
 
 
 @checked
-def idw(train: SpectrumDataset, *, power: float = 2.0, domain: str = "auto") -> Lookup:
+def idw(
+    train: SpectrumDataset,
+    *,
+    power: Positive = 2.0,
+    domain: Annotated[str, one_of("db", "linear", "auto")] = "auto",
+) -> Lookup:
     """Inverse-distance weighting of all training spectra.
 
     Args:
@@ -74,8 +80,6 @@ def idw(train: SpectrumDataset, *, power: float = 2.0, domain: str = "auto") -> 
     Raises:
         ValueError: for a power that is not positive, or an unknown domain.
     """
-    check_positive("power", power)
-    check_choice("domain", domain, ("db", "linear", "auto"))
     receivers = _receivers(train)
     floor, range_db = float(train.floor), train.range_db
     images = np.asarray(train.path_gain, dtype=np.float64)

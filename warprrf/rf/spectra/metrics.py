@@ -16,12 +16,12 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from warprrf.checks import check_alike, check_array, check_number, checked
+from warprrf.checks import NotNegative, Shaped, check_alike, check_array, checked, within
 from warprrf.device import Progress
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.deembedding import respond, scanned_kernel
@@ -36,17 +36,20 @@ from warprrf.rf.spectra.spectrum import (
 )
 
 SSIM_WINDOW = 7  # pixels; scikit-image's default, so that figures compare with other work
+BeamWidth: TypeAlias = Annotated[float, within(NARROWEST_BEAM_RAD, 2 * np.pi)]
 PSNR_CEILING_DB = 150.0  # what two equal images score, instead of infinity
 
 
 @checked
-def unit_image(path_gain: np.ndarray, floor: float, range_db: tuple[float, float]) -> np.ndarray:
+def unit_image(
+    path_gain: Annotated[np.ndarray, Shaped("...", finite=False, least=0.0)],
+    floor: NotNegative,
+    range_db: tuple[float, float],
+) -> np.ndarray:
     """The dB image of a spectrum mapped to [0, 1] by the data set's range, shape of ``path_gain``, float64."""
     low, high = check_array("range_db", range_db, (2,))
     if not high > low:
         raise ValueError(f"range_db: got ({low}, {high}), expected (lowest, highest), the latter above")
-    path_gain = check_array("path_gain", path_gain, finite=False, least=0.0)
-    check_number("floor", floor, 0.0)
     return np.clip((np.asarray(to_db(path_gain, floor), dtype=np.float64) - low) / (high - low), 0.0, 1.0)
 
 
@@ -117,9 +120,8 @@ def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 @checked
-def beam_kappa(width_rad: float) -> float:
+def beam_kappa(width_rad: BeamWidth) -> float:
     """Concentration of the von Mises-Fisher beam whose power falls to half at ``width_rad / 2`` off its axis."""
-    check_number("width_rad", width_rad, NARROWEST_BEAM_RAD, 2 * np.pi)
     return float(np.log(2.0) / (2.0 * np.sin(width_rad / 4) ** 2))
 
 
@@ -175,7 +177,7 @@ def evaluate(
     test: SpectrumDataset,
     predict: Callable[[np.ndarray], Any],
     *,
-    beam_width_rad: float = np.radians(10.0),
+    beam_width_rad: BeamWidth = np.pi / 18.0,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Score ``predict`` on every receiver of ``test``.
@@ -218,7 +220,6 @@ def evaluate(
             stacklevel=2,
         )
     predict = _on_grid(predict, test.path_gain.shape[1:])
-    check_number("beam_width_rad", beam_width_rad, NARROWEST_BEAM_RAD, 2 * np.pi)
     floor, range_db = float(test.floor), test.range_db
     rows = defaultdict[str, np.ndarray](lambda: np.full(count, np.nan))
     seconds = np.zeros(count)

@@ -14,27 +14,26 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, Self, runtime_checkable
+from typing import Annotated, Any, ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import digamma, polygamma
 
 from warprrf.checks import (
+    Count,
+    Positive,
     check_array,
-    check_choice,
     check_chosen,
-    check_count,
     check_each,
-    check_number,
-    check_positive,
-    check_type,
     checked,
+    one_of,
     some_of,
     users_level,
+    within,
 )
 from warprrf.rf.em.absorption import Air
-from warprrf.rf.em.waves import NEPER, check_frequency
+from warprrf.rf.em.waves import NEPER, Hertz
 from warprrf.rf.spectra.antenna import Antenna, Pattern, as_antenna, main_lobe, turned_gain
 from warprrf.rf.spectra.levels import FADING_DB, MARGIN_DB, free_space_gain, question_levels
 
@@ -70,7 +69,7 @@ class PowerTable:
     transmitters: np.ndarray
     receivers: np.ndarray
     power: np.ndarray
-    frequency_hz: float
+    frequency_hz: Hertz
 
     _rows: ClassVar[tuple[str, ...]] = ("transmitters", "receivers", "power")
 
@@ -92,8 +91,9 @@ class PowerTable:
             raise ValueError(
                 f"power: got {count} rows, expected one or more, each of linear powers, or NaN where not measured"
             )
-        places = {name: check_each(name, getattr(self, name), count, 3) for name in self._rows[:2]}
-        return {"power": power, "frequency_hz": check_frequency(self.frequency_hz), **places}
+        return {"power": power} | {
+            name: check_each(name, getattr(self, name), count, 3) for name in self._rows[:2]
+        }
 
 
 @checked
@@ -144,16 +144,16 @@ class Readings(PowerTable):
     receive_pattern: Pattern | None = None
     transmit_pattern: Pattern | None = None
     delay_s: np.ndarray | None = None
-    bandwidth_hz: float | None = None
-    window: str = "rectangular"
+    bandwidth_hz: Positive | None = None
+    window: Annotated[str, one_of(*WINDOWS)] = "rectangular"
     chain: Sequence[str] | NDArray[np.str_] | None = None
     std_db: ArrayLike = 0.0
-    samples: int | None = None
+    samples: Count | None = None
     air: Air | None = None
     name: str = "readings"
     azimuth_known: bool = True
     clock_known: bool = True
-    position_std_m: float = 0.0
+    position_std_m: Annotated[float, within(0.0, 1.0)] = 0.0
 
     _rows = (*PowerTable._rows, "floor", "arrival", "departure", "delay_s", "chain", "std_db")
 
@@ -177,24 +177,17 @@ class Readings(PowerTable):
             raise ValueError("bandwidth_hz: got one of it and delay_s; expected both or neither")
         if self.delay_s is not None:
             fields["delay_s"] = check_array("delay_s", self.delay_s, (count,))
-            fields["bandwidth_hz"] = check_positive("bandwidth_hz", self.bandwidth_hz)
-        check_type("azimuth_known", self.azimuth_known, bool)
         if not self.azimuth_known and self.arrival is None:
             raise ValueError("azimuth_known: got False without arrival, whose zero is to be found")
-        check_type("clock_known", self.clock_known, bool)
         if not self.clock_known and self.delay_s is None:
             raise ValueError("clock_known: got False without delay_s, whose zero is to be found")
         if not self.clock_known and not self.azimuth_known:
             raise ValueError("clock_known: got False, and azimuth_known too; expected one zero known")
-        check_number("position_std_m", self.position_std_m, 0.0, 1.0)
         if self.position_std_m > 0 and self.total:
             raise ValueError(
                 "position_std_m: got readings of power alone, which say nothing of where they were taken; expected "
                 "directions or delays"
             )
-        if self.samples is not None:
-            check_count("samples", self.samples)
-        check_choice("window", self.window, WINDOWS)
         chain = np.full(count, "") if self.chain is None else np.asarray(self.chain, dtype=object)
         if chain.shape != (count,) or not all(isinstance(name, str) for name in chain):
             raise ValueError(f"chain: got {self.chain!r:.200}, expected a name for each of {count} readings")

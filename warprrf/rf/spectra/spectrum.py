@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from types import EllipsisType
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import warp as wp
@@ -29,6 +29,7 @@ from warprrf.checks import (
     check_type,
     checked,
     one_line,
+    positive,
 )
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
@@ -78,6 +79,12 @@ def check_range_db(range_db: Sequence[float]) -> tuple[float, float]:
     if not -1e4 <= low <= high <= 1e4:
         raise ValueError(f"range_db: got {low:g} to {high:g}, expected decibels, the lowest value first")
     return low, high
+
+
+GridShape: TypeAlias = Annotated[tuple[int, int], lambda _, shape: check_shape(shape)]
+Beam: TypeAlias = Annotated[float, lambda _, width: check_beam(width)]
+RangeDb: TypeAlias = Annotated[tuple[float, float], lambda _, range_db: check_range_db(range_db)]
+Floor: TypeAlias = Annotated[float, positive("linear noise floor")]
 
 
 def check_departures(aod: np.ndarray) -> None:

@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import warp as wp
@@ -30,15 +30,7 @@ from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.cache import Cache
-from warprrf.checks import (
-    Expected,
-    check_array,
-    check_arrays,
-    check_number,
-    check_positive,
-    checked,
-    one_line,
-)
+from warprrf.checks import Expected, Positive, check_array, check_arrays, checked, one_line, within
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.geometry.splats.gaussians import Gaussians, discs_on_mesh, gaussians_of
@@ -116,8 +108,8 @@ class HarmonicField(RadioField):
     beam_sigma_rad: float
     options: FieldOptions
     layers: dict[str, np.ndarray] = field(repr=False)
-    gain_unit: float
-    delay_unit: float
+    gain_unit: Positive
+    delay_unit: Annotated[float, within(0.0, 1.0)]
     air: Air | None = None
     fitted_on: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
     report: dict[str, Any] = field(default_factory=dict, repr=False)
@@ -132,8 +124,6 @@ class HarmonicField(RadioField):
         most_coefficient = 1e9
         table = Expected(f"N {_kernels.COEFFICIENTS}", -most_coefficient, most_coefficient)
         check_arrays(self.layers, dict.fromkeys(self.layers, table), N=len(self.gaussians))
-        check_positive("gain_unit", self.gain_unit)
-        check_number("delay_unit", self.delay_unit, 0.0, 1.0)
 
     @property
     def model(self) -> str:
