@@ -285,14 +285,9 @@ def spread_paths(
     grid = _beam_grid((rows, columns), float(sigma), str(where))
     known = beam_sums(d, shape, sigma, device=where) if beams is None else beams[positive]
     near, total = np.ascontiguousarray(known[order].T)
-    toward = wp.array(d[order], dtype=wp.vec3d, device=where)
-    nearest = wp.array(near, dtype=wp.float64, device=where)
-    beam = [grid.pixels, grid.solid_angles, grid.half_widths, grid.kappa, grid.chord_limit]
-    scaled = wp.array(power[order] / total, dtype=wp.float64, device=where)
     image = wp.zeros((rows, columns), dtype=wp.float64, device=where)
     best = wp.zeros((rows, columns), dtype=wp.int32, device=where)
-    first = wp.array(starts, dtype=wp.int32, device=where)
-    inputs = [toward, scaled, nearest, first, *beam, image, best]
+    inputs = [d[order], power[order] / total, near, starts, *grid, image, best]
     _device.launch(beam_kernels.gather_beams, rows * columns, inputs, device=where)
     index = best.numpy()
     return SpreadPaths(image.numpy(), np.where(index >= 0, positive[order][index], -1).astype(np.int32))
@@ -307,10 +302,7 @@ def beam_sums(
     grid = _beam_grid(shape, float(sigma), str(where))
     row, column = pixel_of(directions, shape)
     sums = [wp.zeros(len(directions), dtype=wp.float64, device=where) for _ in range(2)]
-    inputs = [
-        wp.array(directions, dtype=wp.vec3d, device=where), wp.array(row * shape[1] + column, dtype=wp.int32, device=where),
-        grid.pixels, grid.solid_angles, grid.half_widths, grid.kappa, grid.chord_limit, *sums,
-    ]  # fmt: skip
+    inputs = [directions, row * shape[1] + column, *grid, *sums]
     _device.launch(beam_kernels.beam_normaliser, len(directions), inputs, device=where)
     return np.stack([one.numpy() for one in sums], axis=1)
 
@@ -343,11 +335,8 @@ def strongest_rays(
     top = log_power.reshape(rows * columns, -1).max(axis=1)
     best = wp.zeros(rows * columns, dtype=wp.int32, device=where)
     first_row, least_fall = _least_falls((rows, columns), float(sigma), str(where))
-    inputs = [
-        directions, len(power) // (rows * columns), wp.array(log_power, dtype=wp.float64, device=where),
-        wp.array(top, dtype=wp.float64, device=where), wp.float64(top.max()), grid.pixels, grid.half_widths, first_row,
-        least_fall, grid.kappa, grid.chord_limit, best,
-    ]  # fmt: skip
+    inputs = [directions, len(power) // (rows * columns), log_power, top, wp.float64(top.max())]
+    inputs += [grid.pixels, grid.half_widths, first_row, least_fall, grid.kappa, grid.chord_limit, best]
     _device.launch(beam_kernels.strongest_rays, rows * columns, inputs, device=where)
     return best.numpy().reshape(rows, columns)
 

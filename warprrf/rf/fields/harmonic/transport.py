@@ -271,7 +271,7 @@ def path_lengths(
         ranges = view.expected_range if kind == "expected" else nowhere
         if mesh is not None and kind == "mesh":
             hit = mesh.cast(origin, pixel_directions(seen.shape).reshape(-1, 3), device=device)
-            ranges = wp.array(hit.t, dtype=wp.float64, device=device)
+            ranges = hit.t
         points = wp.empty(pixels, dtype=wp.vec3d, device=device)
         lengths = wp.empty(pixels, dtype=wp.float64, device=device)
         inputs = [
