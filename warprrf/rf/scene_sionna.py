@@ -36,8 +36,6 @@ _FOLDERS = (
 )  # fmt: skip
 
 Positions = dict[str, np.ndarray]
-GRID = 361, 721
-"""Zeniths and azimuths, half a degree apart, at which an antenna's fields are handed to Sionna RT."""
 
 
 def parts_of(rt_scene: Any, choice: MaterialChoice) -> tuple[list[ScenePart], dict[str, Any]]:
@@ -272,9 +270,10 @@ def _told_apart(array: PlanarArray, element: Antenna) -> bytes:
 
 
 def _sionna_pattern(rt: Any, antenna: Antenna) -> Any:
-    """A ``sionna.rt.AntennaPattern`` of an antenna: its fields on a grid of :data:`GRID`, between which they are interpolated."""
+    """A ``sionna.rt.AntennaPattern`` of an antenna: its fields at zeniths and azimuths half a degree apart, between which they
+    are interpolated."""
     mi, dr = select_variant(), require("drjit", extra="sionna")
-    rows, columns = GRID
+    rows, columns = 361, 721
     zenith, azimuth = np.linspace(0.0, np.pi, rows), np.linspace(-np.pi, np.pi, columns)
     fields = antenna.field(directions_from_angles(*np.meshgrid(zenith, azimuth, indexing="ij")))
 

@@ -504,11 +504,6 @@ def itu_material(
     )
 
 
-_SKIN = 4.0, ((32.0, 7.234e-12, 0.0), (1100.0, 32.48e-9, 0.2)), 0.0002
-"""Dry skin: permittivity at high frequencies; strength, relaxation time [s] and spread of each of two dispersions (two more have no
-strength); ionic conductivity [S/m]."""
-
-
 @checked
 def skin_permittivity(frequency_hz: Hertz) -> complex:
     """Complex relative permittivity of dry skin: 7.98 - 10.9j at 60 GHz.
@@ -517,7 +512,9 @@ def skin_permittivity(frequency_hz: Hertz) -> complex:
     the dielectric spectrum of tissues", Phys. Med. Biol. 41 (1996), table 1: four Cole-Cole dispersions, 10 Hz to 100 GHz.
     """
     turn = 2j * np.pi * frequency_hz
-    high, dispersions, ionic = _SKIN
+    high, ionic = 4.0, 0.0002  # permittivity at high frequencies, ionic conductivity [S/m]
+    # strength, relaxation time [s] and spread of each; two more have no strength
+    dispersions = (32.0, 7.234e-12, 0.0), (1100.0, 32.48e-9, 0.2)
     found = sum(size / (1.0 + (turn * tau) ** (1.0 - spread)) for size, tau, spread in dispersions)
     return complex(high + found + ionic / (turn * VACUUM_PERMITTIVITY))
 

@@ -24,8 +24,6 @@ OBJECTIVES: dict[str, Callable[[np.ndarray, float], float]] = {
     "mean rate": lambda snr_db, level_db: float(np.mean(np.log2(1.0 + 10.0 ** (snr_db / 10.0)))),
 }
 """Of cells' signal-to-noise ratios (C,) [dB]: the share of those above a level, what nine of ten exceed, Shannon's rate."""
-MOST_SETS = 50_000  # seconds; pairs of 300 candidates
-LEAST_DB = -300.0  # of a cell that gets nothing
 
 
 @checked
@@ -55,8 +53,8 @@ def place(
         options: attributes of :class:`~warprrf.rf.maps.radio_map.MapOptions`.
 
     Returns:
-        Indices of candidates, shape ``(n,)``: the best of all sets up to :data:`MOST_SETS`, else in the order in which they were
-        added.
+        Indices of candidates, shape ``(n,)``: the best of all sets up to 50,000 (pairs of 300), else in the order in which they
+        were added.
 
     Raises:
         ValueError: naming the argument; for a candidate where no transmitter can be.
@@ -76,11 +74,12 @@ def place(
 
 
 def best_set(
-    snr_db: np.ndarray, n: int, objective: str, level: float = 0.0, *, most: int = MOST_SETS
+    snr_db: np.ndarray, n: int, objective: str, level: float = 0.0, *, most: int = 50_000
 ) -> np.ndarray:
     """What :func:`place` chooses by candidates' maps [dB], NaN outside the air, shape ``(C, Y, X)``; of more than ``most`` sets not
     all are tried."""
-    measure, cells = OBJECTIVES[objective], np.fmax(snr_db, LEAST_DB)[:, ~np.isnan(snr_db).all(axis=0)]
+    nothing_db = -300.0  # of a cell that one candidate leaves out, another does not
+    measure, cells = OBJECTIVES[objective], np.fmax(snr_db, nothing_db)[:, ~np.isnan(snr_db).all(axis=0)]
 
     def worth(some: Sequence[int]) -> float:
         return measure(cells[list(some)].max(axis=0), level)

@@ -22,10 +22,6 @@ from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 
-FARTHEST_M = 0.3
-"""How far an interaction point may lie from the scene's surfaces: what photos show is right to some centimetres."""
-FASTEST_M_S = 3e6  # a hundredth of the speed of light: the formula errs by that share
-
 
 def doppler_hz(
     paths: PathArrays,
@@ -79,7 +75,8 @@ def _velocities(name: str, value: ArrayLike, receivers: int | None) -> np.ndarra
     if found.shape != (3,) and (receivers is None or found.shape != (receivers, 3)):
         wanted = "(3,)" if receivers is None else f"(3,) or ({receivers}, 3)"
         raise ValueError(f"{name}: got shape {found.shape}, expected {wanted}, a velocity [m/s]")
-    check_number(name, float(np.abs(found).max()), 0.0, FASTEST_M_S)
+    fastest_m_s = 3e6  # a hundredth of the speed of light: the formula errs by that share
+    check_number(name, float(np.abs(found).max()), 0.0, fastest_m_s)
     return found if found.ndim == 1 else found[:, None]
 
 
@@ -129,7 +126,8 @@ def _touched(scene: Any, moving: Mapping[str, ArrayLike], points: np.ndarray) ->
     if len(points) == 0:
         return np.zeros((0, 3))
     nearest = mesh.closest(points)
-    if nearest.distance.max() > FARTHEST_M:
+    farthest_m = 0.3  # what photos show is right to some centimetres
+    if nearest.distance.max() > farthest_m:
         raise ValueError(
             f"scene: got paths that touch something {nearest.distance.max():.3g} m from its surfaces, expected paths traced in it"
         )

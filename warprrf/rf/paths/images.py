@@ -35,9 +35,7 @@ BLOCK = 500_000  # chains that are unfolded at once
 MOST_CHAINS = 20_000_000
 """More chains of mirrors than this are not tried unless asked for: a minute on two cores in a room, twenty in a city."""
 
-_WORDS = 16_000_000  # chains times leaves that are tried at once
 _SAMPLE = 1000  # chains from which the number of longer ones is estimated
-_PARTS = 1000  # of a search, in which its progress is reported
 
 
 @dataclass(frozen=True)
@@ -128,12 +126,12 @@ class MirrorImages:
                 f"planar patches, some {seconds:.2g} seconds; expected at most {self.max_chains:.3g}: lower mirror_order, "
                 "simplify the mesh (fewer, larger planar patches), or give more max_chains to MirrorTracer"
             )
-        ends = np.cumsum([0.0, *work])
+        ends, parts = np.cumsum([0.0, *work]), 1000  # of a search, in which its progress is reported
 
         def tick(share: float) -> None:
             if progress is not None:
                 behind = ends[k - 1] + share * (ends[k] - ends[k - 1])
-                progress("mirrors", round(_PARTS * behind / max(ends[-1], 1.0)), _PARTS)
+                progress("mirrors", round(parts * behind / max(ends[-1], 1.0)), parts)
 
         for k in range(1, order + 1):
             yield self.candidates(points, k, tick)
@@ -176,7 +174,8 @@ class MirrorImages:
         """Over which edges chains of ``order`` reflections, known from the transmitter on, reach ``point`` (3,), if nothing
         stands between: index of the edge ``(L,)`` and patches ``(L, order)``, whose boxes hold the mirror points."""
         parts = [(np.zeros(0, int), np.zeros((0, order), np.int32))]
-        step = max(1, _WORDS // max(len(leaves.radius), 1))
+        at_once = 16_000_000  # chains times leaves: the words that are held
+        step = max(1, at_once // max(len(leaves.radius), 1))
         kept = self._keep(order)
         known = min(order, len(kept) - 1)
         for chains, _ in self._descendants(kept[known], order - known, point, -1.0):

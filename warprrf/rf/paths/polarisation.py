@@ -16,7 +16,6 @@ import numpy as np
 from warprrf.geometry.mesh import vectors_across
 from warprrf.rf.spectra.spectrum import transverse_basis
 
-_PARALLEL = 1e-6  # sine of incidence below which a mirror has no plane of incidence of its own
 _EXCESS = (0.05, 200.0)  # of epsilon_r - 1, the range of :func:`warprrf.rf.em.fresnel.fresnel_curves`
 
 
@@ -76,13 +75,11 @@ def _frames(stops: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarr
     along = leg / np.maximum(np.linalg.norm(leg, axis=2, keepdims=True), 1e-12)
     across = np.cross(along[:, :-1], normal)
     sine = np.linalg.norm(across, axis=2, keepdims=True)
+    least = 1e-6  # sine of incidence below which a mirror has no plane of incidence of its own
     for k in range(normal.shape[1]):
-        if k:
-            other = across[:, k - 1]
-        else:
-            other = vectors_across(along[:, 0])[0]
-        own = across[:, k] / np.maximum(sine[:, k], _PARALLEL)
-        across[:, k] = np.where(sine[:, k] > _PARALLEL, own, other)
+        other = across[:, k - 1] if k else vectors_across(along[:, 0])[0]
+        own = across[:, k] / np.maximum(sine[:, k], least)
+        across[:, k] = np.where(sine[:, k] > least, own, other)
     return along, across
 
 

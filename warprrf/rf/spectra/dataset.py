@@ -39,7 +39,6 @@ from warprrf.rf.spectra.spectrum import (
 POLARISATION = "mean over vertical and horizontal transmit, sum over both receive polarisations"
 
 _ROLES = ("train", "test")
-SAME_PLACE_M = 1e-3  # a spectrum measured this near is the same one
 
 
 BeamWidth: TypeAlias = Annotated[float, positive("beam width in radians")]
@@ -514,11 +513,12 @@ def _sees(
 def measured_at(ds: SpectrumDataset, receivers: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
     """Which spectra of ``ds`` are of ``receivers`` (K, 3) under ``transmitter`` [m], (3,) or that of each (K, 3), shape
     ``(R,)`` bool."""
+    same_m = 1e-3  # a spectrum measured this near is the same one
     under = np.broadcast_to(transmitter, receivers.shape)
-    own = receivers[np.linalg.norm(under - ds.transmitter, axis=1) <= SAME_PLACE_M]
+    own = receivers[np.linalg.norm(under - ds.transmitter, axis=1) <= same_m]
     if len(own) == 0:
         return np.zeros(len(ds.receivers), dtype=bool)
-    return np.asarray(cKDTree(own).query(ds.receivers)[0] <= SAME_PLACE_M)
+    return np.asarray(cKDTree(own).query(ds.receivers)[0] <= same_m)
 
 
 def _check_roles(role: ArrayLike, count: int) -> np.ndarray:
