@@ -14,12 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Self, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from warprrf.checks import check_array, check_chosen, check_count, check_type, checked, one_line
+from warprrf.checks import Shaped, check_chosen, check_count, check_type, checked, one_line
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 from warprrf.rf.spectra.spectrum import angles_from_directions, directions_from_angles
@@ -227,46 +227,32 @@ class PathArrays:
     @classmethod
     def from_points(
         cls,
-        transmitter: np.ndarray,
-        receiver: np.ndarray,
-        vertices: np.ndarray,
-        amplitude: np.ndarray,
+        transmitter: Annotated[np.ndarray, Shaped("3")],
+        receiver: Annotated[np.ndarray, Shaped("3")],
+        vertices: Annotated[np.ndarray, Shaped("L D 3", finite=False)],
+        amplitude: Annotated[np.ndarray, Shaped("L", np.complex128)],
         kind: NDArray[np.str_],
         frequency_hz: float,
+        *,
+        jones: Annotated[np.ndarray, Shaped("L 2 2", np.complex128, finite=False)] | None = None,
+        excess_m: Annotated[np.ndarray, Shaped("L")] | None = None,
+        interactions: np.ndarray | None = None,
     ) -> Self:
         """Paths of one receiver from their interaction points ``(L, depth, 3)``, NaN past the last.
 
         Args:
             amplitude: Gain before exp(-j 2 pi f tau), complex, shape ``(L,)``; its modulus squared is the path gain.
+            jones: Polarised gains likewise, shape ``(L, 2, 2)``, where known.
+            excess_m: By what slabs make a path longer than it is [m], shape ``(L,)``.
+            interactions: As of :class:`PathArrays`.
         """
-        transmitter = check_array("transmitter", transmitter, (3,))
-        receiver = check_array("receiver", receiver, (3,))
-        vertices = check_array("vertices", vertices, (None, None, 3), finite=False)
-        amplitude = check_array("amplitude", amplitude, (len(vertices),), complex)
-        return cls._from_points(transmitter, receiver, vertices, amplitude, kind, frequency_hz)
-
-    @classmethod
-    def _from_points(
-        cls,
-        transmitter: np.ndarray,
-        receiver: np.ndarray,
-        vertices: np.ndarray,
-        amplitude: np.ndarray,
-        kind: NDArray[np.str_],
-        frequency_hz: float,
-        jones: np.ndarray | None = None,
-        excess_m: np.ndarray | float = 0.0,
-        interactions: np.ndarray | None = None,
-    ) -> Self:
-        """:meth:`from_points` of arrays that fit each other; ``jones`` (L, 2, 2) is complex, before exp(-j 2 pi f tau) too;
-        slabs make paths longer than they are by ``excess_m`` (L,)."""
         count, depth = vertices.shape[:2]
         bounces = np.isfinite(vertices[..., 0]).sum(axis=1)
         points = points_along(transmitter, vertices, receiver)
         each = np.arange(count)
         steps = np.linalg.norm(np.diff(points, axis=1), axis=2)
         length = np.where(np.arange(depth + 1) <= bounces[:, None], steps, 0.0).sum(axis=1)
-        tau = (length + excess_m) / SPEED_OF_LIGHT
+        tau = (length if excess_m is None else length + excess_m) / SPEED_OF_LIGHT
         theta_r, phi_r = angles_from_directions(points[each, bounces] - receiver)
         theta_t, phi_t = angles_from_directions(points[:, 1] - transmitter)
         turned = carrier_phase(frequency_hz, tau)
@@ -281,9 +267,9 @@ class PathArrays:
             kind=kind,
             valid=np.ones(count, dtype=bool),
             jones=None if jones is None else jones * turned[:, None, None],
-            frequency_hz=float(frequency_hz),
-            transmitter=np.array(transmitter, dtype=np.float64),
-            receiver=np.array(receiver, dtype=np.float64),
+            frequency_hz=frequency_hz,
+            transmitter=transmitter.copy(),
+            receiver=receiver.copy(),
             interactions=np.zeros(0, np.int8) if interactions is None else interactions,
         )
 

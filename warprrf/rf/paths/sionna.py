@@ -23,8 +23,6 @@ from warprrf.rf.channel.path_arrays import EDGE, SCATTER, SLAB, PathArrays, turn
 from warprrf.rf.channel.response import channel_taps, frequency_response, impulse_response
 from warprrf.rf.em.waves import carrier_phase
 
-MOST_TIME_STEPS = 1_000_000
-
 
 @checked
 @dataclass(frozen=True)
@@ -93,13 +91,8 @@ class SionnaPaths:
         ``normalize`` scales each link to unit mean energy.
         """
         f = self._paths.carrier_hz + check_array("frequencies", frequencies, (None,))
-        work = partial(
-            frequency_response,
-            frequencies_hz=f,
-            squint=False,
-            normalize_delays=normalize_delays,
-            **self._options,
-        )
+        options = self._options | {"squint": False, "normalize_delays": normalize_delays}
+        work = partial(frequency_response, frequencies_hz=f, **options)
         h = self._over_time(work, _times(num_time_steps, sampling_frequency))
         return _as(_normalised(h, normalize, mean=True), out_type)
 
@@ -117,15 +110,8 @@ class SionnaPaths:
     ) -> Any:
         """Taps ``(R, M, 1, N, T, l_max - l_min + 1)``, as ``sionna.rt.Paths.taps``; T of them a second are ``bandwidth`` by
         default."""
-        work = partial(
-            channel_taps,
-            bandwidth_hz=bandwidth,
-            l_min=l_min,
-            l_max=l_max,
-            squint=False,
-            normalize_delays=normalize_delays,
-            **self._options,
-        )
+        options = self._options | {"squint": False, "normalize_delays": normalize_delays}
+        work = partial(channel_taps, bandwidth_hz=bandwidth, l_min=l_min, l_max=l_max, **options)
         every = bandwidth if sampling_frequency is None else sampling_frequency
         h = self._over_time(work, _times(num_time_steps, every))
         return _as(_normalised(h, normalize, mean=False), out_type)
@@ -276,7 +262,7 @@ def _one_transmitter(h: np.ndarray) -> np.ndarray:
 def _times(count: int, per_second: float) -> np.ndarray:
     """Times [s] of ``count`` steps."""
     every = check_positive("sampling_frequency", per_second)
-    return np.arange(check_count("num_time_steps", count, most=MOST_TIME_STEPS)) / every
+    return np.arange(check_count("num_time_steps", count, most=1_000_000)) / every
 
 
 def _normalised(h: np.ndarray, normalize: bool, *, mean: bool) -> np.ndarray:

@@ -272,9 +272,9 @@ class MirrorTracer:
         own = found.take(np.flatnonzero(found.receiver == k))
         jones = (self.wavelength_m / (4.0 * np.pi * own.length_m))[:, None, None] * own.matrix
         kind = np.full(len(own), "edge", "<U7")
-        return Paths._from_points(
+        return Paths.from_points(
             self.transmitter, point, own.point, own.amplitude, kind, self.frequency_hz,
-            None if self.table is None else jones, own.excess_m, interactions=own.code,
+            jones=None if self.table is None else jones, excess_m=own.excess_m, interactions=own.code,
         )  # fmt: skip
 
     def find(

@@ -37,6 +37,8 @@ from warprrf.rf.spectra.spectrum import (
 
 SSIM_WINDOW = 7  # pixels; scikit-image's default, so that figures compare with other work
 BeamWidth: TypeAlias = Annotated[float, within(NARROWEST_BEAM_RAD, 2 * np.pi)]
+Directions: TypeAlias = Annotated[np.ndarray, Shaped("... 3", finite=False)]
+Image: TypeAlias = Annotated[np.ndarray, lambda name, value: _image(name, value)]
 PSNR_CEILING_DB = 150.0  # what two equal images score, instead of infinity
 
 
@@ -91,30 +93,28 @@ def ssim(prediction: np.ndarray, truth: np.ndarray) -> float:
 
 
 @checked
-def rmse_db(prediction_db: np.ndarray, truth_db: np.ndarray) -> float:
+def rmse_db(prediction_db: np.ndarray, truth_db: Image) -> float:
     """Root mean square difference [dB] of two dB images ``(height, width)``, weighted by solid angle."""
-    predicted, truth_db = _pair(prediction_db=prediction_db, truth_db=_image("truth_db", truth_db))
+    predicted, truth_db = _pair(prediction_db=prediction_db, truth_db=truth_db)
     weight = pixel_solid_angles(truth_db.shape)[:, None]
     error = (predicted - truth_db) ** 2
     return float(np.sqrt(np.sum(weight * error) / (np.sum(weight) * truth_db.shape[1])))
 
 
 @checked
-def strongest_direction(path_gain: np.ndarray) -> np.ndarray:
+def strongest_direction(path_gain: Image) -> np.ndarray:
     """Unit direction ``(3,)`` of the pixel with the most path gain per solid angle.
 
     Of equal pixels the first is taken (an empty or constant density has no direction: this is the first row's).
     """
-    path_gain = _image("path_gain", path_gain)
     density = path_gain / pixel_solid_angles(path_gain.shape)[:, None]
     row, column = np.unravel_index(np.argmax(density), density.shape)
     return pixel_directions(path_gain.shape)[row, column]
 
 
 @checked
-def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def angle_deg(a: Directions, b: Directions) -> np.ndarray:
     """Angle [degrees] between unit vectors ``(..., 3)``; accurate for small angles too."""
-    a, b = check_array("a", a, (..., 3), finite=False), check_array("b", b, (..., 3), finite=False)
     check_alike(a=a, b=b)
     return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
@@ -126,13 +126,12 @@ def beam_kappa(width_rad: BeamWidth) -> float:
 
 
 @checked
-def beam_response(path_gain: np.ndarray, width_rad: float) -> np.ndarray:
+def beam_response(path_gain: Image, width_rad: BeamWidth) -> np.ndarray:
     """Power a beam collects when steered to each pixel centre, shape ``(height, width)``.
 
     The beam's power pattern is ``exp(kappa (cos(angle) - 1))``, one on its axis, with :func:`beam_kappa`. The sum over
     the sphere is exact on the grid: rows are convolved in azimuth by FFT.
     """
-    path_gain = _image("path_gain", path_gain)
     return respond(path_gain, _beam_kernel(path_gain.shape, beam_kappa(width_rad)))
 
 
@@ -142,18 +141,18 @@ def _beam_kernel(shape: tuple[int, int], kappa: float) -> np.ndarray:
 
 
 @checked
-def beam_gain_loss_db(path_gain: np.ndarray, direction: np.ndarray, width_rad: float) -> float:
+def beam_gain_loss_db(
+    path_gain: Image, direction: Annotated[np.ndarray, Shaped("3")], width_rad: BeamWidth
+) -> float:
     """Loss [dB] of a beam steered to ``direction`` (3,) on the spectrum ``path_gain`` against its best steering.
 
     The best is sought over pixel centres, so steering between them can score slightly below zero.
     """
-    power = path_gain = _image("path_gain", path_gain)
-    toward = check_array("direction", direction, (3,))
-    best = float(np.max(beam_response(power, width_rad)))
+    best = float(np.max(beam_response(path_gain, width_rad)))
     if best <= 0:
         return 0.0
-    cosine = pixel_directions(path_gain.shape) @ toward
-    got = float(np.sum(power * np.exp(beam_kappa(width_rad) * (cosine - 1.0))))
+    cosine = pixel_directions(path_gain.shape) @ direction
+    got = float(np.sum(path_gain * np.exp(beam_kappa(width_rad) * (cosine - 1.0))))
     return float(10.0 * np.log10(best / max(got, best * 1e-30)))
 
 

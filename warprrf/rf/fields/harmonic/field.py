@@ -39,14 +39,7 @@ from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField, with_settings
-from warprrf.rf.fields.harmonic.fitting import (
-    KINDS,
-    State,
-    fit_layer,
-    load_states,
-    save_states,
-    targets,
-)
+from warprrf.rf.fields.harmonic import fitting
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining, list_responses
 from warprrf.rf.fields.harmonic.options import CHANNEL_RATES, GAIN_RATES, FieldOptions
 from warprrf.rf.fields.harmonic.paths import View, near_line_of_sight, paths_of
@@ -323,17 +316,13 @@ class HarmonicField(RadioField):
         """The blended layer ``name`` of one receiver, shape ``(H, W)`` float64."""
         device, (view,) = seen.device, seen.views
         kernels = _kernels.build(wp.float32)
-        kind = KINDS[self.options.gain] if name == "gain" else KINDS["signed"]
+        kind = fitting.KINDS[self.options.gain if name == "gain" else "signed"]
         out = wp.zeros(self.shape[0] * self.shape[1], dtype=float, device=device)
-        inputs = [
-            kind,
-            view.start,
-            view.gaussian,
-            view.weight,
-            self._uploaded.get("basis", lambda: harmonics(self.shape, wp.float32, device)),
-            self._uploaded.get(name, lambda: wp.array(self.layers[name], dtype=kernels.vec16, device=device)),
-            out,
-        ]
+        basis = self._uploaded.get("basis", lambda: harmonics(self.shape, wp.float32, device))
+        layer = self._uploaded.get(
+            name, lambda: wp.array(self.layers[name], dtype=kernels.vec16, device=device)
+        )
+        inputs = [kind, view.start, view.gaussian, view.weight, basis, layer, out]
         _device.launch(kernels.predict, len(out), inputs, device=device)
         return out.numpy().reshape(self.shape).astype(np.float64)
 
@@ -343,7 +332,8 @@ class HarmonicField(RadioField):
         visible, friis = self._line_of_sight(receiver, source)
         (lengths,) = self._lengths(seen, source)
         power = self._factor(lengths.total) * self.gain_unit * self._blend("gain", seen)
-        point, delay, departure = lengths.point, lengths.delay_s, lengths.departure
+        point, delay = lengths.point, lengths.total / SPEED_OF_LIGHT
+        departure = point - source
         if self.options.model == "rf3dgs":
             point = np.full_like(point, np.nan)
             delay, departure = self._channels(seen)
@@ -357,13 +347,7 @@ class HarmonicField(RadioField):
         toward = receiver - source
         delay = np.where(direct, np.linalg.norm(toward) / SPEED_OF_LIGHT, delay)
         angles = np.where(direct[..., None], np.stack(angles_from_directions(toward)), angles)
-        spectrum = Spectrum(
-            path_gain=power.astype(np.float32),
-            delay_s=delay,
-            aod=angles,
-            floor=self.floor,
-            range_db=self.range_db,
-        )
+        spectrum = Spectrum(power.astype(np.float32), delay, angles, self.floor, self.range_db)
         return View(spectrum, receiver, source, point, visible, friis, beam)
 
     def _channels(self, seen: Transport) -> tuple[np.ndarray, np.ndarray]:
@@ -414,30 +398,30 @@ def _train(
         beams = [blank._beam(receiver, blank.transmitter) for receiver in seen.receivers]
         extra = np.stack([np.zeros(blank.shape) if beam is None else beam for beam in beams])
     problem = Problem(seen, batch=options.batch, seed=options.seed, device=device)
-    plan, gain_unit, delay_unit = targets(options, ds, images, problem, factor, extra)
+    plan, gain_unit, delay_unit = fitting.targets(options, ds, images, problem, factor, extra)
     channel_steps = 100  # of each delay and AoD channel: they start at means that are nearly right
     steps = {
         name: options.iterations if name == "gain" else min(channel_steps, options.iterations)
         for name in plan
     }
     identity = "" if checkpoint is None else digest(options, seen.values, plan)
-    states, before = load_states(checkpoint, identity), 0
+    states, before = fitting.load_states(checkpoint, identity), 0
     layers: dict[str, np.ndarray] = {}
 
-    def each(name: str, done: int, state: Callable[[], State]) -> None:
+    def each(name: str, done: int, state: Callable[[], fitting.State]) -> None:
         """What follows each step of a layer: progress, and now and then the checkpoint."""
         if progress is not None:
             progress("fit", before + done, sum(steps.values()))
         if checkpoint is not None and (done % 50 == 0 or done == steps[name]):
             states[name] = state()
-            save_states(checkpoint, identity, states)
+            fitting.save_states(checkpoint, identity, states)
 
     for name, target in plan.items():
         is_gain, state, opacity = name == "gain", states.get(name), None
         if listed is not None and is_gain:
             logits = None if state is None else state.opacity
             opacity = OpacityTraining(problem, listed, gaussians.opacities, logits)
-        states[name] = state = fit_layer(
+        states[name] = state = fitting.fit_layer(
             problem, target, steps=steps[name], rates=GAIN_RATES if is_gain else CHANNEL_RATES,
             degree=options.sh_degree, opacity=opacity, state=state, each=partial(each, name),
         )  # fmt: skip

@@ -27,7 +27,6 @@ from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import Blending, Parameters, Rasterizer
 from warprrf.kernels.radio import transport as _kernels
-from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.spectra.spectrum import check_shape, pixel_directions
 
 TRANSMITTANCE = ("product", "exp")
@@ -211,13 +210,11 @@ class Lengths:
 
     Attributes:
         shape: rows and columns.
-        transmitter: position [m], shape ``(3,)``.
         points: interaction points on the device [m], ``H * W`` vectors.
         lengths: transmitter - point - receiver on the device [m], shape ``(H * W,)``.
     """
 
     shape: tuple[int, int]
-    transmitter: np.ndarray
     points: wp.array
     lengths: wp.array
 
@@ -230,16 +227,6 @@ class Lengths:
     def total(self) -> np.ndarray:
         """Length transmitter - point - receiver [m], shape ``(H, W)``."""
         return np.asarray(self.lengths.numpy().reshape(self.shape))
-
-    @property
-    def delay_s(self) -> np.ndarray:
-        """Time of flight [s], shape ``(H, W)``."""
-        return self.total / SPEED_OF_LIGHT
-
-    @property
-    def departure(self) -> np.ndarray:
-        """Way from the transmitter to the point [m], shape ``(H, W, 3)``."""
-        return self.point - self.transmitter
 
 
 def path_lengths(
@@ -278,4 +265,4 @@ def path_lengths(
             how, wp.vec3d(origin), wp.vec3d(transmitter), directions, *scene[:3], view.dominant, ranges, points, lengths
         ]  # fmt: skip
         _device.launch(_kernels.single_bounces, pixels, inputs, device=device)
-        yield Lengths(seen.shape, transmitter, points, lengths)
+        yield Lengths(seen.shape, points, lengths)
