@@ -7,6 +7,7 @@ import inspect
 import numbers
 import types
 import typing
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from types import EllipsisType
@@ -226,6 +227,11 @@ def users_level() -> int:
     while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == "warprrf":
         frame, level = frame.f_back, level + 1
     return level
+
+
+def warn(text: str) -> None:
+    """Warn of ``text``, a UserWarning, at the line outside this package that called it."""
+    warnings.warn(text, UserWarning, stacklevel=users_level())
 
 
 def some_of(rows: Sequence[int] | np.ndarray, most: int = 8) -> str:

@@ -14,7 +14,6 @@ the same number of solids; in a court, under a bridge or below a canopy some of 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -22,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import Positive, check_array, checked, users_level
+from warprrf.checks import Positive, check_array, checked, warn
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -294,11 +293,9 @@ def question_unit(mesh: Mesh, wavelength_m: float) -> None:
     elif largest <= min(20e3, 5e6 * wavelength_m) and extent.min() <= 1e3:
         return
     size = " x ".join(f"{e:.4g}" for e in extent)
-    warnings.warn(
+    warn(
         f"mesh: it is {size} m large ({largest / wavelength_m:.2g} wavelengths); coordinates look like {unit}, expected "
-        f"metres: Mesh({metres} * vertices, faces)",
-        UserWarning,
-        stacklevel=3,
+        f"metres: Mesh({metres} * vertices, faces)"
     )
 
 
@@ -364,11 +361,9 @@ def warn_of_unmodelled(
     if not reasons or not lacking:
         return
     what = f"{' and '.join(lacking)} {'are' if len(lacking) > 1 else 'is'}"
-    warnings.warn(
+    warn(
         f"{frequency_hz / 1e9:g} GHz: {what} not modelled, which matters {' and '.join(reasons)}: receivers without line "
-        "of sight may get more power than is found here; warprrf.relevance estimates how much",
-        UserWarning,
-        stacklevel=users_level(),
+        "of sight may get more power than is found here; warprrf.relevance estimates how much"
     )
 
 
@@ -389,11 +384,7 @@ def _check_apart(points: np.ndarray, wavelength_m: float, labels: list[str]) -> 
             f"{what}, within its reactive near field, where path gain has no meaning (it would exceed one); expected "
             f"more than {NEAR_FIELD * wavelength_m:.3g} m, better {far_field * wavelength_m:.3g} m"
         )
-    warnings.warn(
-        f"{what}; within a wavelength ({wavelength_m:.3g} m) path gain by Friis's formula is a rough guide",
-        UserWarning,
-        stacklevel=4,
-    )
+    warn(f"{what}; within a wavelength ({wavelength_m:.3g} m) path gain by Friis's formula is a rough guide")
 
 
 def _refuse(bad: np.ndarray, what: str, points: np.ndarray, labels: list[str], mesh: Mesh) -> None:

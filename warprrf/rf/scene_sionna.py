@@ -13,7 +13,6 @@ from __future__ import annotations
 import glob
 import os
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,7 +22,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from warprrf.checks import checked, users_level
+from warprrf.checks import checked, warn
 from warprrf.device import require
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.materials import Band, Material, itu_material
@@ -74,9 +73,7 @@ def parts_of(rt_scene: Any, choice: MaterialChoice) -> tuple[list[ScenePart], di
                 own = array_from_sionna(array)
             except ValueError as error:
                 text = str(error).removeprefix("rt_array: ")
-                warnings.warn(
-                    f"rt_scene.{common}: {text}; it is left out", UserWarning, stacklevel=users_level()
-                )
+                warn(f"rt_scene.{common}: {text}; it is left out")
                 continue
             devices["antennas"] |= {
                 str(name): replace(own, orientation=_shortest(np.array(device.orientation)))
@@ -254,7 +251,7 @@ def _common_array(rt: Any, arrays: Sequence[PlanarArray], common: str) -> Any:
         why = "got antennas that differ in more than their orientation, and Sionna RT has one array for all"
     else:
         return rt.AntennaArray(_sionna_pattern(rt, plain[0]), _unturned(arrays[0]).T.tolist())
-    warnings.warn(f"antennas: {why}; {common} is left to be set", UserWarning, stacklevel=users_level())
+    warn(f"antennas: {why}; {common} is left to be set")
     return None
 
 

@@ -52,15 +52,10 @@ def doppler_hz(
         later = paths.after(1e-3, shift)  # a millisecond on
     """
     lead = len(paths.gain) if paths.batched else None
-    ends = [
-        _velocities(name, value, lead)
-        for name, value in (
-            ("transmitter_velocity", transmitter_velocity),
-            ("receiver_velocity", receiver_velocity),
-        )
-    ]
+    sent = _velocities("transmitter_velocity", transmitter_velocity, lead)
+    heard = _velocities("receiver_velocity", receiver_velocity, lead)
     departure, onward = paths.departure, -paths.arrival
-    speed = (ends[0] * departure).sum(axis=-1) - (ends[1] * onward).sum(axis=-1)
+    speed = (sent * departure).sum(axis=-1) - (heard * onward).sum(axis=-1)
     if moving:
         there = np.isfinite(paths.vertices[..., 0])
         speed = speed + np.where(there, _pushed(paths, moving, scene, there, departure, onward), 0.0).sum(

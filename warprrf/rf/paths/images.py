@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import copy
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,7 +19,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_positive, users_level
+from warprrf.checks import check_positive, warn
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.edges import Edges
 from warprrf.geometry.planar_patches import PlanarPatches
@@ -89,11 +88,9 @@ class MirrorImages:
         if patches.two_sided and patches.curved_m2 > max(
             0.5, 0.01 * patches.area.sum()
         ):  # what is less is detail
-            warnings.warn(
+            warn(
                 f"mesh: {patches.curved_m2:.3g} m^2 of it are flat facets of smooth surfaces (a round pillar, say); each "
-                "mirrors as a plane or not at all, so that mirror paths off them are right in the mean alone",
-                UserWarning,
-                stacklevel=users_level(),
+                "mirrors as a plane or not at all, so that mirror paths off them are right in the mean alone"
             )
         self.patches = patches
         self.max_chains = check_positive("max_chains", max_chains)

@@ -41,29 +41,16 @@ def turns(stops: np.ndarray, normal: np.ndarray) -> np.ndarray:
 def vertical_ends(stops: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fields of antennas along the zenith unit vectors of departure and arrival, in the (TE, TM) of the first mirror and
     behind the last, shape ``(L, 2)`` each; arguments as for :func:`turns`."""
-    if normal.shape[1] == 0:
-        both = _directly(stops)[:, 0, 0]
-        return np.stack([both, 0.0 * both], axis=1), np.broadcast_to([1.0, 0.0], (len(both), 2))
-    into, out = _ends(stops, normal)
-    return into[:, :, 0], out[:, 0, :]
-
-
-def _directly(stops: np.ndarray) -> np.ndarray:
-    """From zenith and azimuth unit vectors of departure to those of arrival, without a mirror, shape ``(L, 2, 2)``."""
-    along = np.diff(stops, axis=1)[:, 0]
-    return transverse_basis(-along) @ np.swapaxes(transverse_basis(along), 1, 2)
-
-
-def _ends(stops: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """From zenith and azimuth unit vectors of departure to the first mirror's (TE, TM), and from those behind the last
-    mirror to the unit vectors of arrival, shape ``(L, 2, 2)`` each."""
     leg = np.diff(stops, axis=1)
+    sent, heard = np.swapaxes(transverse_basis(leg[:, 0]), 1, 2), transverse_basis(-leg[:, -1])
+    if normal.shape[1] == 0:
+        both = (heard @ sent)[:, 0, 0]
+        return np.stack([both, 0.0 * both], axis=1), np.broadcast_to([1.0, 0.0], (len(both), 2))
     along, across = _frames(stops, normal)
     first, last = across[:, 0], across[:, -1]
     before = np.stack([first, np.cross(first, along[:, 0])], axis=1)
     behind = np.stack([last, np.cross(last, along[:, -1])], axis=1)
-    into = before @ np.swapaxes(transverse_basis(leg[:, 0]), 1, 2)
-    return into, transverse_basis(-leg[:, -1]) @ np.swapaxes(behind, 1, 2)
+    return (before @ sent)[:, :, 0], (heard @ np.swapaxes(behind, 1, 2))[:, 0, :]
 
 
 def _frames(stops: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

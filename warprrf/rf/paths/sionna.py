@@ -165,10 +165,7 @@ def to_sionna(
     return SionnaPaths(
         a=passband[:, :, None],
         tau=np.where(valid, tau, -1.0)[:, None],
-        theta_t=angle(several.theta_t),
-        phi_t=angle(several.phi_t),
-        theta_r=angle(several.theta_r),
-        phi_r=angle(several.phi_r),
+        **{name: angle(getattr(several, name)) for name in ("theta_t", "phi_t", "theta_r", "phi_r")},
         valid=valid[:, None],
         interactions=np.moveaxis(np.where(there, several.interactions, 0).astype(int), -1, 0)[:, :, None],
         vertices=np.moveaxis(np.where(there[..., None], several.vertices, 0.0), -2, 0)[:, :, None],

@@ -7,12 +7,10 @@ them nearest to line of sight.
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import some_of, users_level
+from warprrf.checks import some_of, warn
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.spectra.spectrum import to_db
 
@@ -60,11 +58,9 @@ def question_levels(
     end = f"{unit}{hint}; expected received over transmitted power"
     if len(impossible):
         raise ValueError(f"{rows} are up to {level_db[wrong].max():.4g} dB, not less than transmitted{end}")
-    warnings.warn(
+    warn(
         f"{rows} are up to {above[wrong].max():.3g} dB above line of sight in free space, where reflections add "
-        f"{float(np.max(margin_db)):g} dB at most{end}",
-        UserWarning,
-        stacklevel=users_level(),
+        f"{float(np.max(margin_db)):g} dB at most{end}"
     )
 
 

@@ -12,7 +12,6 @@ Figures for receivers without line of sight alone carry the suffix ``_blocked``.
 from __future__ import annotations
 
 import time
-import warnings
 from collections import defaultdict
 from collections.abc import Callable
 from functools import lru_cache
@@ -21,7 +20,7 @@ from typing import Annotated, Any, TypeAlias
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from warprrf.checks import NotNegative, Shaped, check_alike, check_array, checked, within
+from warprrf.checks import NotNegative, Shaped, check_alike, check_array, checked, warn, within
 from warprrf.device import Progress
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.deembedding import respond, scanned_kernel
@@ -213,10 +212,9 @@ def evaluate(
     check_whole("test.path_gain", test.path_gain)
     fitted_on = _fitted_on(predict, test)
     if fitted_on:
-        warnings.warn(
+        warn(
             f"test: {fitted_on} of its {count} receivers are among those that the predictor was fitted on: these are "
-            "no errors of prediction; score receivers that were held out (ds.split)",
-            stacklevel=2,
+            "no errors of prediction; score receivers that were held out (ds.split)"
         )
     predict = _on_grid(predict, test.path_gain.shape[1:])
     floor, range_db = float(test.floor), test.range_db

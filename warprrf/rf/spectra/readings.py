@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import csv
 import os
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -29,7 +28,7 @@ from warprrf.checks import (
     checked,
     one_of,
     some_of,
-    users_level,
+    warn,
     within,
 )
 from warprrf.rf.em.absorption import Air
@@ -310,11 +309,7 @@ def _check_columns(names: Sequence[str]) -> None:
         if elevation in names and azimuth not in names:
             raise ValueError(f"table: got {elevation} without {azimuth}, expected both or neither")
     if unknown:
-        warnings.warn(
-            f"table: columns {', '.join(unknown)} are not read; those that are: {', '.join(known)}",
-            UserWarning,
-            stacklevel=users_level(),
-        )
+        warn(f"table: columns {', '.join(unknown)} are not read; those that are: {', '.join(known)}")
 
 
 def question_readings(readings: Readings) -> None:
@@ -333,11 +328,9 @@ def question_readings(readings: Readings) -> None:
     question_levels("power", np.where(known, r.power, np.nan), free_space, margin_db=margin_db)
     above = np.flatnonzero(~known & (r.power > 1.0))
     if len(above):
-        warnings.warn(
+        warn(
             f"power: {len(above)} readings (rows {some_of(above)}) of chains of unknown gain are above 0 dB, more than was "
-            "transmitted: were minus signs lost, or are they linear?",
-            UserWarning,
-            stacklevel=users_level(),
+            "transmitted: were minus signs lost, or are they linear?"
         )
 
 
@@ -423,28 +416,20 @@ def path_weights(
         departure: unit vectors from the transmitter, shape ``(K, 3)``.
         delay_s: delays [s], shape ``(K,)``.
     """
-    weight = np.empty((len(rows), len(delay_s)), dtype)
+    r, weight = readings, np.empty((len(rows), len(delay_s)), dtype)
+    ends = (r.arrival, r.receive_pattern, arrival), (r.departure, r.transmit_pattern, departure)
     weights_at_once = 1_000_000  # of readings and paths: some MB of temporary arrays
     at_once = max(1, weights_at_once // max(1, len(delay_s)))
     for first in range(0, len(rows), at_once):
         some = rows[first : first + at_once]
-        weight[first : first + at_once] = _path_weights(readings, some, arrival, departure, delay_s)
-    return weight
-
-
-def _path_weights(
-    r: Readings, rows: np.ndarray, arrival: np.ndarray, departure: np.ndarray, delay_s: np.ndarray
-) -> np.ndarray:
-    weight = np.ones((len(rows), len(delay_s)))
-    for turned, pattern, path in (
-        (r.arrival, r.receive_pattern, arrival),
-        (r.departure, r.transmit_pattern, departure),
-    ):
-        if turned is not None and pattern is not None:
-            once, own = np.unique(turned[rows], axis=0, return_inverse=True)
-            weight *= turned_gain(as_antenna(pattern), once, path)[own.reshape(-1)]
-    if r.delay_s is not None and r.bandwidth_hz is not None:
-        weight *= tap_share(r.bandwidth_hz * (r.delay_s[rows, None] - delay_s), r.window)
+        own = np.ones((len(some), len(delay_s)))
+        for turned, pattern, path in ends:
+            if turned is not None and pattern is not None:
+                once, which = np.unique(turned[some], axis=0, return_inverse=True)
+                own *= turned_gain(as_antenna(pattern), once, path)[which.reshape(-1)]
+        if r.delay_s is not None and r.bandwidth_hz is not None:
+            own *= tap_share(r.bandwidth_hz * (r.delay_s[some, None] - delay_s), r.window)
+        weight[first : first + at_once] = own
     return weight
 
 

@@ -233,13 +233,8 @@ class HarmonicField(RadioField):
         """At least one diffuse path is kept to carry what is below the floor. With ``line_of_sight="explicit"`` the ``los``
         path carries Friis gain; without, the power of the pixels within 3 beam sigmas of the transmitter's direction,
         merged. Direction and delay of ``los`` are exact; a diffuse path arrives from its pixel's centre."""
-        found = paths_of(
-            self._view_from(receiver, transmitter),
-            beam_sigma_rad=self.beam_sigma_rad,
-            frequency_hz=self.frequency_hz,
-            max_paths=max_paths,
-        )
-        return replace(found, air=self.air)
+        view = self._view_from(receiver, transmitter)
+        return replace(paths_of(view, self.beam_sigma_rad, self.frequency_hz, max_paths), air=self.air)
 
     def _taken_apart(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         tensors = {f"layer/{name}": table for name, table in self.layers.items()}
@@ -254,15 +249,13 @@ class HarmonicField(RadioField):
         layers = {n.removeprefix("layer/"): t for n, t in tensors.items() if n.startswith("layer/")}
         if "gain" not in layers:
             raise ValueError("it has no layer of gain")
+        held = "mesh/faces" in tensors
         return {
             "gaussians": Gaussians(**{f.name: tensors[f"gaussians/{f.name}"] for f in fields(Gaussians)}),
-            "mesh": Mesh(tensors["mesh/vertices"], tensors["mesh/faces"])
-            if "mesh/faces" in tensors
-            else None,
+            "mesh": Mesh(tensors["mesh/vertices"], tensors["mesh/faces"]) if held else None,
             "options": FieldOptions(**header["options"]),
             "layers": layers,
-            "gain_unit": header["gain_unit"],
-            "delay_unit": header["delay_unit"],
+            **{name: header[name] for name in ("gain_unit", "delay_unit")},
         }
 
     def _on_device(self) -> Parameters:
