@@ -32,7 +32,7 @@ from warprrf.checks import (
 )
 from warprrf.device import DeviceLike, Progress, resolve
 from warprrf.geometry.mesh import GeometryLike, Mesh
-from warprrf.netcdf_files import Variable
+from warprrf.netcdf_files import Variable, encoded
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.response import LinkOptions as LinkEnds
@@ -43,7 +43,7 @@ from warprrf.rf.fields.batches import Batch, Work
 from warprrf.rf.fields.location import Location
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
-from warprrf.rf.paths.path_set import PATH_VARIABLES, Paths, arrays_of, ends_and_attributes
+from warprrf.rf.paths.path_set import PATH_VARIABLES, Paths, attributes_of
 from warprrf.rf.positions import Ends, check_positions, retraced_slope
 from warprrf.rf.spectra.antenna import Antenna, Pattern, samples_of
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
@@ -327,8 +327,9 @@ class RadioField(ABC):
         if max_paths is None:
             raise ValueError("max_paths: got None with a store, expected how many paths it has room for")
         source = ends.transmitters if len(ends.groups()) > 1 else ends.transmitters[0]
-        known, attributes = ends_and_attributes(ends.receivers, source, self.frequency_hz, self.air)
-        attributes |= {"single_receiver": int(ends.single)} | self._known_by(batch, max_paths)
+        known = encoded({"receiver": ends.receivers, "transmitter": source}, PATH_VARIABLES)
+        attributes = attributes_of(self.frequency_hz, self.air) | self._known_by(batch, max_paths)
+        attributes["single_receiver"] = int(ends.single)
         batch.gather(partial(_path_arrays, work, max_paths), PATH_VARIABLES, known, attributes)
         return Paths.load(store)
 
@@ -639,7 +640,8 @@ def _paths(field: RadioField, max_paths: int | None, part: Part) -> list[Paths]:
 
 
 def _path_arrays(work: Callable[[Part], list[Paths]], length: int, part: Part) -> dict[str, np.ndarray]:
-    return arrays_of(Paths.stack(work(part), length))
+    paths = replace(Paths.stack(work(part), length), receiver=None, transmitter=None)
+    return encoded(vars(paths), PATH_VARIABLES)
 
 
 def _cfr(

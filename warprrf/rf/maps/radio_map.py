@@ -173,9 +173,8 @@ class RadioMap:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a NetCDF-4 file, whole or not at all: the four quantities over ``y`` and ``x``, and the outline."""
-        arrays = {name: getattr(self, name) for name in _VARIABLES if getattr(self, name) is not None}
-        attributes = {name: float(getattr(self, name)) for name in _PLAIN} | {"format": _FORMAT}
-        netcdf_files.write(path, arrays, _VARIABLES, {}, attributes)
+        attributes = {name: getattr(self, name) for name in _PLAIN} | {"format": _FORMAT}
+        netcdf_files.write(path, netcdf_files.encoded(vars(self), _VARIABLES), _VARIABLES, {}, attributes)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> RadioMap:
@@ -185,10 +184,8 @@ class RadioMap:
             OSError: naming the file, if it cannot be read.
             ValueError: naming it, if it is damaged, or holds something else.
         """
-        arrays, attributes = netcdf_files.read(path, _VARIABLES, {})
+        arrays, attributes = netcdf_files.read(path, _VARIABLES, {}, _FORMAT)
         with named(path, "damaged, or no radio map"):
-            if attributes.get("format") != _FORMAT:
-                raise ValueError(f"it holds {attributes.get('format')!r}, expected {_FORMAT!r}")
             for axis, name in enumerate(("y", "x")):
                 order = np.argsort(arrays[name])  # as another tool may have turned it
                 for held in {name, *_LAYERS, "ground_m"} & set(arrays):
