@@ -191,6 +191,20 @@ def check_type(name: str, value: object, kind: type, hint: str = "") -> None:
         raise TypeError(f"{name}: got {type(value).__name__}, expected a {kind.__name__}{hint}")
 
 
+def check_items(name: str, values: Iterable[T], kind: type, least: int = 0) -> list[T]:
+    """``values`` as a list, each of them a ``kind``.
+
+    Raises:
+        TypeError, ValueError: otherwise, or for less than ``least``, naming the argument and the item.
+    """
+    found = list(values)
+    if len(found) < least:
+        raise ValueError(f"{name}: got {len(found) or 'none'}, expected at least {least}")
+    for k, value in enumerate(found):
+        check_type(f"{name}[{k}]", value, kind)
+    return found
+
+
 def _number(value: object) -> float:
     """A real number as a float, NaN for what is none; a decimal one is none: it does not go together with floats."""
     try:

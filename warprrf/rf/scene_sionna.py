@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from warprrf.checks import checked, warn
 from warprrf.device import require
 from warprrf.rf.channel.arrays import PlanarArray
-from warprrf.rf.em.materials import Band, Material, itu_material
+from warprrf.rf.em.materials import Band, Material, itu_material, radio_values
 from warprrf.rf.scene_parts import MaterialChoice, ScenePart
 from warprrf.rf.spectra.antenna import PATTERNS, SLANTS_RAD, Antenna, as_antenna
 from warprrf.rf.spectra.spectrum import directions_from_angles, pixel_directions
@@ -322,14 +322,7 @@ def _radio_material(rt: Any, material: Material, name: str, frequency: float) ->
             f"material {material.name!r}: it scatters reciprocally, Sionna RT's patterns do not; set reciprocal=False to "
             'take its lobe of the same width, or use engine="exact"'
         )
-    radio = rt.RadioMaterial(
-        name,
-        thickness=float(material.thickness_m),
-        relative_permittivity=material.relative_permittivity(frequency),
-        conductivity=material.conductivity(frequency),
-        scattering_coefficient=material.scattering_coefficient(frequency),
-        xpd_coefficient=float(material.xpd),
-    )
+    radio = rt.RadioMaterial(name, **radio_values(material, frequency))
     radio.scattering_pattern = (
         rt.DirectivePattern(alpha_r=int(material.alpha_r)) if directive else rt.LambertianPattern()
     )

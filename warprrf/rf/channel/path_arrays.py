@@ -19,7 +19,7 @@ from typing import Annotated, Any, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from warprrf.checks import Shaped, check_chosen, check_count, check_type, checked, one_line
+from warprrf.checks import Shaped, check_chosen, check_count, check_items, checked, one_line
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 from warprrf.rf.spectra.spectrum import angles_from_directions, directions_from_angles
@@ -276,7 +276,7 @@ class PathArrays:
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
         """All paths of one receiver."""
-        _check_parts(parts)
+        check_items("parts", parts, PathArrays, 1)
         joined: dict[str, Any] = {name: np.concatenate(arrays) for name, arrays in _columns(parts).items()}
         return cls(**joined, **_common(parts), receiver=parts[0].receiver)
 
@@ -287,7 +287,7 @@ class PathArrays:
         Raises:
             ValueError, TypeError: for no paths, or a length above :data:`MOST_PATHS`.
         """
-        _check_parts(parts)
+        check_items("parts", parts, PathArrays, 1)
         length = max(check_count("length", length, 0, MOST_PATHS), *(len(p.gain) for p in parts))
         stacked: dict[str, Any] = {
             name: np.stack([_padded(a, 0, length, PADDING[name]) for a in arrays])
@@ -320,14 +320,6 @@ def points_along(transmitter: np.ndarray, vertices: np.ndarray, receiver: np.nda
     points = np.concatenate([start, vertices, np.zeros((count, 1, 3))], axis=1)
     points[np.arange(count), np.isfinite(vertices[..., 0]).sum(axis=1) + 1] = receiver
     return points
-
-
-def _check_parts(parts: Sequence[PathArrays]) -> None:
-    """Raise ValueError or TypeError unless these are some paths."""
-    if not len(parts):
-        raise ValueError("parts: got none, expected at least one")
-    for k, part in enumerate(parts):
-        check_type(f"parts[{k}]", part, PathArrays)
 
 
 def _columns(parts: Sequence[PathArrays]) -> dict[str, list[np.ndarray]]:

@@ -29,9 +29,9 @@ from warprrf.checks import (
     NotNegative,
     check_choice,
     check_count,
+    check_items,
     check_number,
     check_positive,
-    check_type,
     checked,
     within,
 )
@@ -155,8 +155,7 @@ class Material:
     xpd: float = 0.0
 
     def __post_init__(self) -> None:
-        for k, band in enumerate(self.bands):
-            check_type(f"bands[{k}]", band, Band)
+        check_items("bands", self.bands, Band)
         of = f" of {self.name!r}"
         if self.thickness_m != np.inf:
             check_positive("thickness_m" + of, self.thickness_m, "number of metres, or inf for a half-space")
@@ -255,6 +254,17 @@ class Material:
         if self.scattering is not None:
             return float(self.scattering)
         return roughness_scattering(self.roughness_m, frequency_hz)
+
+
+def radio_values(material: Material, frequency_hz: float) -> dict[str, float]:
+    """A material at a carrier, by the names that Sionna RT's radio materials have for its properties."""
+    return {
+        "relative_permittivity": material.relative_permittivity(frequency_hz),
+        "conductivity": material.conductivity(frequency_hz),
+        "thickness": material.thickness_m,
+        "scattering_coefficient": material.scattering_coefficient(frequency_hz),
+        "xpd_coefficient": material.xpd,
+    }
 
 
 def is_name_alone(material: object) -> bool:

@@ -35,7 +35,7 @@ from warprrf.checks import check_positive, checked
 from warprrf.files import partial_path, read_json, write_json
 from warprrf.geometry.mesh_files import write_mesh
 from warprrf.rf.em.fresnel import COSINES, LAMBERTIAN, fresnel_curves, lobe, slab_reflection
-from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, Band, Material, table_entry
+from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, Band, Material, radio_values, table_entry
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
@@ -421,13 +421,7 @@ def _scene_xml(materials: Sequence[Material], frequency_hz: float) -> str:
         "",
     ]
     for material in materials:
-        values = {
-            "relative_permittivity": material.relative_permittivity(frequency_hz),
-            "conductivity": material.conductivity(frequency_hz),
-            "thickness": material.thickness_m,
-            "scattering_coefficient": material.scattering_coefficient(frequency_hz),
-            "xpd_coefficient": 0.0,
-        }
+        values = radio_values(material, frequency_hz)
         lines += [
             f'  <bsdf type="radio-material" id="mat-{material.name}">',
             *(f'    <float name="{key}" value="{value:.9g}"/>' for key, value in values.items()),

@@ -101,8 +101,7 @@ class RadioMap:
     def positions(self) -> np.ndarray:
         """Centres of the cells [m], shape ``(Y, X, 3)``."""
         x, y = np.meshgrid(self.x, self.y)
-        ground = 0.0 if self.ground_m is None else self.ground_m
-        return np.stack([x, y, np.full_like(x, self.height_m) + ground], axis=-1)
+        return _places(x, y, self.height_m, self.ground_m)
 
     @property
     def best_beam_snr_db(self) -> np.ndarray:
@@ -270,9 +269,7 @@ def radio_map(
     x, y = _centres(mesh, cell, o.bounds)
     across, along = np.meshgrid(x, y)
     ground = ground_height(mesh, across, along, device=field.device) if o.above_ground else None
-    places = np.stack(
-        [across, along, np.full_like(across, height) + (0.0 if ground is None else ground)], axis=-1
-    )
+    places = _places(across, along, height, ground)
     free = is_free(mesh, places.reshape(-1, 3), source, device=field.device).reshape(across.shape)
     free &= np.linalg.norm(places - source, axis=-1) > NEAR_FIELD * wavelength_m
     if not free.any():
@@ -296,6 +293,11 @@ def radio_map(
         ground_m=ground,
         **layers,
     )
+
+
+def _places(x: np.ndarray, y: np.ndarray, height: float, ground: np.ndarray | None) -> np.ndarray:
+    """Places at ``height`` [m] over the ``ground``, where there is one, shape ``(Y, X, 3)``."""
+    return np.stack([x, y, np.full_like(x, height) + (0.0 if ground is None else ground)], axis=-1)
 
 
 def _centres(mesh: Mesh, cell: float, bounds: Any) -> tuple[np.ndarray, np.ndarray]:

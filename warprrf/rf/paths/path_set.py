@@ -12,22 +12,13 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import netcdf_files
-from warprrf.checks import (
-    Expected,
-    check_array,
-    check_known_whole,
-    check_number,
-    check_positive,
-    checked,
-    lengths,
-    one_line,
-)
+from warprrf.checks import Expected, check_known_whole, check_positive, checked, lengths, one_line, within
 from warprrf.netcdf_files import Variable
 from warprrf.rf.channel import dispersion as dispersions
 from warprrf.rf.channel import response
@@ -57,7 +48,7 @@ class Paths(PathArrays):
     dispersion = dispersions.dispersion
     doppler_hz = doppler.doppler_hz
 
-    def after(self, time_s: float, doppler_hz: ArrayLike) -> Paths:
+    def after(self, time_s: Annotated[float, within()], doppler_hz: ArrayLike) -> Paths:
         """The same paths ``time_s`` later, each turned by its Doppler shift: exp(j 2 pi f_D t).
 
         It holds while nothing has moved by more than a part of what changes the paths themselves, or their gains: trace anew for
@@ -70,11 +61,7 @@ class Paths(PathArrays):
         Raises:
             ValueError: for another shape, or a path without a shift.
         """
-        shift = check_array("doppler_hz", doppler_hz, self.tau.shape, finite=False)
-        if not np.isfinite(shift[self.valid]).all():
-            raise ValueError("doppler_hz: got NaN or infinite shifts, expected one for every path")
-        turn = carrier_phase(-check_number("time_s", time_s), np.where(self.valid, shift, 0.0))
-        return turned(self, turn)
+        return turned(self, carrier_phase(-time_s, sionna.check_shifts(self, doppler_hz)))
 
     to_sionna = sionna.to_sionna
 
@@ -97,8 +84,9 @@ class Paths(PathArrays):
         Raises:
             ValueError: for other arrays.
         """
-        found = sionna.from_sionna(paths, frequency_hz, transmitter, drop_repeated)
-        return cls.stack([cls(**arrays) for arrays in found])
+        several = sionna.by_delay(paths, frequency_hz, transmitter, drop_repeated)
+        found = [p.select(np.argsort(-np.abs(p.gain), kind="stable")) for p in several]
+        return cls.stack([cls(**vars(p)) for p in found])
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write to a NetCDF-4 file, whole or not at all; see :mod:`warprrf.rf.paths.path_set`."""

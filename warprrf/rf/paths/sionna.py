@@ -147,10 +147,7 @@ def to_sionna(
     several = paths.as_several()
     shift = np.zeros(several.gain.shape)
     if doppler_hz is not None:
-        given = check_array("doppler_hz", doppler_hz, paths.gain.shape, finite=False)
-        shift = np.where(several.valid, given.reshape(shift.shape), 0.0)
-        if not np.isfinite(shift).all():
-            raise ValueError("doppler_hz: got NaN or infinite shifts, expected one for every path")
+        shift[:] = check_shifts(paths, doppler_hz)
     options: dict[str, Any] = {"tx_array": tx_array, "rx_array": rx_array, "diffuse": diffuse, "seed": seed}
     coefficient, tau = impulse_response(several, **options)
     valid = several.valid & np.isfinite(tau)
@@ -175,16 +172,21 @@ def to_sionna(
     )
 
 
-def from_sionna(
-    paths: Any, frequency_hz: float, transmitter: int, drop_repeated: bool
-) -> list[dict[str, Any]]:
-    """Arrays of the paths of ``sionna.rt.Paths`` from one transmitter, of each receiver; see ``Paths.from_sionna``."""
-    each = by_delay(paths, frequency_hz, transmitter, drop_repeated)
-    return [vars(p.select(np.argsort(-np.abs(p.gain), kind="stable"))) for p in each]
+def check_shifts(paths: PathArrays, doppler_hz: ArrayLike) -> np.ndarray:
+    """Shifts [Hz] of ``paths``, shape as ``tau``, 0 where padded.
+
+    Raises:
+        ValueError: for another shape, or a path without a shift.
+    """
+    given = check_array("doppler_hz", doppler_hz, paths.tau.shape, finite=False)
+    if not np.isfinite(given[paths.valid]).all():
+        raise ValueError("doppler_hz: got NaN or infinite shifts, expected one for every path")
+    return np.where(paths.valid, given, 0.0)
 
 
 def by_delay(paths: Any, carrier: float, transmitter: int, drop_repeated: bool) -> Iterator[PathArrays]:
-    """The paths of each receiver by rising delay: in the same order, whatever Sionna's threads did."""
+    """The paths of ``sionna.rt.Paths`` from one transmitter, of each receiver, by rising delay: in the same order, whatever
+    Sionna's threads did; see :meth:`Paths.from_sionna`."""
     if not hasattr(paths, "synthetic_array"):
         raise TypeError(f"paths: got {type(paths).__name__}, expected what Sionna RT's PathSolver returned")
     real, imag = (np.asarray(part.numpy(), dtype=np.float64) for part in paths.a)

@@ -305,20 +305,10 @@ class SpectrumDataset:
         """
         if isinstance(index, bool) or not isinstance(index, int | np.integer):
             raise TypeError(f"index: got {index!r}, expected a whole number; subset() takes several")
-        return Spectrum(
-            path_gain=self.path_gain[index],
-            delay_s=self.delay_s[index],
-            aod=self.aod[index],
-            floor=self.floor,
-            range_db=self.range_db,
-            attributes={
-                "receiver": self.receivers[index],
-                "transmitter": self.transmitter,
-                "frequency_hz": self.frequency_hz,
-                "beam_sigma_rad": self.beam_sigma_rad,
-                "engine": self.engine,
-            },
-        )
+        of_all = ("transmitter", "frequency_hz", "beam_sigma_rad", "engine")
+        attributes = {"receiver": self.receivers[index]} | {name: getattr(self, name) for name in of_all}
+        arrays = self.path_gain[index], self.delay_s[index], self.aod[index]
+        return Spectrum(*arrays, self.floor, self.range_db, attributes=attributes)
 
     def __iter__(self) -> Any:
         return (self[k] for k in range(len(self)))

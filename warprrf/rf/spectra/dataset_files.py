@@ -23,10 +23,7 @@ from warprrf.netcdf_files import XYZ, Axis, Variable
 from warprrf.rf.spectra.spectrum import Spectrum
 from warprrf.tensor_files import named
 
-# What a compact file keeps. A relative step of 2^-7 errs by at most 0.017 dB, half of N0 / 64 moves the dB image by at
-# most 0.034 dB.
-COMPACT_GAIN_BITS = 7  # explicit mantissa bits
-COMPACT_GAIN_OF_FLOOR = 2.0**-6  # absolute step, times N0
+# What a compact file keeps; of path gain see _rounded.
 COMPACT_DELAY_STEP_S = 2.0**-39  # 1.8 ps between values: errors below 0.91 ps, 0.27 mm
 COMPACT_AOD_STEP_RAD = 2.0**-10  # 9.8e-4 rad between values: errors below 4.9e-4 rad
 
@@ -92,11 +89,8 @@ def write(path: str | os.PathLike[str], values: Mapping[str, Any], *, compact: b
         **values["attributes"],
     }
     if compact:
-        arrays |= _rounded(arrays, values["floor"])
-        attributes["compact_rounding"] = (
-            f"path_gain: {COMPACT_GAIN_BITS} mantissa bits and steps of floor * {COMPACT_GAIN_OF_FLOOR:g}; "
-            f"delay: {COMPACT_DELAY_STEP_S:g} s; aod: {COMPACT_AOD_STEP_RAD:g} rad"
-        )
+        rounded, attributes["compact_rounding"] = _rounded(arrays, values["floor"])
+        arrays |= rounded
     netcdf_files.write(path, arrays, _VARIABLES, _AXES, attributes, level=9 if compact else 4)
 
 
@@ -121,13 +115,20 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
     }
 
 
-def _rounded(arrays: Mapping[str, np.ndarray], floor: float) -> dict[str, np.ndarray]:
-    """What a compact file holds of path gain, delay and departure; a pixel that becomes zero is empty altogether."""
-    gain = _round_mantissa(arrays["path_gain"], COMPACT_GAIN_BITS, COMPACT_GAIN_OF_FLOOR * floor)
+def _rounded(arrays: Mapping[str, np.ndarray], floor: float) -> tuple[dict[str, np.ndarray], str]:
+    """What a compact file holds of path gain, delay and departure, and how that is rounded; a pixel that becomes zero is empty
+    altogether."""
+    # A relative step of 2^-7 errs by at most 0.017 dB, half of N0 / 64 moves the dB image by at most 0.034 dB.
+    bits, of_floor = 7, 2.0**-6
+    gain = _round_mantissa(arrays["path_gain"], bits, of_floor * floor)
     delay = np.round(arrays["delay"] / COMPACT_DELAY_STEP_S) * COMPACT_DELAY_STEP_S
     aod = (np.round(arrays["aod"] / COMPACT_AOD_STEP_RAD) * COMPACT_AOD_STEP_RAD).astype(np.float32)
     delay[gain == 0] = aod[gain == 0] = np.nan
-    return {"path_gain": gain, "delay": delay, "aod": aod}
+    how = (
+        f"path_gain: {bits} mantissa bits and steps of floor * {of_floor:g}; "
+        f"delay: {COMPACT_DELAY_STEP_S:g} s; aod: {COMPACT_AOD_STEP_RAD:g} rad"
+    )
+    return {"path_gain": gain, "delay": delay, "aod": aod}, how
 
 
 def _round_mantissa(values: np.ndarray, bits: int, step: float) -> np.ndarray:

@@ -17,8 +17,6 @@ from warprrf.rf.spectra.spectrum import to_db
 MARGIN_DB = 18.0
 """By how much all paths together may exceed line of sight: three mirror reflections in a corridor of perfect conductors
 give 16.4 dB, two in a furnished room of them 10.3 dB, a lobby of building materials 3.9 dB."""
-FADING_DB = 10.0
-"""By how much a power at one place may exceed the mean of its fading: 1 in 20,000 does, if it is Rayleigh's."""
 
 
 def free_space_gain(transmitters: np.ndarray, receivers: np.ndarray, frequency_hz: float) -> np.ndarray:

@@ -34,7 +34,7 @@ from warprrf.checks import (
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import NEPER, Hertz
 from warprrf.rf.spectra.antenna import Antenna, Pattern, as_antenna, main_lobe, turned_gain
-from warprrf.rf.spectra.levels import FADING_DB, MARGIN_DB, free_space_gain, question_levels
+from warprrf.rf.spectra.levels import MARGIN_DB, free_space_gain, question_levels
 
 COLUMNS = {
     "transmitter": ("tx_x", "tx_y", "tx_z"),
@@ -165,21 +165,19 @@ class Readings(PowerTable):
         if not (fields["power"] > floor).any():
             raise ValueError(f"power: got no value above the floor of {floor.min():g}")
         fields |= {"floor": floor, "std_db": std}
-        for turned, pattern in (("arrival", "receive_pattern"), ("departure", "transmit_pattern")):
-            value, gain = getattr(self, turned), getattr(self, pattern)
-            if (value is None) != (gain is None):
-                raise ValueError(f"{pattern}: got one of it and {turned}; expected both or neither")
-            if value is not None:
-                fields[turned] = check_turned(turned, value, count)
-                fields[pattern] = antenna_of(pattern, gain)
-        if (self.delay_s is None) != (self.bandwidth_hz is None):
-            raise ValueError("bandwidth_hz: got one of it and delay_s; expected both or neither")
+        ends = ("arrival", "receive_pattern"), ("departure", "transmit_pattern")
+        for one, other in (*ends, ("delay_s", "bandwidth_hz")):
+            if (getattr(self, one) is None) != (getattr(self, other) is None):
+                raise ValueError(f"{other}: got one of it and {one}; expected both or neither")
+        for turned, pattern in ends:
+            if getattr(self, turned) is not None:
+                fields[turned] = check_turned(turned, getattr(self, turned), count)
+                fields[pattern] = antenna_of(pattern, getattr(self, pattern))
         if self.delay_s is not None:
             fields["delay_s"] = check_array("delay_s", self.delay_s, (count,))
-        if not self.azimuth_known and self.arrival is None:
-            raise ValueError("azimuth_known: got False without arrival, whose zero is to be found")
-        if not self.clock_known and self.delay_s is None:
-            raise ValueError("clock_known: got False without delay_s, whose zero is to be found")
+        for known, of in (("azimuth_known", "arrival"), ("clock_known", "delay_s")):
+            if not getattr(self, known) and getattr(self, of) is None:
+                raise ValueError(f"{known}: got False without {of}, whose zero is to be found")
         if not self.clock_known and not self.azimuth_known:
             raise ValueError("clock_known: got False, and azimuth_known too; expected one zero known")
         if self.position_std_m > 0 and self.total:
@@ -324,7 +322,10 @@ def question_readings(readings: Readings) -> None:
     free_space = np.minimum(
         free_space_gain(r.transmitters, r.receivers, r.frequency_hz) * 10.0 ** (gain_db / 10.0), 1.0
     )
-    margin_db = MARGIN_DB + FADING_DB * (r.samples is not None)
+    fading_db = 10.0 * (
+        r.samples is not None
+    )  # a power at one place above the mean of its fading: 1 in 20,000, if Rayleigh's
+    margin_db = MARGIN_DB + fading_db
     question_levels("power", np.where(known, r.power, np.nan), free_space, margin_db=margin_db)
     above = np.flatnonzero(~known & (r.power > 1.0))
     if len(above):

@@ -23,10 +23,10 @@ from warprrf import device as _device
 from warprrf.checks import (
     check_array,
     check_count,
+    check_items,
     check_known_whole,
     check_number,
     check_positive,
-    check_type,
     checked,
     one_line,
     positive,
@@ -496,14 +496,10 @@ class Spectrum:
         Raises:
             TypeError, ValueError: for none, or what are no spectra.
         """
-        if not isinstance(spectra, Sequence) or not len(spectra):
-            raise ValueError(f"spectra: got {spectra!r:.60}, expected a list of at least one")
-        for k, one in enumerate(spectra):
-            check_type(f"spectra[{k}]", one, Spectrum)
-        several: dict[str, Any] = {}
-        for name, first in spectra[0]._arrays().items():
-            several[name] = None if first is None else np.stack([getattr(one, name) for one in spectra])
-        return replace(spectra[0], **several)
+        each, several = check_items("spectra", spectra, Spectrum, 1), dict[str, Any]()
+        for name, first in each[0]._arrays().items():
+            several[name] = None if first is None else np.stack([getattr(one, name) for one in each])
+        return replace(each[0], **several)
 
     def __getitem__(self, receiver: int) -> Spectrum:
         """The spectrum of one of several receivers."""
