@@ -201,8 +201,7 @@ class PathArrays:
         change = 0.0 if air is None else air.attenuation_db_per_m(carrier)
         change -= 0.0 if self.air is None else self.air.attenuation_db_per_m(carrier)
         loss = 10.0 ** (-change * np.nan_to_num(self.length_m) / 20.0)
-        jones = None if self.jones is None else self.jones * loss[..., None, None]
-        return replace(self, gain=self.gain * loss, jones=jones, air=air)
+        return replace(turned(self, loss), air=air)
 
     @property
     def carrier_hz(self) -> float:
@@ -308,7 +307,7 @@ P = TypeVar("P", bound=PathArrays)
 
 
 def turned(paths: P, turn: np.ndarray) -> P:
-    """The same paths with their complex gains times ``turn``, shape as ``gain``."""
+    """The same paths with their complex gains times ``turn``, complex or real, shape as ``gain``."""
     jones = None if paths.jones is None else paths.jones * turn[..., None, None]
     return replace(paths, gain=paths.gain * turn, jones=jones)
 

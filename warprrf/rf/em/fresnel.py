@@ -260,6 +260,7 @@ def lobe_norm(alpha_r: int, cos_incidence: ArrayLike) -> np.ndarray:
     return total / 2.0**alpha_r
 
 
+EXCESS = (0.05, 200.0)  # of epsilon_r over 1, what half-spaces are taken for; the last reflects like metal
 COSINES = 257  # entries of tables over the cosine of incidence
 
 
@@ -297,7 +298,7 @@ class FresnelCurves:
 @lru_cache(maxsize=1)
 def fresnel_curves() -> FresnelCurves:
     """The family of half-spaces from epsilon_r 1.05 to 201."""
-    excess = np.geomspace(0.05, 200.0, 97)  # of epsilon_r over 1; the last reflects like metal
+    excess = np.geomspace(*EXCESS, 97)
     te, tm = slab_reflection(np.linspace(0.0, 1.0, COSINES), 1.0 + excess[:, None], np.inf, 1.0)
     curves = 0.5 * (np.abs(te) ** 2 + np.abs(tm) ** 2)
     # relative errors count: each curve is weighted by its mean

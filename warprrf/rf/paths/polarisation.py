@@ -14,9 +14,8 @@ from __future__ import annotations
 import numpy as np
 
 from warprrf.geometry.mesh import vectors_across
+from warprrf.rf.em.fresnel import EXCESS
 from warprrf.rf.spectra.spectrum import transverse_basis
-
-_EXCESS = (0.05, 200.0)  # of epsilon_r - 1, the range of :func:`warprrf.rf.em.fresnel.fresnel_curves`
 
 
 def turns(stops: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -119,7 +118,7 @@ def chain_amplitude(
 
 def _half_space(log_excess: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Amplitudes (TE, TM) that a half-space reflects, shape ``(..., 2)``, and their derivatives to ``log_excess``."""
-    excess = np.clip(np.exp(log_excess), *_EXCESS)
+    excess = np.clip(np.exp(log_excess), *EXCESS)
     cos = np.clip(cosine, 0.0, 1.0)
     root = np.maximum(np.sqrt(excess + cos**2), 1e-12)
     dense = (1.0 + excess) * cos

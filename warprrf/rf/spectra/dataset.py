@@ -391,15 +391,8 @@ class SpectrumDataset:
             ValueError: on negative, NaN or infinite gains, a scanned antenna without directivity, another shape.
         """
         check_whole("path_gain", self.path_gain)
-        done = deembed(
-            self.path_gain,
-            pattern,
-            self.beam_sigma_rad,
-            boresight_gain_dbi=boresight_gain_dbi,
-            noise=noise,
-            progress=progress,
-            **options,
-        )
+        options |= {"boresight_gain_dbi": boresight_gain_dbi, "noise": noise, "progress": progress}
+        done = deembed(self.path_gain, pattern, self.beam_sigma_rad, **options)
         count, rows, columns = done.path_gain.shape
         there = done.source.reshape(count, -1)
         chosen = np.maximum(there, 0)

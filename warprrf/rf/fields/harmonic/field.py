@@ -172,11 +172,8 @@ class HarmonicField(RadioField):
             gaussians=gaussians,
             mesh=mesh,
             transmitter=transmitter,
-            frequency_hz=float(ds.frequency_hz),
+            **{n: getattr(ds, n) for n in ("frequency_hz", "floor", "range_db", "beam_sigma_rad")},
             shape=images.shape[1:],  # type: ignore[arg-type]
-            floor=float(ds.floor),
-            range_db=(float(ds.range_db[0]), float(ds.range_db[1])),
-            beam_sigma_rad=float(ds.beam_sigma_rad),
             options=replace(chosen, checkpoint=None),
             layers={},
             gain_unit=1.0,
