@@ -39,7 +39,6 @@ from warprrf.files import read_json
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, Hertz
 
 VACUUM_PERMITTIVITY = 8.8541878128e-12  # F/m, CODATA 2018
-PATTERNS = ("lambertian", "directive")
 
 NARROWEST_LOBE = 1000
 """Largest exponent of a scattering lobe: half its power lies within 3 degrees of the mirror direction. From 1023 on
@@ -162,7 +161,7 @@ class Material:
         check_number("roughness_m" + of, self.roughness_m, 0.0, ROUGHEST_M)
         if self.scattering is not None:
             check_number("scattering" + of, self.scattering, 0.0, 1.0)
-        check_choice("pattern" + of, self.pattern, PATTERNS)
+        check_choice("pattern" + of, self.pattern, ("lambertian", "directive"))
         check_count("alpha_r" + of, self.alpha_r, 1, NARROWEST_LOBE)
         check_number("xpd" + of, self.xpd, 0.0, 1.0)
 

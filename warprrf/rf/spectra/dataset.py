@@ -38,8 +38,6 @@ from warprrf.rf.spectra.spectrum import (
 
 POLARISATION = "mean over vertical and horizontal transmit, sum over both receive polarisations"
 
-_ROLES = ("train", "test")
-
 
 BeamWidth: TypeAlias = Annotated[float, positive("beam width in radians")]
 
@@ -506,7 +504,7 @@ def measured_at(ds: SpectrumDataset, receivers: np.ndarray, transmitter: np.ndar
 
 def _check_roles(role: ArrayLike, count: int) -> np.ndarray:
     found = np.asarray(role)
-    if found.shape != (count,) or not np.isin(found, _ROLES).all():
+    if found.shape != (count,) or not np.isin(found, ("train", "test")).all():
         held = f" of {', '.join(sorted(map(repr, found.astype(str).tolist())))[:80]}" * (found.ndim == 1)
         raise ValueError(f"role: got shape {found.shape}{held}, expected ({count},) of 'train' and 'test'")
     return found.astype("<U5")

@@ -47,7 +47,6 @@ NEEDED = (*COLUMNS["transmitter"], *COLUMNS["receiver"], "power_db")
 NUMBERS = (*NEEDED, *COLUMNS["arrival"], *COLUMNS["departure"], "delay_ns", "std_db")
 NOT_MEASURED = ("", "na", "n/a", "#n/a", "<na>", "nan", "null", "none")
 """What stands in a file, in small letters, for a power that was not measured."""
-WINDOWS = ("rectangular", "hann")
 
 
 @runtime_checkable
@@ -144,7 +143,7 @@ class Readings(PowerTable):
     transmit_pattern: Pattern | None = None
     delay_s: np.ndarray | None = None
     bandwidth_hz: Positive | None = None
-    window: Annotated[str, one_of(*WINDOWS)] = "rectangular"
+    window: Annotated[str, one_of("rectangular", "hann")] = "rectangular"
     chain: Sequence[str] | NDArray[np.str_] | None = None
     std_db: ArrayLike = 0.0
     samples: Count | None = None

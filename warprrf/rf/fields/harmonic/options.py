@@ -8,10 +8,7 @@ from typing import Annotated
 
 from warprrf.checks import Count, Seed, checked, one_of, whole
 from warprrf.kernels.raster.sh import COEFFICIENTS as DEGREE_TO_COUNT
-from warprrf.rf.fields.harmonic.transport import INTERACTION_POINTS, TOP_K, TRANSMITTANCE
-
-MODELS = ("rf3dgs+", "rf3dgs")
-GAINS = ("exp", "linear")
+from warprrf.rf.fields.harmonic.transport import TOP_K
 
 
 @dataclass(frozen=True)
@@ -63,10 +60,10 @@ class FieldOptions:
         ValueError: for a value that is not allowed.
     """
 
-    model: Annotated[str, one_of(*MODELS)] = "rf3dgs+"
-    transmittance: Annotated[str, one_of(*TRANSMITTANCE)] = "product"
-    interaction_point: Annotated[str, one_of(*INTERACTION_POINTS)] = "centre"
-    gain: Annotated[str, one_of(*GAINS)] = "exp"
+    model: Annotated[str, one_of("rf3dgs+", "rf3dgs")] = "rf3dgs+"
+    transmittance: Annotated[str, one_of("product", "exp")] = "product"
+    interaction_point: Annotated[str, one_of("centre", "peak", "expected", "mesh")] = "centre"
+    gain: Annotated[str, one_of("exp", "linear")] = "exp"
     sh_degree: Annotated[int, one_of(*DEGREE_TO_COUNT)] = 3
     top_k: Count = TOP_K
     line_of_sight: Annotated[str | None, one_of(None, "explicit")] = None

@@ -29,7 +29,6 @@ from warprrf.geometry.splats.rasterizer import Blending, Parameters, Rasterizer
 from warprrf.kernels.radio import transport as _kernels
 from warprrf.rf.spectra.spectrum import check_shape, pixel_directions
 
-TRANSMITTANCE = ("product", "exp")
 TOP_K = 16  # Gaussians kept per pixel
 
 
@@ -199,9 +198,6 @@ def _rows(raster: Rasterizer, found: Strongest) -> Rows:
     inputs = [share, index, weight, alpha, start, gaussian, out]
     _device.launch(_kernels.write_weights, len(dominant), inputs, device=device)
     return Rows(start, gaussian, out, dominant, expected)
-
-
-INTERACTION_POINTS = ("centre", "peak", "expected", "mesh")
 
 
 @dataclass(frozen=True)
