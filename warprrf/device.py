@@ -46,6 +46,15 @@ Stages come one after the other. ``done`` never falls within one, and starts abo
 kept; the last call of a stage has ``done == total``. What shows it makes seconds of it with :class:`TimeLeft`.
 """
 
+
+def with_progress(items: Sequence[Any] | np.ndarray, stage: str, progress: Progress | None) -> Iterator[Any]:
+    """``items`` one after another; ``progress`` is called once each is done with."""
+    for done, item in enumerate(items, 1):
+        yield item
+        if progress is not None:
+            progress(stage, done, len(items))
+
+
 RECENT_S = 15.0  # the rate is that of so many seconds
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_count, checked, one_of, within
-from warprrf.device import Progress
+from warprrf.device import Progress, with_progress
 from warprrf.rf.maps.radio_map import MapOptions, radio_map
 
 OBJECTIVES: dict[str, Callable[[np.ndarray, float], float]] = {
@@ -65,12 +65,9 @@ def place(
     """
     places = check_array("candidates", candidates, (None, 3))
     check_count("n", n, 1, len(places))
-    found = []
-    for k, source in enumerate(places):
-        found.append(radio_map(field, height, cell, source, MapOptions(**options)).best_beam_snr_db)
-        if progress is not None:
-            progress("place", k + 1, len(places))
-    return best_set(np.stack(found), n, objective, level_db)
+    asked, every = MapOptions(**options), with_progress(places, "place", progress)
+    snr_db = [radio_map(field, height, cell, source, asked).best_beam_snr_db for source in every]
+    return best_set(np.stack(snr_db), n, objective, level_db)
 
 
 def best_set(

@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from warprrf.checks import check_count
-from warprrf.device import Progress
+from warprrf.device import Progress, with_progress
 from warprrf.geometry.edges import Edges, mesh_edges
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
 from warprrf.geometry.planar_patches import PlanarPatches
@@ -148,12 +148,10 @@ class EdgeFinder:
             self.edges, np.zeros(0, int), np.zeros((0, 2), int), self.images.patches, place, place
         )
         parts = [self._described(none, none.edge)]
-        for k, receiver in enumerate(points):
+        for k, receiver in enumerate(with_progress(points, "edges", progress)):
             ways = self._ways(receiver, mirrors)
             part = self._described(ways, np.full(len(ways.edge), k))
             parts.append(part.take(np.argsort(part.length_m, kind="stable")))
-            if progress is not None:
-                progress("edges", k + 1, len(points))
         return EdgePaths.joined(parts)
 
     def _ways(self, receiver: np.ndarray, mirrors: int) -> _Ways:

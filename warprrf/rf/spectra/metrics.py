@@ -21,7 +21,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 
 from warprrf.checks import NotNegative, Shaped, check_alike, check_array, checked, warn, within
-from warprrf.device import Progress
+from warprrf.device import Progress, with_progress
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.deembedding import respond, scanned_kernel
 from warprrf.rf.spectra.spectrum import (
@@ -220,7 +220,7 @@ def evaluate(
     floor, range_db = float(test.floor), test.range_db
     rows = defaultdict[str, np.ndarray](lambda: np.full(count, np.nan))
     seconds = np.zeros(count)
-    for i, receiver in enumerate(np.asarray(test.receivers, dtype=np.float64)):
+    for i, receiver in enumerate(with_progress(test.receivers, "evaluate", progress)):
         start = time.perf_counter()
         prediction = predict(receiver)
         seconds[i] = time.perf_counter() - start
@@ -243,8 +243,6 @@ def evaluate(
             if weight.any() and _predicts(prediction.aod):
                 error = angle_deg(_unit(prediction.aod), _unit(test.aod[i]))
                 rows["aod_error_deg"][i] = weighted_median(np.where(np.isnan(error), np.inf, error), weight)
-        if progress is not None:
-            progress("evaluate", i + 1, count)
     line_of_sight = np.asarray(test.line_of_sight, dtype=bool)
     report: dict[str, Any] = _summary(rows, np.ones(count, dtype=bool), "")
     report.update(_summary(rows, ~line_of_sight, "_blocked"))

@@ -156,10 +156,8 @@ def transport(
     raster = Rasterizer(device=device, blending=cutoffs(range_db, rule))
     scene = raster.upload(gaussians) if uploaded is None else uploaded
     views = []
-    for k, position in enumerate(positions):
+    for position in _device.with_progress(positions, "transport", progress):
         views.append(_rows(raster, strongest(raster, scene, position, size, top_k)))
-        if progress is not None:
-            progress("transport", k + 1, len(positions))
     return Transport(size, positions, tuple(views), len(gaussians), rule)
 
 
