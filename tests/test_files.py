@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from warprrf import files, tensor_files
+from warprrf import files, netcdf_files, tensor_files
 
 
 @pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
@@ -155,3 +155,42 @@ def test_json_that_is_no_mapping_of_finite_numbers_is_refused(tmp_path, text):
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(ValueError, match=r"a\.json: "):
         files.read_json(path)
+
+
+def test_a_folder_takes_its_place_whole_or_not_at_all(tmp_path):
+    folder = tmp_path / "made"
+    for text in ("first", "second"):
+        with files.folder_in_place(folder) as part:
+            (part / "a").write_text(text)
+        assert (folder / "a").read_text() == text
+    with pytest.raises(ZeroDivisionError), files.folder_in_place(folder) as part:
+        (part / "a").write_text("third")
+        raise ZeroDivisionError
+    assert (folder / "a").read_text() == "second" and os.listdir(tmp_path) == ["made"]
+
+
+def test_fields_come_back_from_codes_and_parts():
+    variables = {
+        "kind": netcdf_files.Variable(("n",), codes=("", "los")),
+        "seen": netcdf_files.Variable(("n",), codes=(False, True)),
+        "gain_real": netcdf_files.Variable(("n",), field="gain", is_part=True),
+        "gain_imag": netcdf_files.Variable(("n",), field="gain", is_part=True),
+        "at": netcdf_files.Variable(("xyz",), field="place"),
+        "each_at": netcdf_files.Variable(("n", "xyz"), field="place"),
+    }
+    fields = {
+        "kind": np.array(["los", ""]), "seen": np.array([True, False]), "gain": np.array([1 + 2j, 3j]),
+        "place": np.zeros((2, 3)),
+    }  # fmt: skip
+    arrays = netcdf_files.encoded(fields, variables)
+    assert list(arrays) == ["kind", "seen", "gain_real", "gain_imag", "each_at"]
+    assert arrays["kind"].dtype == np.int8
+    found = netcdf_files.decoded(arrays, variables)
+    assert found.keys() == fields.keys()
+    for name, value in fields.items():
+        np.testing.assert_array_equal(found[name], value)
+    for bad in ([2, 0], [-1, 0], [0.5, 0.0], [np.nan, 0.0]):
+        with pytest.raises(ValueError, match="^kind: got .*, expected whole numbers from 0 to 1"):
+            netcdf_files.decoded(arrays | {"kind": np.array(bad)}, variables)
+    with pytest.raises(KeyError, match="gain_imag"):
+        netcdf_files.decoded({"gain_real": arrays["gain_real"]}, variables)

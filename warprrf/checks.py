@@ -7,14 +7,17 @@ import inspect
 import numbers
 import types
 import typing
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from types import EllipsisType
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeAlias, TypeVar
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, DTypeLike
+
+T = TypeVar("T")
 
 LARGEST = 1e100
 """Beyond it a number counts as infinite, its inverse as zero: products of a few would leave double precision."""
@@ -117,11 +120,16 @@ def check_count(name: str, value: object, least: int = 1, most: int = 2**31 - 1)
     return int(value)  # type: ignore[call-overload]
 
 
-def check_choice(name: str, value: object, allowed: Iterable[object]) -> None:
-    """Raise ValueError, naming the argument, unless ``value`` is one of those ``allowed``."""
+def check_choice(name: str, value: T, allowed: Iterable[object]) -> T:
+    """``value``, if it is one of those ``allowed``.
+
+    Raises:
+        ValueError: otherwise, naming the argument.
+    """
     known = tuple(allowed)
     if value not in known:
         raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(map(str, known))}")
+    return value
 
 
 def check_chosen(name: str, value: ArrayLike, count: int, least: int = 0) -> np.ndarray:
@@ -183,6 +191,20 @@ def check_type(name: str, value: object, kind: type, hint: str = "") -> None:
         raise TypeError(f"{name}: got {type(value).__name__}, expected a {kind.__name__}{hint}")
 
 
+def check_items(name: str, values: Iterable[T], kind: type, least: int = 0) -> list[T]:
+    """``values`` as a list, each of them a ``kind``.
+
+    Raises:
+        TypeError, ValueError: otherwise, or for less than ``least``, naming the argument and the item.
+    """
+    found = list(values)
+    if len(found) < least:
+        raise ValueError(f"{name}: got {len(found) or 'none'}, expected at least {least}")
+    for k, value in enumerate(found):
+        check_type(f"{name}[{k}]", value, kind)
+    return found
+
+
 def _number(value: object) -> float:
     """A real number as a float, NaN for what is none; a decimal one is none: it does not go together with floats."""
     try:
@@ -219,6 +241,11 @@ def users_level() -> int:
     while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == "warprrf":
         frame, level = frame.f_back, level + 1
     return level
+
+
+def warn(text: str) -> None:
+    """Warn of ``text``, a UserWarning, at the line outside this package that called it."""
+    warnings.warn(text, UserWarning, stacklevel=users_level())
 
 
 def some_of(rows: Sequence[int] | np.ndarray, most: int = 8) -> str:
@@ -304,6 +331,56 @@ def lengths(shape: str, least: float = -LARGEST_M) -> Expected:
     return Expected(shape, least, LARGEST_M)
 
 
+@dataclass(frozen=True)
+class Shaped:
+    """What an array must be, in the annotation of an argument or a field: ``Annotated[np.ndarray, Shaped("R 3")]``.
+
+    Attributes:
+        shape: its axes, numbers or names of sizes that the arguments of one call share; ``...`` first for any number of them.
+        dtype, finite, least: as for :func:`check_array`.
+    """
+
+    shape: str
+    dtype: type[np.generic] = np.float64
+    finite: bool = True
+    least: float | None = None
+
+    def __call__(self, name: str, value: ArrayLike, sizes: dict[str, int]) -> np.ndarray:
+        """``value`` as such an array; its sizes go into ``sizes``, where those of arguments before it stand."""
+        axes = self.shape.split()
+        wanted = tuple(
+            ... if axis == "..." else int(axis) if axis.isdigit() else sizes.get(axis) for axis in axes
+        )
+        array = check_array(name, value, wanted, self.dtype, self.finite, self.least)
+        sizes.update(zip(reversed(axes), reversed(array.shape), strict=False))
+        return array
+
+
+def within(least: float = -np.inf, most: float = np.inf) -> Callable[[str, object], float]:
+    """In an annotation: a finite number from ``least`` to ``most``; see :func:`checked`."""
+    return functools.partial(check_number, least=least, most=most)
+
+
+def whole(least: int = 1, most: int = 2**31 - 1) -> Callable[[str, object], int]:
+    """In an annotation: a whole number from ``least`` to ``most``."""
+    return functools.partial(check_count, least=least, most=most)
+
+
+def positive(what: str = "number") -> Callable[[str, object], float]:
+    """In an annotation: a finite number above zero; ``what`` says of what kind it is."""
+    return functools.partial(check_positive, what=what)
+
+
+def one_of(*allowed: object) -> Callable[[str, Any], Any]:
+    """In an annotation: one of those ``allowed``."""
+    return functools.partial(check_choice, allowed=allowed)
+
+
+Count: TypeAlias = Annotated[int, whole()]
+Seed: TypeAlias = Annotated[int, whole(0, 2**63 - 1)]
+Positive: TypeAlias = Annotated[float, positive()]
+NotNegative: TypeAlias = Annotated[float, within(0.0)]
+
 Public = TypeVar("Public", bound=Callable[..., Any])
 
 
@@ -311,10 +388,13 @@ def checked(public: Public) -> Public:
     """A function, or a class with its public methods, whose arguments come as their annotations say.
 
     Numbers of other kinds become Python's, arrays of other kinds (Warp's, torch's, lists, Python objects) NumPy's. What
-    a sequence or a mapping holds is not looked at, and values are checked by the function itself.
+    is ``Annotated`` is what stands behind its type too: functions of name and value that return what is to be taken
+    (:func:`within`, :func:`whole`, :func:`one_of`, ...), or :class:`Shaped`. What a sequence or a mapping holds is not looked
+    at, and other values are checked by the function itself. Defaults are taken as they are.
 
     Raises:
         TypeError: when called with something else, naming the argument.
+        ValueError: for a value that its annotation does not allow, likewise.
     """
     if not isinstance(public, type):
         return _checked_call(public, public)  # type: ignore[return-value]
@@ -332,19 +412,29 @@ def _checked_call(function: Callable[..., Any], annotated: Any) -> Callable[...,
     names = tuple(parameters)
 
     @functools.cache
-    def converters() -> dict[str, Callable[[Any], object]]:
+    def kinds() -> dict[str, Any]:
         """By argument, when first called: annotations name what modules import last."""
-        kinds = typing.get_type_hints(annotated)
+        found = typing.get_type_hints(annotated, include_extras=True)
         for one in parameters.values():
-            if one.kind is one.VAR_KEYWORD and typing.get_origin(kinds[one.name]) is typing.Unpack:
-                kinds |= typing.get_type_hints(typing.get_args(kinds[one.name])[0])
-        return {name: _converter(kind) for name, kind in kinds.items()}
+            if one.kind is one.VAR_KEYWORD and typing.get_origin(found[one.name]) is typing.Unpack:
+                found |= typing.get_type_hints(typing.get_args(found[one.name])[0], include_extras=True)
+        return found
+
+    @functools.cache
+    def converters() -> dict[str, Callable[[Any], object]]:
+        return {name: _converter(kind, name) for name, kind in kinds().items()}
+
+    @functools.cache
+    def shapes() -> dict[str, Shaped]:
+        """Of arrays, in the order of the arguments, which share sizes."""
+        found = {name: _shape_of(kinds().get(name)) for name in names}
+        return {name: shape for name, shape in found.items() if shape is not None}
 
     def refused(name: str, value: object) -> object:
         if name in parameters and value is parameters[name].default:
             return value
-        expected = function.__annotations__.get(name, "another type")
-        raise TypeError(f"{name}: got {_described(value)}, expected {expected}")
+        text = function.__annotations__.get(name, "another type")
+        raise TypeError(f"{name}: got {_described(value)}, expected {_written(kinds()[name], text)}")
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -356,9 +446,33 @@ def _checked_call(function: Callable[..., Any], annotated: Any) -> Callable[...,
         for name, value in kwargs.items():
             if name in known and (found := known[name](value)) is not value:
                 kwargs[name] = refused(name, value) if found is _OTHER else found
+        sizes: dict[str, int] = {}
+        for name, shape in shapes().items():
+            at = names.index(name)
+            if at < len(given) and given[at] is not None:
+                given[at] = shape(name, given[at], sizes)
+            elif kwargs.get(name) is not None:
+                kwargs[name] = shape(name, kwargs[name], sizes)
         return function(*given, **kwargs)
 
     return call
+
+
+def _shape_of(kind: Any) -> Shaped | None:
+    """What an annotation, or one of those that it may be, says of an array."""
+    if typing.get_origin(kind) is Annotated:
+        return next((one for one in typing.get_args(kind) if isinstance(one, Shaped)), None)
+    return next(filter(None, map(_shape_of, typing.get_args(kind))), None)
+
+
+def _written(kind: Any, text: str) -> str:
+    """An annotation as it is written, ``text``; of one with checks the types alone."""
+    inside = typing.get_args(kind)
+    if typing.get_origin(kind) is Annotated:
+        return _written(inside[0], inspect.formatannotation(inside[0]).replace("numpy.", "np."))
+    if any(typing.get_origin(one) is Annotated for one in inside):
+        return " | ".join(_written(one, inspect.formatannotation(one)) for one in inside)
+    return "None" if kind is types.NoneType else text
 
 
 _OTHER = object()  # what does not fit its annotation
@@ -371,15 +485,18 @@ def _described(value: object) -> str:
 
 
 @functools.cache
-def _converter(kind: Any) -> Callable[[Any], object]:
-    """What turns a value into one of the annotation ``kind``, or into :data:`_OTHER`."""
+def _converter(kind: Any, name: str) -> Callable[[Any], object]:
+    """What turns a value into one of the annotation ``kind`` of the argument ``name``, or into :data:`_OTHER`."""
     origin, inside = typing.get_origin(kind) or kind, typing.get_args(kind)
+    if origin is Annotated:
+        checks = tuple(one for one in inside[1:] if not isinstance(one, Shaped))
+        return functools.partial(_as_allowed, name, _converter(inside[0], name), checks)
     if origin in (typing.Union, types.UnionType):
         if bytes in inside:  # ArrayLike, whose numbers are arrays too
             inside = tuple(one for one in inside if one not in _NUMBERS and one not in (bool, str, bytes))
         # What need not become an array comes before what must, None, which is rarely given, last.
         order = sorted(inside, key=lambda one: (one is types.NoneType, _is_of_numpy(one)))
-        every = [_converter(one) for one in order]
+        every = [_converter(one, name) for one in order]
         return functools.partial(_as_one_of, every)
     if kind is bool:
         return _as_bool
@@ -398,6 +515,15 @@ def _converter(kind: Any) -> Callable[[Any], object]:
         known = getattr(origin, "_is_runtime_protocol", False)
         return lambda value: value if not known or isinstance(value, origin) else _OTHER
     return functools.partial(_as_object, origin)
+
+
+def _as_allowed(
+    name: str, convert: Callable[[Any], object], checks: Sequence[Callable[[str, Any], Any]], value: object
+) -> object:
+    found = convert(value)
+    for check in checks:
+        found = found if found is _OTHER else check(name, found)
+    return found
 
 
 def _as_one_of(every: list[Callable[[Any], object]], value: object) -> object:

@@ -28,6 +28,7 @@ from itertools import pairwise
 from types import ModuleType
 from typing import Any, TypeAlias
 
+import numpy as np
 import warp as wp
 
 from warprrf.cache import loading, once
@@ -44,6 +45,15 @@ Progress = Callable[[str, int, int], None]
 Stages come one after the other. ``done`` never falls within one, and starts above zero where an earlier run's work is
 kept; the last call of a stage has ``done == total``. What shows it makes seconds of it with :class:`TimeLeft`.
 """
+
+
+def with_progress(items: Sequence[Any] | np.ndarray, stage: str, progress: Progress | None) -> Iterator[Any]:
+    """``items`` one after another; ``progress`` is called once each is done with."""
+    for done, item in enumerate(items, 1):
+        yield item
+        if progress is not None:
+            progress(stage, done, len(items))
+
 
 RECENT_S = 15.0  # the rate is that of so many seconds
 
@@ -171,7 +181,8 @@ def launch(
 ) -> None:
     """Launch ``kernel`` over ``dim`` indices; on a CPU the range is split over all cores.
 
-    The kernel's first argument is ``offset: int`` and is supplied here; ``inputs`` are the others, in order.
+    The kernel's first argument is ``offset: int`` and is supplied here; ``inputs`` are the others, in order. NumPy's arrays
+    are copied to the device, as what the kernel takes.
     A CPU launch is cut into 4 equal parts a thread, of ``grain`` indices at least: few where one index is much work.
     ``pieces`` fixes how many parts and ``cuts`` where, for kernels that own one buffer a part. ``adjoint`` runs the
     kernel's adjoint on the arrays' ``.grad``.
@@ -190,7 +201,11 @@ def launch(
         elif threads() > 1:
             count = min(PIECES_PER_THREAD * threads(), max(1, dim // grain))
         bounds = [dim * k // count for k in range(count + 1)]
-    arguments = [bounds[0], *inputs]
+    kinds = (argument.type for argument in kernel.adj.args[1:])
+    arguments = [
+        bounds[0],
+        *(_as_taken(value, kind, where) for value, kind in zip(inputs, kinds, strict=True)),
+    ]
     with loading:
         load_module(kernel.module, where, block_dim=256 if where.is_cuda else 1)
     extra = {"adjoint": True, "adj_inputs": [None] * len(arguments)} if adjoint else {}
@@ -203,6 +218,21 @@ def launch(
         kernel, dim=size, inputs=arguments, device=where, record_tape=False, record_cmd=True, **extra
     )
     _issue(_cut(whole, bounds))
+
+
+def filled(struct: Any, device: DeviceLike, **values: Any) -> Any:
+    """A structure of a kernel, ``struct``, with ``values`` by name; NumPy's arrays are copied to ``device``."""
+    where, result = resolve(device), struct()
+    for name, value in values.items():
+        setattr(result, name, _as_taken(value, struct.vars[name].type, where))
+    return result
+
+
+def _as_taken(value: Any, kind: Any, device: wp.Device) -> Any:
+    """``value`` as an argument of the type ``kind``."""
+    if isinstance(value, np.ndarray) and isinstance(kind, wp.array):
+        return wp.array(value, dtype=kind.dtype, device=device)
+    return value
 
 
 def _cut(whole: wp.Launch, bounds: Sequence[int]) -> list[wp.Launch]:

@@ -63,6 +63,29 @@ def write_atomically(
 
 
 @contextmanager
+def folder_in_place(folder: Path) -> Iterator[Path]:
+    """A new folder to fill, which then takes the place of ``folder``: a kill or an error leaves the earlier one or the new one.
+
+    Raises:
+        OSError: if the system does not take it.
+    """
+    part = partial_path(folder)
+    # no partial file: the only one, if this is killed just then
+    earlier = part.with_name(f"{part.name}.earlier.kept")
+    try:
+        part.mkdir()
+        yield part
+        if folder.exists():
+            folder.rename(earlier)  # a folder cannot be renamed over one that holds something
+        part.rename(folder)
+    finally:
+        if earlier.exists() and not folder.exists():
+            earlier.rename(folder)
+        for rest in (part, earlier):
+            shutil.rmtree(rest, ignore_errors=True)
+
+
+@contextmanager
 def naming(path: str | os.PathLike[str], partial: Path) -> Iterator[None]:
     """What the system refuses of ``partial`` is said of ``path``."""
     try:

@@ -23,6 +23,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from warprrf.checks import Expected, check_arrays
 from warprrf.device import require
 from warprrf.files import MOST_INFLATED, check_seal, end_with_seal, naming, partial_path, write_bytes
 
@@ -45,6 +46,10 @@ class Variable:
         about: more attributes of it.
         packed: compress it, and do so in chunks of whole rows.
         optional: files may lack it.
+        field: name of what it holds, if another; see :func:`encoded`. One of another number of axes is not held.
+        codes: what the values 0, 1, ... stand for, if for anything.
+        is_part: it holds the real part of its field, or the imaginary one, as its own name's end says.
+        expected: limits of its values in a file.
     """
 
     dimensions: tuple[str, ...]
@@ -52,6 +57,10 @@ class Variable:
     about: Mapping[str, Any] = field(default_factory=dict)
     packed: bool = False
     optional: bool = False
+    field: str = ""
+    codes: tuple[Any, ...] = ()
+    is_part: bool = False
+    expected: Expected | None = None
 
 
 @dataclass(frozen=True)
@@ -75,6 +84,45 @@ class Room:
 
     shape: tuple[int, ...]
     dtype: Any
+
+
+def encoded(fields: Mapping[str, Any], variables: Mapping[str, Variable]) -> dict[str, np.ndarray]:
+    """The arrays of ``variables`` that hold ``fields``, by name, those that are None apart."""
+    arrays = dict[str, np.ndarray]()
+    for name, it in variables.items():
+        value = fields.get(it.field or name)
+        if value is None or np.ndim(value) != len(it.dimensions):
+            continue
+        if it.codes:
+            value = np.asarray(sum(k * (value == meant) for k, meant in enumerate(it.codes)), np.int8)
+        arrays[name] = getattr(value, name.rpartition("_")[2]) if it.is_part else np.asarray(value)
+    return arrays
+
+
+def decoded(arrays: Mapping[str, np.ndarray], variables: Mapping[str, Variable]) -> dict[str, Any]:
+    """The fields that ``arrays`` of ``variables`` hold, by name.
+
+    Raises:
+        KeyError: for one part of a field without the other.
+        TypeError, ValueError: naming the array, for values that it cannot have.
+    """
+    limits = {name: it.expected for name, it in variables.items() if name in arrays}
+    check_arrays(arrays, {name: expected for name, expected in limits.items() if expected is not None})
+    fields = dict[str, Any]()
+    for name, array in arrays.items():
+        it = variables[name]
+        key = it.field or name
+        if it.is_part:
+            array = arrays[f"{key}_real"] + 1j * arrays[f"{key}_imag"]
+        if it.codes:
+            unknown = array[~np.isin(array, range(len(it.codes)))]
+            if unknown.size:
+                raise ValueError(
+                    f"{name}: got {unknown[0]}, expected whole numbers from 0 to {len(it.codes) - 1}"
+                )
+            array = np.array(it.codes)[array.astype(int)]
+        fields[key] = array
+    return fields
 
 
 XYZ = Axis(lambda _: np.array(["x", "y", "z"]))
@@ -361,9 +409,13 @@ class _FirstFailure(io.FileIO):
 
 
 def read(
-    path: str | os.PathLike[str], variables: Mapping[str, Variable], axes: Mapping[str, Axis]
+    path: str | os.PathLike[str],
+    variables: Mapping[str, Variable],
+    axes: Mapping[str, Axis],
+    kind: str | None = None,
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Those of ``variables`` that the file holds, in the order of their dimensions and of ``axes``, and its attributes.
+    """Those of ``variables`` that the file holds, in the order of their dimensions and of ``axes``, and its attributes, among
+    them a ``format`` of ``kind``.
 
     Raises:
         OSError: naming ``path``, if it cannot be read.
@@ -383,6 +435,8 @@ def read(
             attributes = {n: _plain(value) for n, value in file.attrs.items()}
     except Exception as error:  # of a damaged file h5netcdf and h5py raise anything
         raise ValueError(f"{name}: damaged, or no NetCDF-4 file: {error}") from error
+    if kind is not None and attributes.get("format") != kind:
+        raise ValueError(f"{name}: holds {attributes.get('format')!r}, expected {kind!r}")
     if lacking := sorted(n for n, it in variables.items() if n not in found and not it.optional):
         raise ValueError(f"{name}: lacks {', '.join(lacking)}, expected a file saved by warprrf")
     try:

@@ -14,7 +14,6 @@ the same number of solids; in a court, under a bridge or below a canopy some of 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -22,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_positive, checked, users_level
+from warprrf.checks import Positive, check_array, checked, warn
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -101,7 +100,7 @@ def quotients(answers: Any, step_m: float) -> np.ndarray:
 
 @checked
 def retraced_slope(
-    answer: Callable[[np.ndarray], Any], points: ArrayLike, *, step_m: float = 0.01
+    answer: Callable[[np.ndarray], Any], points: ArrayLike, *, step_m: Positive = 0.01
 ) -> np.ndarray:
     """Slopes of what is traced anew on either side of each place: central differences.
 
@@ -125,15 +124,15 @@ def retraced_slope(
 
         wr.paths.retraced_slope(total_db, [3.0, 2.0, 1.5])  # [dB/m], shape (3,)
     """
-    at, step = check_receivers("points", points), check_positive("step_m", step_m)
-    places = beside(at, step).reshape(-1, 3)
+    at = check_receivers("points", points)
+    places = beside(at, step_m).reshape(-1, 3)
     found = np.asarray(answer(places))
     if found.ndim == 0 or len(found) != len(places):
         raise ValueError(
             f"answer: got shape {found.shape} for {len(places)} positions, expected a row for each"
         )
     found = found.reshape(*at.shape[:-1], 6, *found.shape[1:])
-    return quotients(np.moveaxis(found, at.ndim - 1, 0), step)
+    return quotients(np.moveaxis(found, at.ndim - 1, 0), step_m)
 
 
 def check_positions(
@@ -294,11 +293,9 @@ def question_unit(mesh: Mesh, wavelength_m: float) -> None:
     elif largest <= min(20e3, 5e6 * wavelength_m) and extent.min() <= 1e3:
         return
     size = " x ".join(f"{e:.4g}" for e in extent)
-    warnings.warn(
+    warn(
         f"mesh: it is {size} m large ({largest / wavelength_m:.2g} wavelengths); coordinates look like {unit}, expected "
-        f"metres: Mesh({metres} * vertices, faces)",
-        UserWarning,
-        stacklevel=3,
+        f"metres: Mesh({metres} * vertices, faces)"
     )
 
 
@@ -364,11 +361,9 @@ def warn_of_unmodelled(
     if not reasons or not lacking:
         return
     what = f"{' and '.join(lacking)} {'are' if len(lacking) > 1 else 'is'}"
-    warnings.warn(
+    warn(
         f"{frequency_hz / 1e9:g} GHz: {what} not modelled, which matters {' and '.join(reasons)}: receivers without line "
-        "of sight may get more power than is found here; warprrf.relevance estimates how much",
-        UserWarning,
-        stacklevel=users_level(),
+        "of sight may get more power than is found here; warprrf.relevance estimates how much"
     )
 
 
@@ -389,11 +384,7 @@ def _check_apart(points: np.ndarray, wavelength_m: float, labels: list[str]) -> 
             f"{what}, within its reactive near field, where path gain has no meaning (it would exceed one); expected "
             f"more than {NEAR_FIELD * wavelength_m:.3g} m, better {far_field * wavelength_m:.3g} m"
         )
-    warnings.warn(
-        f"{what}; within a wavelength ({wavelength_m:.3g} m) path gain by Friis's formula is a rough guide",
-        UserWarning,
-        stacklevel=4,
-    )
+    warn(f"{what}; within a wavelength ({wavelength_m:.3g} m) path gain by Friis's formula is a rough guide")
 
 
 def _refuse(bad: np.ndarray, what: str, points: np.ndarray, labels: list[str], mesh: Mesh) -> None:

@@ -10,23 +10,22 @@ import os
 from collections.abc import Mapping, Sequence
 from copy import copy
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_arrays, check_number, check_type, checked, index_to
+from warprrf.checks import NotNegative, check_array, check_arrays, check_items, check_type, checked, index_to
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import MeshOptions, is_mesh_file
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.materials import Material
+from warprrf.rf.em.waves import Hertz
 from warprrf.rf.positions import is_free
 from warprrf.rf.scene_parts import MaterialChoice, Materials, ScenePart, read_mesh_scene
 from warprrf.rf.scene_sionna import parts_of, to_sionna_scene
 from warprrf.rf.scene_xml import read_scene_xml
-
-T = TypeVar("T")
 
 
 @checked
@@ -61,10 +60,10 @@ class Scene:
         if face_object is None:
             face_object = np.zeros(faces, dtype=np.int32)
         self.mesh = mesh
-        self.materials = _named_list("materials", materials, Material)
+        self.materials = check_items("materials", materials, Material)
         self.face_material = check_array("face_material", face_material, (faces,), dtype=np.int32)
         self.face_object = check_array("face_object", face_object, (faces,), dtype=np.int32)
-        self.object_names = _named_list("object_names", object_names, str)
+        self.object_names = check_items("object_names", object_names, str)
         self.xml_path = None if xml_path is None else Path(xml_path)
         self.transmitters = _positions("transmitters", transmitters)
         self.receivers = _positions("receivers", receivers)
@@ -191,7 +190,7 @@ class Scene:
             **options,
         )
 
-    def to_sionna(self, *, frequency_hz: float = 3.5e9) -> Any:
+    def to_sionna(self, *, frequency_hz: Hertz = 3.5e9) -> Any:
         """The scene as a ``sionna.rt.Scene``, with scattering patterns, transmitters, receivers and their antennas.
 
         Objects keep their names (with ``_`` for ``.``) and are not merged; one of several materials becomes one object
@@ -232,7 +231,7 @@ class Scene:
         Raises:
             ValueError: if there are not as many.
         """
-        materials = _named_list("materials", materials, Material)
+        materials = check_items("materials", materials, Material)
         if len(materials) != len(self.materials):
             raise ValueError(f"materials: got {len(materials)}, expected {len(self.materials)}, one for each")
         other = copy(self)
@@ -245,7 +244,7 @@ class Scene:
         return self.mesh.bounds
 
     def is_free(
-        self, points: ArrayLike, *, clearance_m: float = 0.0, device: DeviceLike = None
+        self, points: ArrayLike, *, clearance_m: NotNegative = 0.0, device: DeviceLike = None
     ) -> np.ndarray:
         """Whether points lie in the air of a room or a city, shape ``(N,)``, bool.
 
@@ -253,7 +252,6 @@ class Scene:
         besides.
         """
         points = check_array("points", points, (None, 3))
-        check_number("clearance_m", clearance_m, 0.0)
         return is_free(self.mesh, points, clearance_m=clearance_m, device=device)
 
 
@@ -264,10 +262,3 @@ def _positions(name: str, values: Mapping[str, ArrayLike] | None) -> dict[str, n
         check_type(f"{name}: the name {key!r}", key, str)
         found[key] = check_array(f"{name}[{key!r}]", position, (3,))
     return found
-
-
-def _named_list(name: str, values: Sequence[T], kind: type[T]) -> list[T]:
-    """``values`` as a list whose items are all of ``kind``."""
-    for k, value in enumerate(values):
-        check_type(f"{name}[{k}]", value, kind)
-    return list(values)

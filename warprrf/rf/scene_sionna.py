@@ -13,7 +13,6 @@ from __future__ import annotations
 import glob
 import os
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,11 +22,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from warprrf.checks import checked, users_level
+from warprrf.checks import checked, warn
 from warprrf.device import require
 from warprrf.rf.channel.arrays import PlanarArray
-from warprrf.rf.em.materials import Band, Material, itu_material
-from warprrf.rf.em.waves import check_frequency
+from warprrf.rf.em.materials import Band, Material, itu_material, radio_values
 from warprrf.rf.scene_parts import MaterialChoice, ScenePart
 from warprrf.rf.spectra.antenna import PATTERNS, SLANTS_RAD, Antenna, as_antenna
 from warprrf.rf.spectra.spectrum import directions_from_angles, pixel_directions
@@ -37,8 +35,6 @@ _FOLDERS = (
 )  # fmt: skip
 
 Positions = dict[str, np.ndarray]
-GRID = 361, 721
-"""Zeniths and azimuths, half a degree apart, at which an antenna's fields are handed to Sionna RT."""
 
 
 def parts_of(rt_scene: Any, choice: MaterialChoice) -> tuple[list[ScenePart], dict[str, Any]]:
@@ -77,9 +73,7 @@ def parts_of(rt_scene: Any, choice: MaterialChoice) -> tuple[list[ScenePart], di
                 own = array_from_sionna(array)
             except ValueError as error:
                 text = str(error).removeprefix("rt_array: ")
-                warnings.warn(
-                    f"rt_scene.{common}: {text}; it is left out", UserWarning, stacklevel=users_level()
-                )
+                warn(f"rt_scene.{common}: {text}; it is left out")
                 continue
             devices["antennas"] |= {
                 str(name): replace(own, orientation=_shortest(np.array(device.orientation)))
@@ -204,7 +198,6 @@ def to_sionna_scene(
     frequency_hz: float,
 ) -> Any:
     """A ``sionna.rt.Scene`` of these objects, devices and antennas; see :meth:`Scene.to_sionna`."""
-    frequency = check_frequency(frequency_hz)
     rt = sionna_rt()
     mi = select_variant()
     taken = {*transmitters, *receivers}  # Sionna's objects, materials and devices share one set of names
@@ -218,7 +211,7 @@ def to_sionna_scene(
     names = [free(part.name.replace(".", "_"), "_") for part in parts]  # Mitsuba parts its paths by dots
     materials = {id(part.material): part.material for part in parts}
     radio = {
-        key: _radio_material(rt, one, free(one.name, "-material"), frequency)
+        key: _radio_material(rt, one, free(one.name, "-material"), frequency_hz)
         for key, one in materials.items()
     }
     shapes: dict[str, Any] = {"type": "scene"}
@@ -234,7 +227,7 @@ def to_sionna_scene(
         mesh.set_bsdf(radio[id(part.material)])
         shapes[name] = mesh
     scene = rt.Scene(mi.load_dict(shapes, optimize=False))
-    scene.frequency = frequency
+    scene.frequency = frequency_hz
     for key, material in materials.items():  # not before: a new scene has Sionna's default frequency
         _follow_frequency(radio[key], material)
     ends = (rt.Transmitter, transmitters, "tx_array"), (rt.Receiver, receivers, "rx_array")
@@ -258,7 +251,7 @@ def _common_array(rt: Any, arrays: Sequence[PlanarArray], common: str) -> Any:
         why = "got antennas that differ in more than their orientation, and Sionna RT has one array for all"
     else:
         return rt.AntennaArray(_sionna_pattern(rt, plain[0]), _unturned(arrays[0]).T.tolist())
-    warnings.warn(f"antennas: {why}; {common} is left to be set", UserWarning, stacklevel=users_level())
+    warn(f"antennas: {why}; {common} is left to be set")
     return None
 
 
@@ -274,9 +267,10 @@ def _told_apart(array: PlanarArray, element: Antenna) -> bytes:
 
 
 def _sionna_pattern(rt: Any, antenna: Antenna) -> Any:
-    """A ``sionna.rt.AntennaPattern`` of an antenna: its fields on a grid of :data:`GRID`, between which they are interpolated."""
+    """A ``sionna.rt.AntennaPattern`` of an antenna: its fields at zeniths and azimuths half a degree apart, between which they
+    are interpolated."""
     mi, dr = select_variant(), require("drjit", extra="sionna")
-    rows, columns = GRID
+    rows, columns = 361, 721
     zenith, azimuth = np.linspace(0.0, np.pi, rows), np.linspace(-np.pi, np.pi, columns)
     fields = antenna.field(directions_from_angles(*np.meshgrid(zenith, azimuth, indexing="ij")))
 
@@ -328,14 +322,7 @@ def _radio_material(rt: Any, material: Material, name: str, frequency: float) ->
             f"material {material.name!r}: it scatters reciprocally, Sionna RT's patterns do not; set reciprocal=False to "
             'take its lobe of the same width, or use engine="exact"'
         )
-    radio = rt.RadioMaterial(
-        name,
-        thickness=float(material.thickness_m),
-        relative_permittivity=material.relative_permittivity(frequency),
-        conductivity=material.conductivity(frequency),
-        scattering_coefficient=material.scattering_coefficient(frequency),
-        xpd_coefficient=float(material.xpd),
-    )
+    radio = rt.RadioMaterial(name, **radio_values(material, frequency))
     radio.scattering_pattern = (
         rt.DirectivePattern(alpha_r=int(material.alpha_r)) if directive else rt.LambertianPattern()
     )

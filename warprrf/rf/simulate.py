@@ -7,26 +7,19 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from warprrf.cache import Cache, making
-from warprrf.checks import (
-    check_array,
-    check_choice,
-    check_count,
-    check_number,
-    check_seed,
-    checked,
-)
+from warprrf.checks import NotNegative, Seed, check_array, check_count, checked, one_of
 from warprrf.cluster import each
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import as_mesh
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.fresnel import surface_table
-from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, Hertz
 from warprrf.rf.exact import REVISION, SINGLE, SUB_PIXELS, ExactEngine
 from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
 from warprrf.rf.positions import (
@@ -38,7 +31,7 @@ from warprrf.rf.positions import (
 )
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import Received, SpectrumDataset
-from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, DEFAULT_SHAPE, check_beam, check_shape
+from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, DEFAULT_SHAPE, Beam, GridShape
 from warprrf.rf.tracing.model import Effects
 from warprrf.steps import Steps, digest
 
@@ -49,13 +42,13 @@ def simulate(
     *,
     transmitter: ArrayLike,
     receivers: ArrayLike,
-    frequency_hz: float,
-    shape: tuple[int, int] = DEFAULT_SHAPE,
-    engine: str = "exact",
+    frequency_hz: Hertz,
+    shape: GridShape = DEFAULT_SHAPE,
+    engine: Annotated[str, one_of("exact", "sionna")] = "exact",
     effects: Effects = SINGLE,
     depth: int = 3,
     samples: int = 1_000_000,
-    beam_sigma_rad: float = BEAM_SIGMA_RAD,
+    beam_sigma_rad: Beam = BEAM_SIGMA_RAD,
     refraction: bool = False,
     seed: int = 0,
     gas: Gas = False,
@@ -104,14 +97,12 @@ def simulate(
     """
     if not hasattr(scene, "materials"):
         raise TypeError(f"scene: got {type(scene).__name__}, expected a Scene (a mesh and its materials)")
-    check_choice("engine", engine, ("exact", "sionna"))
     sampling = Sampling(depth=depth, samples=samples, refraction=refraction, seed=seed)
     points = np.atleast_2d(check_receivers("receivers", receivers))
     source = check_array("transmitter", transmitter, (3,))
-    frequency = check_frequency(frequency_hz)
-    table = surface_table(scene.materials, frequency)
-    air = air_of(gas, frequency)
-    mesh, wavelength_m = as_mesh(scene, "scene"), SPEED_OF_LIGHT / frequency
+    table = surface_table(scene.materials, frequency_hz)
+    air = air_of(gas, frequency_hz)
+    mesh, wavelength_m = as_mesh(scene, "scene"), SPEED_OF_LIGHT / frequency_hz
     question_unit(mesh, wavelength_m)
     check_positions(mesh, source, points, wavelength_m, device=device)
     exact = engine == "exact"
@@ -119,10 +110,10 @@ def simulate(
         "transmission": effects.transmissions > 0 if exact else refraction,
         "diffraction": exact and effects.diffractions > 0,
     }
-    warn_of_unmodelled(mesh, source, points, frequency_hz=frequency, device=device, **modelled)
+    warn_of_unmodelled(mesh, source, points, frequency_hz=frequency_hz, device=device, **modelled)
 
-    common: dict[str, Any] = {"transmitter": source, "frequency_hz": frequency}
-    common |= {"shape": check_shape(shape), "beam_sigma_rad": check_beam(beam_sigma_rad)}
+    common: dict[str, Any] = {"transmitter": source, "frequency_hz": frequency_hz}
+    common |= {"shape": shape, "beam_sigma_rad": beam_sigma_rad}
     surfaces = (scene.mesh.vertices, scene.mesh.faces, scene.face_material, *vars(table).values())
     solver: Any = sampling, _versions(engine, solver_only=True)
     settings = {"depth": depth, "samples": samples, "refraction": int(refraction)}
@@ -146,7 +137,7 @@ def simulate(
     return SpectrumDataset.from_spectra(
         receivers=points,
         transmitter=source,
-        frequency_hz=frequency,
+        frequency_hz=frequency_hz,
         beam_sigma_rad=beam_sigma_rad,
         engine=engine,
         seed=seed,
@@ -165,9 +156,9 @@ def sample_receivers(
     n: int,
     *,
     z: ArrayLike = (0.8, 2.2),
-    clearance: float = 0.3,
+    clearance: NotNegative = 0.3,
     above_ground: bool = False,
-    seed: int,
+    seed: Seed,
     device: DeviceLike = None,
 ) -> np.ndarray:
     """``n`` places drawn uniformly from the scene's air, shape ``(n, 3)`` [m]; a longer draw starts with a shorter one.
@@ -186,7 +177,6 @@ def sample_receivers(
     # none worth the name.
     batch, most = 1000, 200_000
     check_count("n", n, most=most)
-    check_number("clearance", clearance, 0.0)
     z = check_array("z", z, (2,))
     if z[0] > z[1]:
         raise ValueError(f"z: got {z.tolist()}, expected the lowest and the highest place")
@@ -195,7 +185,7 @@ def sample_receivers(
     low[2], high[2] = z if above_ground else (max(low[2], z[0]), min(high[2], z[1]))
     if low[2] > high[2]:
         raise ValueError(f"z: got {z.tolist()}, but the scene lies at {mesh.bounds[:, 2].tolist()}")
-    rng = np.random.default_rng(check_seed(seed))
+    rng = np.random.default_rng(seed)
     found: list[np.ndarray] = []
     count = 0
     for _ in range(most // batch):

@@ -14,13 +14,13 @@ import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from warprrf.checks import check_array, check_choice, check_number, check_positive, check_type, checked
+from warprrf.checks import NotNegative, Positive, check_array, check_type, checked, one_of
 from warprrf.device import require
 from warprrf.rf.channel.arrays import PlanarArray, check_unpolarised
 from warprrf.rf.em.absorption import Air
@@ -59,19 +59,17 @@ class ArraySpectra(PowerTable):
 
     array: PlanarArray
     directions: np.ndarray
-    floor: float = 0.01
+    floor: Positive = 0.01
     relative: bool = True
-    length_std_m: float = 0.0
+    length_std_m: NotNegative = 0.0
     air: Air | None = None
     name: str = "array spectra"
 
     def __post_init__(self) -> None:
         directions = check_steering(self.array, self.directions)
         fields = self._checked(*directions.shape[:-1])
-        floor = check_positive("floor", self.floor)
-        if not (fields["power"] > floor).any():
-            raise ValueError(f"power: got no value above the floor of {floor:g}")
-        check_number("length_std_m", self.length_std_m, 0.0)
+        if not (fields["power"] > self.floor).any():
+            raise ValueError(f"power: got no value above the floor of {self.floor:g}")
         for name, value in (fields | {"directions": directions}).items():
             object.__setattr__(self, name, value)
 
@@ -88,7 +86,7 @@ class ArraySpectra(PowerTable):
         path: str | os.PathLike[str],
         *,
         frequency_hz: float,
-        part: str | None = None,
+        part: Annotated[str | None, one_of(None, "train", "test")] = None,
         array: PlanarArray | None = None,
         **settings: Any,
     ) -> ArraySpectra:
@@ -112,7 +110,6 @@ class ArraySpectra(PowerTable):
             ImportError: without Pillow (extra ``mesh``).
         """
         folder = Path(path)
-        check_choice("part", part, (None, "train", "test"))
         needed = ["spectrum", "tx_pos.csv", "gateway_info.yml", *([f"{part}_index.txt"] if part else [])]
         for name in needed:
             if not (folder / name).exists():

@@ -13,15 +13,17 @@ then element by element.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Annotated, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.cache import cached_property
-from warprrf.checks import check_array, check_count, check_positive, checked
+from warprrf.checks import Count, check_array, checked, positive
 from warprrf.rf.spectra.antenna import Antenna, Pattern, as_antenna, check_rotation
 from warprrf.rf.spectra.spectrum import angles_from_directions, unit_vectors
+
+Metres: TypeAlias = Annotated[float, positive("number of metres")]
 
 
 @checked
@@ -42,16 +44,14 @@ class PlanarArray:
         TypeError, ValueError: naming the argument.
     """
 
-    rows: int
-    cols: int
+    rows: Count
+    cols: Count
     spacing: ArrayLike = 0.5
     orientation: ArrayLike = (0.0, 0.0, 0.0)
     pattern: Pattern = "isotropic"
     polarisation: str | None = None
 
     def __post_init__(self) -> None:
-        for name in ("rows", "cols"):
-            check_count(name, getattr(self, name))
         spacing = check_array("spacing", self.spacing)
         if spacing.shape not in ((), (2,)) or (spacing <= 0).any():
             raise ValueError(f"spacing: got {self.spacing!r}, expected one or two positive numbers")
@@ -77,10 +77,9 @@ class PlanarArray:
         """Rotation from local to world axes, shape ``(3, 3)``."""
         return check_rotation(self.orientation)
 
-    def positions(self, wavelength_m: float) -> np.ndarray:
+    def positions(self, wavelength_m: Metres) -> np.ndarray:
         """Elements about the array's centre in world axes [m], shape ``(N, 3)``; ``wavelength_m`` is the carrier's."""
-        wavelength = check_positive("wavelength_m", wavelength_m, "number of metres")
-        down, across = np.broadcast_to(np.asarray(self.spacing, dtype=np.float64), (2,)) * wavelength
+        down, across = np.broadcast_to(np.asarray(self.spacing, dtype=np.float64), (2,)) * wavelength_m
         column, row = np.divmod(np.arange(self.elements), self.rows)
         local = np.zeros((self.elements, 3))
         local[:, 1] = (column - 0.5 * (self.cols - 1)) * across
@@ -152,7 +151,7 @@ class PlaneWaveError:
 
 @checked
 def plane_wave_error(
-    array: PlanarArray, distance_m: float, wavelength_m: float, direction: ArrayLike = (1.0, 0.0, 0.0)
+    array: PlanarArray, distance_m: Metres, wavelength_m: Metres, direction: ArrayLike = (1.0, 0.0, 0.0)
 ) -> PlaneWaveError:
     """Error of the plane wave from a source ``distance_m`` away in world ``direction``.
 
@@ -162,8 +161,6 @@ def plane_wave_error(
     Raises:
         ValueError: for a distance or wavelength that is not positive.
     """
-    for name, value in (("distance_m", distance_m), ("wavelength_m", wavelength_m)):
-        check_positive(name, value, "number of metres")
     unit = unit_vectors("direction", direction, (3,))
     plane = array.response(unit, wavelength_m)
     true = array.spherical_response(distance_m * unit, wavelength_m)

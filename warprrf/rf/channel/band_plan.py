@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warprrf.checks import check_count, checked
+from warprrf.checks import Count, checked
 
 
 @checked
@@ -41,14 +41,13 @@ class ThzChannel:
         """Centre frequency [Hz]."""
         return 0.5 * (self.low_hz + self.high_hz)
 
-    def frequencies_hz(self, count: int) -> np.ndarray:
+    def frequencies_hz(self, count: Count) -> np.ndarray:
         """``count`` equally spaced frequencies [Hz], the middles of as many equal parts of the channel.
 
         Raises:
             ValueError: if ``count`` is not a whole number of at least 1.
         """
-        parts = check_count("count", count)
-        return self.low_hz + (np.arange(parts) + 0.5) * (self.bandwidth_hz / parts)
+        return self.low_hz + (np.arange(count) + 0.5) * (self.bandwidth_hz / count)
 
 
 def _plan() -> dict[int, ThzChannel]:

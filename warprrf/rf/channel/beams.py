@@ -20,11 +20,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Annotated, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count, check_positive, checked, one_line
+from warprrf.checks import Count, check_array, check_count, check_positive, checked, one_line, positive
 from warprrf.rf.channel.arrays import ISOTROPIC, End, PlanarArray, array_of, check_unpolarised
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.waves import carrier_phase
@@ -135,7 +136,7 @@ class Codebook:
 
 
 @checked
-def dft_codebook(array: PlanarArray, oversampling: int = 1) -> Codebook:
+def dft_codebook(array: PlanarArray, oversampling: Count = 1) -> Codebook:
     """Beams at equally spaced spatial frequencies, across and down the array; orthonormal without oversampling.
 
     Beam k of B along a side of n elements, B = ``oversampling`` n, looks along the cosine ((k + 1/2) / B - 1/2) /
@@ -146,8 +147,7 @@ def dft_codebook(array: PlanarArray, oversampling: int = 1) -> Codebook:
         ValueError: for a polarised array, or oversampling below 1.
     """
     check_unpolarised("array", array)
-    times = check_count("oversampling", oversampling)
-    return Codebook(array, (_dft(array.cols, times), _dft(array.rows, times)))
+    return Codebook(array, (_dft(array.cols, oversampling), _dft(array.rows, oversampling)))
 
 
 @checked
@@ -183,6 +183,7 @@ def steering_codebook(
 
 Source = PathArrays | Spectrum
 """Where predicted power comes from and how much: :class:`Paths` of one receiver or several, or a :class:`Spectrum`."""
+Noise: TypeAlias = Annotated[float, positive("share of the transmitted power")]
 Ends = End | Codebook
 """Beams of one end: those given, an array's DFT codebook, an antenna as it stands, or a single isotropic element."""
 
@@ -219,7 +220,7 @@ def beam_gains(source: Source, tx_array: Ends = None, rx_array: Ends = None) -> 
 
 @checked
 def select_beams(
-    source: Source, tx_array: Ends = None, rx_array: Ends = None, *, count: int = 1
+    source: Source, tx_array: Ends = None, rx_array: Ends = None, *, count: Count = 1
 ) -> BeamChoice:
     """The pairs of beams with the largest predicted mean gain: no pilot is sent.
 
@@ -239,12 +240,11 @@ def select_beams(
         ValueError: for a polarised array, a count below 1, or a spectrum without departure angles for a transmitting
             array.
     """
-    most = check_count("count", count)
     tx, rx = codebook_of("tx_array", tx_array), codebook_of("rx_array", rx_array)
     rows = []
     for rays in rays_of(source, tx):
         gains = _pair_gains(rays, tx, rx)
-        best = np.argsort(-gains, axis=None, kind="stable")[:most]
+        best = np.argsort(-gains, axis=None, kind="stable")[:count]
         rows.append((best % len(tx), best // len(tx), gains.ravel()[best]))
     if not (isinstance(source, PathArrays) and source.batched):
         return BeamChoice(*rows[0])
@@ -271,7 +271,7 @@ class MultiUserChoice:
 
 @checked
 def select_beams_multiuser(
-    sources: Source | Iterable[Source], tx_array: Ends = None, rx_array: Ends = None, *, noise: float
+    sources: Source | Iterable[Source], tx_array: Ends = None, rx_array: Ends = None, *, noise: Noise
 ) -> MultiUserChoice:
     """Beams for several users at once, so that the sum of their predicted rates is large.
 
@@ -287,7 +287,6 @@ def select_beams_multiuser(
     Raises:
         TypeError, ValueError: as for :func:`select_beams`; without users, or for noise that is not positive.
     """
-    check_positive("noise", noise, "share of the transmitted power")
     tx, rx = codebook_of("tx_array", tx_array), codebook_of("rx_array", rx_array)
     gains = [_pair_gains(rays, tx, rx) for rays in rays_of_users(sources, tx)]
     served = _search(gains, noise * len(gains))
@@ -298,7 +297,7 @@ def select_beams_multiuser(
 
 @checked
 def signal_over_interference(
-    gains: Sequence[ArrayLike], tx: ArrayLike, rx: ArrayLike, noise: float
+    gains: Sequence[ArrayLike], tx: ArrayLike, rx: ArrayLike, noise: Noise
 ) -> np.ndarray:
     """SINR of users [linear], shape ``(U,)``, power shared equally.
 
@@ -316,7 +315,6 @@ def signal_over_interference(
         fewest = min((table.shape[axis] for table in tables), default=0)
         if users and not -fewest <= index.min() <= index.max() < fewest:
             raise ValueError(f"{name}: got beams {index.min()} to {index.max()}, expected 0 to {fewest - 1}")
-    check_positive("noise", noise, "noise power")
     heard = np.array([table[r, transmitted] for table, r in zip(tables, received, strict=True)]).reshape(
         users, users
     )

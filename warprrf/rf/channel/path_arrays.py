@@ -14,12 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Self, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from warprrf.checks import check_array, check_chosen, check_count, check_type, checked, one_line
+from warprrf.checks import Shaped, check_chosen, check_count, check_items, checked, one_line
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 from warprrf.rf.spectra.spectrum import angles_from_directions, directions_from_angles
@@ -201,8 +201,7 @@ class PathArrays:
         change = 0.0 if air is None else air.attenuation_db_per_m(carrier)
         change -= 0.0 if self.air is None else self.air.attenuation_db_per_m(carrier)
         loss = 10.0 ** (-change * np.nan_to_num(self.length_m) / 20.0)
-        jones = None if self.jones is None else self.jones * loss[..., None, None]
-        return replace(self, gain=self.gain * loss, jones=jones, air=air)
+        return replace(turned(self, loss), air=air)
 
     @property
     def carrier_hz(self) -> float:
@@ -227,46 +226,32 @@ class PathArrays:
     @classmethod
     def from_points(
         cls,
-        transmitter: np.ndarray,
-        receiver: np.ndarray,
-        vertices: np.ndarray,
-        amplitude: np.ndarray,
+        transmitter: Annotated[np.ndarray, Shaped("3")],
+        receiver: Annotated[np.ndarray, Shaped("3")],
+        vertices: Annotated[np.ndarray, Shaped("L D 3", finite=False)],
+        amplitude: Annotated[np.ndarray, Shaped("L", np.complex128)],
         kind: NDArray[np.str_],
         frequency_hz: float,
+        *,
+        jones: Annotated[np.ndarray, Shaped("L 2 2", np.complex128, finite=False)] | None = None,
+        excess_m: Annotated[np.ndarray, Shaped("L")] | None = None,
+        interactions: np.ndarray | None = None,
     ) -> Self:
         """Paths of one receiver from their interaction points ``(L, depth, 3)``, NaN past the last.
 
         Args:
             amplitude: Gain before exp(-j 2 pi f tau), complex, shape ``(L,)``; its modulus squared is the path gain.
+            jones: Polarised gains likewise, shape ``(L, 2, 2)``, where known.
+            excess_m: By what slabs make a path longer than it is [m], shape ``(L,)``.
+            interactions: As of :class:`PathArrays`.
         """
-        transmitter = check_array("transmitter", transmitter, (3,))
-        receiver = check_array("receiver", receiver, (3,))
-        vertices = check_array("vertices", vertices, (None, None, 3), finite=False)
-        amplitude = check_array("amplitude", amplitude, (len(vertices),), complex)
-        return cls._from_points(transmitter, receiver, vertices, amplitude, kind, frequency_hz)
-
-    @classmethod
-    def _from_points(
-        cls,
-        transmitter: np.ndarray,
-        receiver: np.ndarray,
-        vertices: np.ndarray,
-        amplitude: np.ndarray,
-        kind: NDArray[np.str_],
-        frequency_hz: float,
-        jones: np.ndarray | None = None,
-        excess_m: np.ndarray | float = 0.0,
-        interactions: np.ndarray | None = None,
-    ) -> Self:
-        """:meth:`from_points` of arrays that fit each other; ``jones`` (L, 2, 2) is complex, before exp(-j 2 pi f tau) too;
-        slabs make paths longer than they are by ``excess_m`` (L,)."""
         count, depth = vertices.shape[:2]
         bounces = np.isfinite(vertices[..., 0]).sum(axis=1)
         points = points_along(transmitter, vertices, receiver)
         each = np.arange(count)
         steps = np.linalg.norm(np.diff(points, axis=1), axis=2)
         length = np.where(np.arange(depth + 1) <= bounces[:, None], steps, 0.0).sum(axis=1)
-        tau = (length + excess_m) / SPEED_OF_LIGHT
+        tau = (length if excess_m is None else length + excess_m) / SPEED_OF_LIGHT
         theta_r, phi_r = angles_from_directions(points[each, bounces] - receiver)
         theta_t, phi_t = angles_from_directions(points[:, 1] - transmitter)
         turned = carrier_phase(frequency_hz, tau)
@@ -281,16 +266,16 @@ class PathArrays:
             kind=kind,
             valid=np.ones(count, dtype=bool),
             jones=None if jones is None else jones * turned[:, None, None],
-            frequency_hz=float(frequency_hz),
-            transmitter=np.array(transmitter, dtype=np.float64),
-            receiver=np.array(receiver, dtype=np.float64),
+            frequency_hz=frequency_hz,
+            transmitter=transmitter.copy(),
+            receiver=receiver.copy(),
             interactions=np.zeros(0, np.int8) if interactions is None else interactions,
         )
 
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
         """All paths of one receiver."""
-        _check_parts(parts)
+        check_items("parts", parts, PathArrays, 1)
         joined: dict[str, Any] = {name: np.concatenate(arrays) for name, arrays in _columns(parts).items()}
         return cls(**joined, **_common(parts), receiver=parts[0].receiver)
 
@@ -301,7 +286,7 @@ class PathArrays:
         Raises:
             ValueError, TypeError: for no paths, or a length above :data:`MOST_PATHS`.
         """
-        _check_parts(parts)
+        check_items("parts", parts, PathArrays, 1)
         length = max(check_count("length", length, 0, MOST_PATHS), *(len(p.gain) for p in parts))
         stacked: dict[str, Any] = {
             name: np.stack([_padded(a, 0, length, PADDING[name]) for a in arrays])
@@ -322,7 +307,7 @@ P = TypeVar("P", bound=PathArrays)
 
 
 def turned(paths: P, turn: np.ndarray) -> P:
-    """The same paths with their complex gains times ``turn``, shape as ``gain``."""
+    """The same paths with their complex gains times ``turn``, complex or real, shape as ``gain``."""
     jones = None if paths.jones is None else paths.jones * turn[..., None, None]
     return replace(paths, gain=paths.gain * turn, jones=jones)
 
@@ -334,14 +319,6 @@ def points_along(transmitter: np.ndarray, vertices: np.ndarray, receiver: np.nda
     points = np.concatenate([start, vertices, np.zeros((count, 1, 3))], axis=1)
     points[np.arange(count), np.isfinite(vertices[..., 0]).sum(axis=1) + 1] = receiver
     return points
-
-
-def _check_parts(parts: Sequence[PathArrays]) -> None:
-    """Raise ValueError or TypeError unless these are some paths."""
-    if not len(parts):
-        raise ValueError("parts: got none, expected at least one")
-    for k, part in enumerate(parts):
-        check_type(f"parts[{k}]", part, PathArrays)
 
 
 def _columns(parts: Sequence[PathArrays]) -> dict[str, list[np.ndarray]]:

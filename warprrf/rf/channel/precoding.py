@@ -23,13 +23,14 @@ known channel is the covariance of rank one:
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import eigh
 
-from warprrf.checks import check_array, check_choice, check_positive, checked
-from warprrf.rf.channel.beams import Ends, Source, chunks, codebook_of, rays_of_users, squared
+from warprrf.checks import check_array, checked, one_of
+from warprrf.rf.channel.beams import Ends, Noise, Source, chunks, codebook_of, rays_of_users, squared
 
 
 @checked
@@ -72,7 +73,9 @@ def transmit_covariance(
 
 
 @checked
-def precoders(channels: ArrayLike, method: str = "slnr", *, noise: float) -> np.ndarray:
+def precoders(
+    channels: ArrayLike, method: Annotated[str, one_of("mr", "zf", "slnr")] = "slnr", *, noise: Noise
+) -> np.ndarray:
     """Weights that serve all users at once, unit norm each, shape ``(U, N)``, complex: user u is sent ``weights[u]``.
 
     Args:
@@ -84,8 +87,6 @@ def precoders(channels: ArrayLike, method: str = "slnr", *, noise: float) -> np.
         ValueError: naming the argument; for a user without power, and for "zf" with more users than elements or users
             whose channels are linearly dependent.
     """
-    check_choice("method", method, ("mr", "zf", "slnr"))
-    check_positive("noise", noise, "share of the transmitted power")
     h = _checked(channels)
     if h.ndim == 2:
         if method == "slnr":
@@ -101,7 +102,7 @@ def precoders(channels: ArrayLike, method: str = "slnr", *, noise: float) -> np.
 
 
 @checked
-def precoded_sinr(channels: ArrayLike, weights: ArrayLike, *, noise: float) -> np.ndarray:
+def precoded_sinr(channels: ArrayLike, weights: ArrayLike, *, noise: Noise) -> np.ndarray:
     """SINR of every user [linear], shape ``(U,)``, the power shared equally.
 
     Args:
@@ -112,7 +113,6 @@ def precoded_sinr(channels: ArrayLike, weights: ArrayLike, *, noise: float) -> n
     Raises:
         ValueError: naming the argument.
     """
-    check_positive("noise", noise, "share of the transmitted power")
     h = _checked(channels, allow_dark=True)
     w = np.asarray(weights, dtype=complex)
     if w.shape != h.shape[:2] or not (np.isfinite(w).all() and w.any(axis=1).all()):

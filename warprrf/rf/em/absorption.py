@@ -10,12 +10,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_number, checked
+from warprrf.checks import NotNegative, check_array, checked, within
 
 _PREFIX = "air_"
 
@@ -34,14 +34,9 @@ class Air:
         ValueError: for less than 100 K, or a negative pressure or density.
     """
 
-    temperature_k: float = 288.15
-    pressure_hpa: float = 1013.25
-    water_vapour_g_m3: float = 7.5
-
-    def __post_init__(self) -> None:
-        check_number("temperature_k", self.temperature_k, 100.0)
-        check_number("pressure_hpa", self.pressure_hpa, 0.0)
-        check_number("water_vapour_g_m3", self.water_vapour_g_m3, 0.0)
+    temperature_k: Annotated[float, within(100.0)] = 288.15
+    pressure_hpa: NotNegative = 1013.25
+    water_vapour_g_m3: NotNegative = 7.5
 
     def attenuation_db_per_m(self, frequency_hz: ArrayLike) -> Any:
         """Specific attenuation [dB/m], shape as ``frequency_hz``; see :func:`gas_attenuation_db_per_m`."""

@@ -19,11 +19,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import LARGEST, check_alike, check_array, check_count, checked
+from warprrf.checks import LARGEST, check_alike, check_array, checked, whole
 from warprrf.kernels.radio.records import MOMENTS
 from warprrf.rf.em.materials import NARROWEST_LOBE, Material, check_known
 
@@ -168,7 +169,7 @@ def _step(before: np.ndarray, behind: np.ndarray) -> np.ndarray:
 
 @checked
 def lobe(
-    alpha_r: int,
+    alpha_r: Annotated[int, whole(0, NARROWEST_LOBE)],
     cos_incidence: ArrayLike,
     cos_scatter: ArrayLike,
     cos_to_mirror: ArrayLike,
@@ -191,7 +192,7 @@ def lobe(
     for name, value in cosines.items():
         if (np.abs(check_array(name, value, finite=False)) > 1.0 + 1e-6).any():
             raise ValueError(f"{name}: got values beyond -1 to 1, expected cosines")
-    if check_count("alpha_r", alpha_r, 0, NARROWEST_LOBE) == LAMBERTIAN:
+    if alpha_r == LAMBERTIAN:
         return np.asarray(cos_scatter) / np.pi
     shape = (0.5 * (1.0 + np.asarray(cos_to_mirror))) ** alpha_r
     if reciprocal:
@@ -259,6 +260,7 @@ def lobe_norm(alpha_r: int, cos_incidence: ArrayLike) -> np.ndarray:
     return total / 2.0**alpha_r
 
 
+EXCESS = (0.05, 200.0)  # of epsilon_r over 1, what half-spaces are taken for; the last reflects like metal
 COSINES = 257  # entries of tables over the cosine of incidence
 
 
@@ -296,7 +298,7 @@ class FresnelCurves:
 @lru_cache(maxsize=1)
 def fresnel_curves() -> FresnelCurves:
     """The family of half-spaces from epsilon_r 1.05 to 201."""
-    excess = np.geomspace(0.05, 200.0, 97)  # of epsilon_r over 1; the last reflects like metal
+    excess = np.geomspace(*EXCESS, 97)
     te, tm = slab_reflection(np.linspace(0.0, 1.0, COSINES), 1.0 + excess[:, None], np.inf, 1.0)
     curves = 0.5 * (np.abs(te) ** 2 + np.abs(tm) ** 2)
     # relative errors count: each curve is weighted by its mean

@@ -21,16 +21,24 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 
-from warprrf.checks import check_choice, check_count, check_number, check_positive, check_type, checked
+from warprrf.checks import (
+    NotNegative,
+    check_choice,
+    check_count,
+    check_items,
+    check_number,
+    check_positive,
+    checked,
+    within,
+)
 from warprrf.files import read_json
-from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, Hertz
 
 VACUUM_PERMITTIVITY = 8.8541878128e-12  # F/m, CODATA 2018
-PATTERNS = ("lambertian", "directive")
 
 NARROWEST_LOBE = 1000
 """Largest exponent of a scattering lobe: half its power lies within 3 degrees of the mirror direction. From 1023 on
@@ -40,6 +48,11 @@ WIDEST_HZ = (1e6, 1e13)
 """Where a material whose permittivity does not depend on frequency is known [Hz]."""
 
 ROUGHEST_M = 1.0  # rms height; from a few wavelengths on nothing is reflected as by a mirror
+
+
+Number: TypeAlias = Annotated[float, within()]
+Permittivity: TypeAlias = Annotated[float, within(1.0)]
+Roughness: TypeAlias = Annotated[float, within(0.0, ROUGHEST_M)]
 
 
 @checked
@@ -58,18 +71,16 @@ class Band:
             permittivity is less than 1 or the conductivity negative: such a surface would give power.
     """
 
-    low_hz: float
-    high_hz: float
-    a: float
-    b: float
-    c: float
-    d: float
+    low_hz: Hertz
+    high_hz: Hertz
+    a: Number
+    b: Number
+    c: Number
+    d: Number
     source: str = "assumed"
 
     def __post_init__(self) -> None:
-        for name in ("a", "b", "c", "d"):
-            check_number(name, getattr(self, name))
-        if not check_frequency(self.low_hz, "low_hz") < check_frequency(self.high_hz, "high_hz"):
+        if not self.low_hz < self.high_hz:
             raise ValueError(f"low_hz, high_hz: got {self.low_hz}, {self.high_hz}, expected 0 < low < high")
         for frequency_hz in (self.low_hz, self.high_hz):  # both laws are monotonic in between
             what = f" at {frequency_hz / 1e9:g} GHz"
@@ -94,15 +105,13 @@ class Band:
             self, low_hz=low_hz, high_hz=high_hz, source=f"extrapolated from {self}: {self.source}"
         )
 
-    def relative_permittivity(self, frequency_hz: float) -> float:
+    def relative_permittivity(self, frequency_hz: Hertz) -> float:
         """a f^b, f in GHz."""
-        check_frequency(frequency_hz)
         with np.errstate(over="ignore"):
             return float(self.a * np.float64(frequency_hz / 1e9) ** self.b)
 
-    def conductivity(self, frequency_hz: float) -> float:
+    def conductivity(self, frequency_hz: Hertz) -> float:
         """c f^d [S/m], f in GHz."""
-        check_frequency(frequency_hz)
         with np.errstate(over="ignore"):
             return float(self.c * np.float64(frequency_hz / 1e9) ** self.d)
 
@@ -145,15 +154,14 @@ class Material:
     xpd: float = 0.0
 
     def __post_init__(self) -> None:
-        for k, band in enumerate(self.bands):
-            check_type(f"bands[{k}]", band, Band)
+        check_items("bands", self.bands, Band)
         of = f" of {self.name!r}"
         if self.thickness_m != np.inf:
             check_positive("thickness_m" + of, self.thickness_m, "number of metres, or inf for a half-space")
         check_number("roughness_m" + of, self.roughness_m, 0.0, ROUGHEST_M)
         if self.scattering is not None:
             check_number("scattering" + of, self.scattering, 0.0, 1.0)
-        check_choice("pattern" + of, self.pattern, PATTERNS)
+        check_choice("pattern" + of, self.pattern, ("lambertian", "directive"))
         check_count("alpha_r" + of, self.alpha_r, 1, NARROWEST_LOBE)
         check_number("xpd" + of, self.xpd, 0.0, 1.0)
 
@@ -162,8 +170,8 @@ class Material:
         cls,
         name: str,
         *,
-        relative_permittivity: float,
-        conductivity: float = 0.0,
+        relative_permittivity: Permittivity,
+        conductivity: NotNegative = 0.0,
         thickness_m: float = 0.1,
         scattering: float = 0.0,
         pattern: str = "lambertian",
@@ -175,8 +183,6 @@ class Material:
         Raises:
             ValueError: for a relative permittivity below 1, a negative conductivity, and as :class:`Material`.
         """
-        check_number("relative_permittivity", relative_permittivity, 1.0)
-        check_number("conductivity", conductivity, 0.0)
         band = Band(*WIDEST_HZ, relative_permittivity, 0.0, conductivity, 0.0, "given by the caller")
         return cls(name, (band,), thickness_m, 0.0, scattering, pattern, alpha_r, reciprocal=reciprocal)
 
@@ -186,13 +192,12 @@ class Material:
         and what else :meth:`custom` takes."""
         return cls.custom("conductor", relative_permittivity=1.0, conductivity=1e7, **options)
 
-    def band(self, frequency_hz: float) -> Band:
+    def band(self, frequency_hz: Hertz) -> Band:
         """The row that holds at ``frequency_hz``.
 
         Raises:
             ValueError: naming material, frequency and bands, if none does.
         """
-        check_frequency(frequency_hz)
         check_known((self,))
         for band in self.bands:
             if band.low_hz <= frequency_hz <= band.high_hz:
@@ -250,6 +255,17 @@ class Material:
         return roughness_scattering(self.roughness_m, frequency_hz)
 
 
+def radio_values(material: Material, frequency_hz: float) -> dict[str, float]:
+    """A material at a carrier, by the names that Sionna RT's radio materials have for its properties."""
+    return {
+        "relative_permittivity": material.relative_permittivity(frequency_hz),
+        "conductivity": material.conductivity(frequency_hz),
+        "thickness": material.thickness_m,
+        "scattering_coefficient": material.scattering_coefficient(frequency_hz),
+        "xpd_coefficient": material.xpd,
+    }
+
+
 def is_name_alone(material: object) -> bool:
     """Whether nothing is known of a material but its name."""
     return isinstance(material, Material) and not material.bands
@@ -271,10 +287,9 @@ def check_known(materials: Iterable[Material]) -> None:
 
 
 @checked
-def roughness_scattering(roughness_m: float, frequency_hz: float) -> float:
+def roughness_scattering(roughness_m: Roughness, frequency_hz: Hertz) -> float:
     """Scattering coefficient of a surface of rms height ``roughness_m`` [m] at normal incidence, in [0, 1]."""
-    height = check_number("roughness_m", roughness_m, 0.0, ROUGHEST_M)
-    exponent = 8 * (np.pi * height * check_frequency(frequency_hz) / SPEED_OF_LIGHT) ** 2
+    exponent = 8 * (np.pi * roughness_m * frequency_hz / SPEED_OF_LIGHT) ** 2
     return float(np.sqrt(-np.expm1(-2 * exponent)))
 
 
@@ -498,19 +513,17 @@ def itu_material(
     )
 
 
-_SKIN = 4.0, ((32.0, 7.234e-12, 0.0), (1100.0, 32.48e-9, 0.2)), 0.0002
-"""Dry skin: permittivity at high frequencies; strength, relaxation time [s] and spread of each of two dispersions (two more have no
-strength); ionic conductivity [S/m]."""
-
-
-def skin_permittivity(frequency_hz: float) -> complex:
+@checked
+def skin_permittivity(frequency_hz: Hertz) -> complex:
     """Complex relative permittivity of dry skin: 7.98 - 10.9j at 60 GHz.
 
     Source: S. Gabriel, R. W. Lau and C. Gabriel, "The dielectric properties of biological tissues: III. Parametric models for
     the dielectric spectrum of tissues", Phys. Med. Biol. 41 (1996), table 1: four Cole-Cole dispersions, 10 Hz to 100 GHz.
     """
-    turn = 2j * np.pi * check_frequency(frequency_hz)
-    high, dispersions, ionic = _SKIN
+    turn = 2j * np.pi * frequency_hz
+    high, ionic = 4.0, 0.0002  # permittivity at high frequencies, ionic conductivity [S/m]
+    # strength, relaxation time [s] and spread of each; two more have no strength
+    dispersions = (32.0, 7.234e-12, 0.0), (1100.0, 32.48e-9, 0.2)
     found = sum(size / (1.0 + (turn * tau) ** (1.0 - spread)) for size, tau, spread in dispersions)
     return complex(high + found + ionic / (turn * VACUUM_PERMITTIVITY))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated, TypeAlias
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -24,6 +26,10 @@ def check_frequency(frequency_hz: ArrayLike | None, name: str = "frequency_hz") 
     if not low <= value <= high:
         raise ValueError(f"{name}: got {value!r}, expected hertz, {low:g} to {high:g} (28 GHz is 28e9)")
     return value
+
+
+Hertz: TypeAlias = Annotated[float, lambda name, value: check_frequency(value, name)]
+"""A carrier, checked where an argument is annotated so."""
 
 
 @checked

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from importlib.metadata import version
-from typing import Any, ClassVar, Self, TypeAlias, TypeVar, Unpack, cast
+from typing import Annotated, Any, ClassVar, Self, TypeAlias, TypeVar, Unpack, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,17 +21,18 @@ from warprrf import tensor_files
 from warprrf.cache import Cache
 from warprrf.checks import (
     LARGEST_M,
+    Count,
     check_array,
     check_choice,
-    check_count,
     check_number,
     check_positive,
     check_type,
     checked,
+    one_of,
 )
 from warprrf.device import DeviceLike, Progress, resolve
 from warprrf.geometry.mesh import GeometryLike, Mesh
-from warprrf.netcdf_files import Variable
+from warprrf.netcdf_files import Variable, encoded
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.response import LinkOptions as LinkEnds
@@ -42,12 +43,13 @@ from warprrf.rf.fields.batches import Batch, Work
 from warprrf.rf.fields.location import Location
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
-from warprrf.rf.paths.path_set import PATH_VARIABLES, Paths, arrays_of, ends_and_attributes
+from warprrf.rf.paths.path_set import PATH_VARIABLES, Paths, attributes_of
 from warprrf.rf.positions import Ends, check_positions, retraced_slope
 from warprrf.rf.spectra.antenna import Antenna, Pattern, samples_of
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.spectra.spectrum import (
+    GridShape,
     Spectra,
     Spectrum,
     check_beam,
@@ -196,7 +198,7 @@ class RadioField(ABC):
         receivers: ArrayLike,
         transmitter: ArrayLike | None = None,
         *,
-        shape: tuple[int, int] | None = None,
+        shape: GridShape | None = None,
     ) -> Spectrum:
         """The spatial spectrum of every receiver.
 
@@ -230,17 +232,17 @@ class RadioField(ABC):
     def _trace_spectrum(self, receiver: np.ndarray, transmitter: np.ndarray) -> Spectrum:
         """:meth:`spectrum` at a position (3,) that was checked."""
 
-    def on_grid(self, shape: tuple[int, int] | None) -> Self:
+    def on_grid(self, shape: GridShape | None) -> Self:
         """The same field, its spectra of ``shape`` rows and columns; None for its own.
 
         Floor and range, which are those of a pixel, go with the pixels' size.
         """
-        if shape is None or check_shape(shape) == tuple(self.shape):
+        if shape is None or shape == tuple(self.shape):
             return self
         smaller = float(np.prod(self.shape) / np.prod(shape))
         low, high = (level + 10.0 * float(np.log10(smaller)) for level in self.range_db)
-        new = {"shape": check_shape(shape), "floor": self.floor * smaller, "range_db": (low, high)}
-        return self._grids.get(new["shape"], lambda: replace(cast(Any, self), **new))
+        new = {"shape": shape, "floor": self.floor * smaller, "range_db": (low, high)}
+        return self._grids.get(shape, lambda: replace(cast(Any, self), **new))
 
     def spectra(
         self,
@@ -284,7 +286,7 @@ class RadioField(ABC):
         self,
         receivers: ArrayLike,
         transmitter: ArrayLike | None = None,
-        max_paths: int | None = None,
+        max_paths: Count | None = None,
         *,
         store: str | os.PathLike[str] | None = None,
         client: Any = None,
@@ -313,8 +315,6 @@ class RadioField(ABC):
         Raises:
             ValueError: as for :meth:`spectra`, for a ``max_paths`` below 1, and for a store without one.
         """
-        if max_paths is not None:
-            check_count("max_paths", max_paths)
         ends = self.check_positions(receivers, transmitter)
         if ends.single and store is None and client is None:  # in a hurry
             return self._trace_paths(ends.receivers[0], ends.transmitters[0], max_paths)
@@ -327,8 +327,9 @@ class RadioField(ABC):
         if max_paths is None:
             raise ValueError("max_paths: got None with a store, expected how many paths it has room for")
         source = ends.transmitters if len(ends.groups()) > 1 else ends.transmitters[0]
-        known, attributes = ends_and_attributes(ends.receivers, source, self.frequency_hz, self.air)
-        attributes |= {"single_receiver": int(ends.single)} | self._known_by(batch, max_paths)
+        known = encoded({"receiver": ends.receivers, "transmitter": source}, PATH_VARIABLES)
+        attributes = attributes_of(self.frequency_hz, self.air) | self._known_by(batch, max_paths)
+        attributes["single_receiver"] = int(ends.single)
         batch.gather(partial(_path_arrays, work, max_paths), PATH_VARIABLES, known, attributes)
         return Paths.load(store)
 
@@ -422,7 +423,7 @@ class RadioField(ABC):
         receivers: ArrayLike,
         transmitter: ArrayLike | None = None,
         *,
-        quantity: str = "total",
+        quantity: Annotated[str, one_of("total", "spectrum")] = "total",
         step_m: float = 0.01,
     ) -> np.ndarray:
         """How what arrives changes with a receiver's place, by differences of spectra traced anew on either side of it, so that the
@@ -444,7 +445,6 @@ class RadioField(ABC):
 
             field.slope([7.0, 4.0, 1.5])  # of the total [dB/m]
         """
-        check_choice("quantity", quantity, ("total", "spectrum"))
         ends = self.check_positions(receivers, transmitter)
 
         def decibels(at: np.ndarray) -> np.ndarray:
@@ -640,7 +640,8 @@ def _paths(field: RadioField, max_paths: int | None, part: Part) -> list[Paths]:
 
 
 def _path_arrays(work: Callable[[Part], list[Paths]], length: int, part: Part) -> dict[str, np.ndarray]:
-    return arrays_of(Paths.stack(work(part), length))
+    paths = replace(Paths.stack(work(part), length), receiver=None, transmitter=None)
+    return encoded(vars(paths), PATH_VARIABLES)
 
 
 def _cfr(

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.checks import check_count, checked
+from warprrf.checks import Count, checked
 from warprrf.files import write_arrays, write_text
 from warprrf.rf.channel.path_arrays import EDGE, MIRROR, SCATTER, SLAB
 from warprrf.rf.paths.path_set import Paths
@@ -36,7 +36,7 @@ def write_deepmimo(
     scene: Scene | None = None,
     diffuse: str | None = None,
     seed: int = 0,
-    max_paths: int | None = None,
+    max_paths: Count | None = None,
 ) -> Path:
     """Write a scenario folder; ``deepmimo.load(name)`` finds it as ``deepmimo_scenarios/<name>`` in its working folder.
 
@@ -116,7 +116,7 @@ def write_deepmimo(
 def _matrices(paths: Paths, coefficient: np.ndarray, max_paths: int | None) -> dict[str, np.ndarray]:
     count = int(paths.valid.sum(axis=1).max(initial=0))
     if max_paths is not None:
-        count = min(count, check_count("max_paths", max_paths))
+        count = min(count, max_paths)
     count = max(count, 1)  # an empty matrix does not load
     if paths.gain.shape[1] == 0:
         raise ValueError("paths: got none for any receiver, expected at least one path")

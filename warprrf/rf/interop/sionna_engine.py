@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_count, checked
+from warprrf.checks import Count, Seed, check_array, checked, whole
 from warprrf.device import DeviceLike
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.absorption import Gas, air_of
@@ -47,6 +47,7 @@ def load_sionna_scene(scene: Scene | str | os.PathLike[str], *, frequency_hz: fl
     return scene.to_sionna(frequency_hz=frequency_hz)
 
 
+@checked
 @dataclass(frozen=True)
 class Sampling:
     """How Sionna RT looks for paths.
@@ -58,15 +59,10 @@ class Sampling:
         seed: Seed of the ray directions.
     """
 
-    depth: int = 3
-    samples: int = 1_000_000
+    depth: Annotated[int, whole(0)] = 3
+    samples: Count = 1_000_000
     refraction: bool = False
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_count("depth", self.depth, 0)
-        check_count("samples", self.samples)
-        check_count("seed", self.seed, 0)
+    seed: Seed = 0
 
 
 class SionnaEngine:

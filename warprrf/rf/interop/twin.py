@@ -22,7 +22,6 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -32,10 +31,10 @@ import numpy as np
 from scipy.optimize import minimize
 
 from warprrf.checks import check_positive, checked
-from warprrf.files import partial_path, read_json, write_json
+from warprrf.files import folder_in_place, read_json, write_json
 from warprrf.geometry.mesh_files import write_mesh
 from warprrf.rf.em.fresnel import COSINES, LAMBERTIAN, fresnel_curves, lobe, slab_reflection
-from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, Band, Material, table_entry
+from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, Band, Material, radio_values, table_entry
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
@@ -189,11 +188,7 @@ def write_twin(
         "about": [ABOUT, f"Fitted to spectra at {field.frequency_hz / 1e9:g} GHz. Left out:", *left_out],
         "materials": [table_entry(group.material) for group in groups],
     }
-    part = partial_path(folder)
-    # no partial file: the only one, if this is killed just then
-    earlier = part.with_name(f"{part.name}.earlier.kept")
-    try:
-        part.mkdir()
+    with folder_in_place(folder) as part:
         for m in used:
             kept, faces = np.unique(surface.mesh.faces[face_material == m], return_inverse=True)
             file = part / "meshes" / f"{names[largest[m]]}.ply"
@@ -201,14 +196,6 @@ def write_twin(
         write_json(part / "materials.json", table, seal=True)
         xml = _scene_xml([group.material for group in groups], field.frequency_hz)
         (part / "scene.xml").write_text(xml, encoding="utf-8")
-        if folder.exists():
-            folder.rename(earlier)  # a folder cannot be renamed over one that holds something
-        part.rename(folder)
-    finally:
-        if earlier.exists() and not folder.exists():
-            earlier.rename(folder)
-        for rest in (part, earlier):
-            shutil.rmtree(rest, ignore_errors=True)
     return Twin(folder / "scene.xml", field.frequency_hz, tuple(groups), left_out)
 
 
@@ -421,13 +408,7 @@ def _scene_xml(materials: Sequence[Material], frequency_hz: float) -> str:
         "",
     ]
     for material in materials:
-        values = {
-            "relative_permittivity": material.relative_permittivity(frequency_hz),
-            "conductivity": material.conductivity(frequency_hz),
-            "thickness": material.thickness_m,
-            "scattering_coefficient": material.scattering_coefficient(frequency_hz),
-            "xpd_coefficient": 0.0,
-        }
+        values = radio_values(material, frequency_hz)
         lines += [
             f'  <bsdf type="radio-material" id="mat-{material.name}">',
             *(f'    <float name="{key}" value="{value:.9g}"/>' for key, value in values.items()),

@@ -10,22 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from warprrf.checks import check_choice, checked, one_line
+from warprrf.checks import checked, one_line, one_of
 from warprrf.device import Progress
 from warprrf.rf.channel.dispersion import delay_spread
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.beam import beam_operator
-from warprrf.rf.spectra.spectrum import (
-    BEAM_SIGMA_RAD,
-    check_beam,
-    check_shape,
-    pixel_of,
-    pixel_solid_angles,
-)
+from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Beam, GridShape, pixel_of, pixel_solid_angles
 from warprrf.rows import Rows
 
 
@@ -67,17 +61,11 @@ class LinkOptions:
         progress: called as ``progress("links", done, total)``.
     """
 
-    beam_sigma_rad: float = BEAM_SIGMA_RAD
-    shape: tuple[int, int] | None = None
-    mirror_order: int | None = None
+    beam_sigma_rad: Beam = BEAM_SIGMA_RAD
+    shape: GridShape | None = None
+    mirror_order: Annotated[int | None, one_of(None, 0, 1, 2, 3)] = None
     client: Any = None
     progress: Progress | None = None
-
-    def __post_init__(self) -> None:
-        if self.shape is not None:
-            object.__setattr__(self, "shape", check_shape(self.shape))
-        check_beam(self.beam_sigma_rad)
-        check_choice("mirror_order", self.mirror_order, (None, 0, 1, 2, 3))
 
 
 def directivity(sigma: float, cosine: Any = 1.0) -> np.ndarray:

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from itertools import combinations
 from math import comb
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_choice, check_count, check_number
-from warprrf.device import Progress
+from warprrf.checks import check_array, check_count, checked, one_of, within
+from warprrf.device import Progress, with_progress
 from warprrf.rf.maps.radio_map import MapOptions, radio_map
 
 OBJECTIVES: dict[str, Callable[[np.ndarray, float], float]] = {
@@ -24,17 +24,16 @@ OBJECTIVES: dict[str, Callable[[np.ndarray, float], float]] = {
     "mean rate": lambda snr_db, level_db: float(np.mean(np.log2(1.0 + 10.0 ** (snr_db / 10.0)))),
 }
 """Of cells' signal-to-noise ratios (C,) [dB]: the share of those above a level, what nine of ten exceed, Shannon's rate."""
-MOST_SETS = 50_000  # seconds; pairs of 300 candidates
-LEAST_DB = -300.0  # of a cell that gets nothing
 
 
+@checked
 def place(
     field: Any,
     candidates: ArrayLike,
     n: int = 1,
     *,
-    objective: str = "share",
-    level_db: float = 10.0,
+    objective: Annotated[str, one_of(*OBJECTIVES)] = "share",
+    level_db: Annotated[float, within()] = 10.0,
     height: float = 1.5,
     cell: float = 0.5,
     progress: Progress | None = None,
@@ -54,8 +53,8 @@ def place(
         options: attributes of :class:`~warprrf.rf.maps.radio_map.MapOptions`.
 
     Returns:
-        Indices of candidates, shape ``(n,)``: the best of all sets up to :data:`MOST_SETS`, else in the order in which they were
-        added.
+        Indices of candidates, shape ``(n,)``: the best of all sets up to 50,000 (pairs of 300), else in the order in which they
+        were added.
 
     Raises:
         ValueError: naming the argument; for a candidate where no transmitter can be.
@@ -66,22 +65,18 @@ def place(
     """
     places = check_array("candidates", candidates, (None, 3))
     check_count("n", n, 1, len(places))
-    check_choice("objective", objective, OBJECTIVES)
-    level = check_number("level_db", level_db)
-    found = []
-    for k, source in enumerate(places):
-        found.append(radio_map(field, height, cell, source, MapOptions(**options)).best_beam_snr_db)
-        if progress is not None:
-            progress("place", k + 1, len(places))
-    return best_set(np.stack(found), n, objective, level)
+    asked, every = MapOptions(**options), with_progress(places, "place", progress)
+    snr_db = [radio_map(field, height, cell, source, asked).best_beam_snr_db for source in every]
+    return best_set(np.stack(snr_db), n, objective, level_db)
 
 
 def best_set(
-    snr_db: np.ndarray, n: int, objective: str, level: float = 0.0, *, most: int = MOST_SETS
+    snr_db: np.ndarray, n: int, objective: str, level: float = 0.0, *, most: int = 50_000
 ) -> np.ndarray:
     """What :func:`place` chooses by candidates' maps [dB], NaN outside the air, shape ``(C, Y, X)``; of more than ``most`` sets not
     all are tried."""
-    measure, cells = OBJECTIVES[objective], np.fmax(snr_db, LEAST_DB)[:, ~np.isnan(snr_db).all(axis=0)]
+    nothing_db = -300.0  # of a cell that one candidate leaves out, another does not
+    measure, cells = OBJECTIVES[objective], np.fmax(snr_db, nothing_db)[:, ~np.isnan(snr_db).all(axis=0)]
 
     def worth(some: Sequence[int]) -> float:
         return measure(cells[list(some)].max(axis=0), level)

@@ -9,13 +9,13 @@ from __future__ import annotations
 import io
 import os
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 
 from warprrf import device as _device
 from warprrf import netcdf_files
-from warprrf.checks import check_array, check_choice, check_number, check_positive, checked
+from warprrf.checks import Positive, Shaped, check_array, checked, one_of, within
 from warprrf.files import write_bytes
 from warprrf.geometry.mesh import Mesh
 from warprrf.netcdf_files import Variable
@@ -39,6 +39,11 @@ QUANTITIES = {
     "best_beam_snr_db": "best beam's SNR [dB]",
 }
 """What :meth:`RadioMap.plot` draws, and how the picture calls it."""
+
+
+Number: TypeAlias = Annotated[float, within()]
+Layer: TypeAlias = Annotated[np.ndarray, Shaped("Y X", finite=False, least=0.0)]
+Quantity: TypeAlias = Annotated[str, one_of(*QUANTITIES)]
 
 
 @checked
@@ -65,40 +70,27 @@ class RadioMap:
             coordinates.
     """
 
-    x: np.ndarray = field(repr=False)
-    y: np.ndarray = field(repr=False)
-    height_m: float
-    cell_m: float
-    transmitter: np.ndarray
-    frequency_hz: float
-    total_path_gain: np.ndarray = field(repr=False)
-    best_path_gain: np.ndarray = field(repr=False)
-    delay_spread_s: np.ndarray = field(repr=False)
-    best_beam_gain: np.ndarray = field(repr=False)
-    beam_sigma_rad: float
-    transmit_power_dbm: float
-    noise_power_dbm: float
-    outline: np.ndarray = field(repr=False)
-    ground_m: np.ndarray | None = field(default=None, repr=False)
+    x: Annotated[np.ndarray, Shaped("X")] = field(repr=False)
+    y: Annotated[np.ndarray, Shaped("Y")] = field(repr=False)
+    height_m: Number
+    cell_m: Positive
+    transmitter: Annotated[np.ndarray, Shaped("3")]
+    frequency_hz: Positive
+    total_path_gain: Layer = field(repr=False)
+    best_path_gain: Layer = field(repr=False)
+    delay_spread_s: Layer = field(repr=False)
+    best_beam_gain: Layer = field(repr=False)
+    beam_sigma_rad: Positive
+    transmit_power_dbm: Number
+    noise_power_dbm: Number
+    outline: Annotated[np.ndarray, Shaped("S 2 2")] = field(repr=False)
+    ground_m: Annotated[np.ndarray, Shaped("Y X", finite=False)] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        """Check shapes and values; ValueError or TypeError names the field."""
-        fields: dict[str, Any] = {name: check_number(name, getattr(self, name)) for name in _PLAIN}
-        shapes = {"x": (None,), "y": (None,), "transmitter": (3,), "outline": (None, 2, 2)}
-        for name, shape in shapes.items():
-            fields[name] = check_array(name, getattr(self, name), shape)
-        cells = len(fields["y"]), len(fields["x"])
-        for name in ("cell_m", "frequency_hz", "beam_sigma_rad"):
-            check_positive(name, fields[name])
-        for name in ("x", "y"):
-            if not (np.abs(np.diff(fields[name]) - self.cell_m) < 1e-3 * self.cell_m).all():
-                raise ValueError(f"{name}: got {fields[name]}, expected steps of cell_m, {self.cell_m:g} m")
-        for name in _LAYERS:
-            fields[name] = check_array(name, getattr(self, name), cells, finite=False, least=0.0)
-        if self.ground_m is not None:
-            fields["ground_m"] = check_array("ground_m", self.ground_m, cells, finite=False)
-        for name, value in fields.items():
-            object.__setattr__(self, name, value)
+        """Check that the cells are as wide as is said; ValueError names their axis."""
+        for name, centres in (("x", self.x), ("y", self.y)):
+            if not (np.abs(np.diff(centres) - self.cell_m) < 1e-3 * self.cell_m).all():
+                raise ValueError(f"{name}: got {centres}, expected steps of cell_m, {self.cell_m:g} m")
 
     @property
     def free(self) -> np.ndarray:
@@ -109,21 +101,19 @@ class RadioMap:
     def positions(self) -> np.ndarray:
         """Centres of the cells [m], shape ``(Y, X, 3)``."""
         x, y = np.meshgrid(self.x, self.y)
-        ground = 0.0 if self.ground_m is None else self.ground_m
-        return np.stack([x, y, np.full_like(x, self.height_m) + ground], axis=-1)
+        return _places(x, y, self.height_m, self.ground_m)
 
     @property
     def best_beam_snr_db(self) -> np.ndarray:
         """Signal-to-noise ratio of the best beam [dB], shape ``(Y, X)``; another budget shifts it by a constant."""
         return self.transmit_power_dbm + to_db(self.best_beam_gain) - self.noise_power_dbm
 
-    def plot_values(self, quantity: str) -> np.ndarray:
+    def plot_values(self, quantity: Quantity) -> np.ndarray:
         """``quantity`` as it is drawn: gains in dB, delay spread in ns, shape ``(Y, X)``.
 
         Raises:
             ValueError: for a quantity that is not one of :data:`QUANTITIES`.
         """
-        check_choice("quantity", quantity, QUANTITIES)
         value = np.asarray(getattr(self, quantity))
         if quantity == "delay_spread_s":
             return value * 1e9
@@ -182,9 +172,8 @@ class RadioMap:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a NetCDF-4 file, whole or not at all: the four quantities over ``y`` and ``x``, and the outline."""
-        arrays = {name: getattr(self, name) for name in _VARIABLES if getattr(self, name) is not None}
-        attributes = {name: float(getattr(self, name)) for name in _PLAIN} | {"format": _FORMAT}
-        netcdf_files.write(path, arrays, _VARIABLES, {}, attributes)
+        attributes = {name: getattr(self, name) for name in _PLAIN} | {"format": _FORMAT}
+        netcdf_files.write(path, netcdf_files.encoded(vars(self), _VARIABLES), _VARIABLES, {}, attributes)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> RadioMap:
@@ -194,10 +183,8 @@ class RadioMap:
             OSError: naming the file, if it cannot be read.
             ValueError: naming it, if it is damaged, or holds something else.
         """
-        arrays, attributes = netcdf_files.read(path, _VARIABLES, {})
+        arrays, attributes = netcdf_files.read(path, _VARIABLES, {}, _FORMAT)
         with named(path, "damaged, or no radio map"):
-            if attributes.get("format") != _FORMAT:
-                raise ValueError(f"it holds {attributes.get('format')!r}, expected {_FORMAT!r}")
             for axis, name in enumerate(("y", "x")):
                 order = np.argsort(arrays[name])  # as another tool may have turned it
                 for held in {name, *_LAYERS, "ground_m"} & set(arrays):
@@ -231,15 +218,9 @@ class MapOptions(LinkOptions):
 
     bounds: Any = None
     above_ground: bool = False
-    transmit_power_dbm: float = 20.0
-    bandwidth_hz: float = 2.16e9
-    noise_figure_db: float = 10.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_positive("bandwidth_hz", self.bandwidth_hz)
-        for name in ("transmit_power_dbm", "noise_figure_db"):
-            check_number(name, getattr(self, name))
+    transmit_power_dbm: Number = 20.0
+    bandwidth_hz: Positive = 2.16e9
+    noise_figure_db: Number = 10.0
 
     @property
     def noise_power_dbm(self) -> float:
@@ -250,10 +231,11 @@ class MapOptions(LinkOptions):
         return float(10.0 * np.log10(noise_w) + 30.0 + self.noise_figure_db)
 
 
+@checked
 def radio_map(
     field: Any,
-    height: float,
-    cell: float = 0.25,
+    height: Number,
+    cell: Positive = 0.25,
     transmitter: Any = None,
     options: MapOptions | None = None,
 ) -> RadioMap:
@@ -281,17 +263,13 @@ def radio_map(
     check_positions(
         mesh, source, np.zeros((0, 3)), wavelength_m, known=field.transmitter, device=field.device
     )
-    check_number("height", height)
-    check_positive("cell", cell)
     low, high = mesh.bounds
     if not (0.0 if o.above_ground else low[2]) < height < high[2]:
         raise ValueError(f"height: got {height!r} m, expected {low[2]:.3g} to {high[2]:.3g} m")
     x, y = _centres(mesh, cell, o.bounds)
     across, along = np.meshgrid(x, y)
     ground = ground_height(mesh, across, along, device=field.device) if o.above_ground else None
-    places = np.stack(
-        [across, along, np.full_like(across, height) + (0.0 if ground is None else ground)], axis=-1
-    )
+    places = _places(across, along, height, ground)
     free = is_free(mesh, places.reshape(-1, 3), source, device=field.device).reshape(across.shape)
     free &= np.linalg.norm(places - source, axis=-1) > NEAR_FIELD * wavelength_m
     if not free.any():
@@ -304,17 +282,22 @@ def radio_map(
     return RadioMap(
         x=x,
         y=y,
-        height_m=float(height),
-        cell_m=float(cell),
+        height_m=height,
+        cell_m=cell,
         transmitter=source,
-        frequency_hz=float(field.frequency_hz),
-        beam_sigma_rad=float(o.beam_sigma_rad),
-        transmit_power_dbm=float(o.transmit_power_dbm),
+        frequency_hz=field.frequency_hz,
+        beam_sigma_rad=o.beam_sigma_rad,
+        transmit_power_dbm=o.transmit_power_dbm,
         noise_power_dbm=o.noise_power_dbm,
         outline=mesh.cross_section(float(np.median(places[free][:, 2]))),
         ground_m=ground,
         **layers,
     )
+
+
+def _places(x: np.ndarray, y: np.ndarray, height: float, ground: np.ndarray | None) -> np.ndarray:
+    """Places at ``height`` [m] over the ``ground``, where there is one, shape ``(Y, X, 3)``."""
+    return np.stack([x, y, np.full_like(x, height) + (0.0 if ground is None else ground)], axis=-1)
 
 
 def _centres(mesh: Mesh, cell: float, bounds: Any) -> tuple[np.ndarray, np.ndarray]:

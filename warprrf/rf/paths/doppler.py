@@ -22,10 +22,6 @@ from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 
-FARTHEST_M = 0.3
-"""How far an interaction point may lie from the scene's surfaces: what photos show is right to some centimetres."""
-FASTEST_M_S = 3e6  # a hundredth of the speed of light: the formula errs by that share
-
 
 def doppler_hz(
     paths: PathArrays,
@@ -56,15 +52,10 @@ def doppler_hz(
         later = paths.after(1e-3, shift)  # a millisecond on
     """
     lead = len(paths.gain) if paths.batched else None
-    ends = [
-        _velocities(name, value, lead)
-        for name, value in (
-            ("transmitter_velocity", transmitter_velocity),
-            ("receiver_velocity", receiver_velocity),
-        )
-    ]
+    sent = _velocities("transmitter_velocity", transmitter_velocity, lead)
+    heard = _velocities("receiver_velocity", receiver_velocity, lead)
     departure, onward = paths.departure, -paths.arrival
-    speed = (ends[0] * departure).sum(axis=-1) - (ends[1] * onward).sum(axis=-1)
+    speed = (sent * departure).sum(axis=-1) - (heard * onward).sum(axis=-1)
     if moving:
         there = np.isfinite(paths.vertices[..., 0])
         speed = speed + np.where(there, _pushed(paths, moving, scene, there, departure, onward), 0.0).sum(
@@ -79,7 +70,8 @@ def _velocities(name: str, value: ArrayLike, receivers: int | None) -> np.ndarra
     if found.shape != (3,) and (receivers is None or found.shape != (receivers, 3)):
         wanted = "(3,)" if receivers is None else f"(3,) or ({receivers}, 3)"
         raise ValueError(f"{name}: got shape {found.shape}, expected {wanted}, a velocity [m/s]")
-    check_number(name, float(np.abs(found).max()), 0.0, FASTEST_M_S)
+    fastest_m_s = 3e6  # a hundredth of the speed of light: the formula errs by that share
+    check_number(name, float(np.abs(found).max()), 0.0, fastest_m_s)
     return found if found.ndim == 1 else found[:, None]
 
 
@@ -129,7 +121,8 @@ def _touched(scene: Any, moving: Mapping[str, ArrayLike], points: np.ndarray) ->
     if len(points) == 0:
         return np.zeros((0, 3))
     nearest = mesh.closest(points)
-    if nearest.distance.max() > FARTHEST_M:
+    farthest_m = 0.3  # what photos show is right to some centimetres
+    if nearest.distance.max() > farthest_m:
         raise ValueError(
             f"scene: got paths that touch something {nearest.distance.max():.3g} m from its surfaces, expected paths traced in it"
         )

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from warprrf.checks import check_count
-from warprrf.device import Progress
+from warprrf.device import Progress, with_progress
 from warprrf.geometry.edges import Edges, mesh_edges
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
 from warprrf.geometry.planar_patches import PlanarPatches
@@ -147,13 +147,11 @@ class EdgeFinder:
         points = np.asarray(receivers, float).reshape(-1, 3)
         nothing = np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2), int)
         parts, waiting = list[EdgePaths](), [nothing]
-        for k, receiver in enumerate(points):
+        for k, receiver in enumerate(with_progress(points, "edges", progress)):
             waiting += self._candidates(k, receiver, mirrors)
             if sum(len(edge) for _, edge, _ in waiting) > AT_ONCE:
                 parts.append(self._paths(points, waiting))
                 waiting = [nothing]
-            if progress is not None:
-                progress("edges", k + 1, len(points))
         return EdgePaths.joined([*parts, self._paths(points, waiting)])
 
     def _candidates(

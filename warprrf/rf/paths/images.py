@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import copy
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,7 +19,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_positive, users_level
+from warprrf.checks import check_positive, warn
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.edges import Edges
 from warprrf.geometry.planar_patches import PlanarPatches
@@ -35,9 +34,7 @@ BLOCK = 500_000  # chains that are unfolded at once
 MOST_CHAINS = 20_000_000
 """More chains of mirrors than this are not tried unless asked for: a minute on two cores in a room, twenty in a city."""
 
-_WORDS = 16_000_000  # chains times leaves that are tried at once
 _SAMPLE = 1000  # chains from which the number of longer ones is estimated
-_PARTS = 1000  # of a search, in which its progress is reported
 
 
 @dataclass(frozen=True)
@@ -91,11 +88,9 @@ class MirrorImages:
         if patches.two_sided and patches.curved_m2 > max(
             0.5, 0.01 * patches.area.sum()
         ):  # what is less is detail
-            warnings.warn(
+            warn(
                 f"mesh: {patches.curved_m2:.3g} m^2 of it are flat facets of smooth surfaces (a round pillar, say); each "
-                "mirrors as a plane or not at all, so that mirror paths off them are right in the mean alone",
-                UserWarning,
-                stacklevel=users_level(),
+                "mirrors as a plane or not at all, so that mirror paths off them are right in the mean alone"
             )
         self.patches = patches
         self.max_chains = check_positive("max_chains", max_chains)
@@ -128,12 +123,12 @@ class MirrorImages:
                 f"planar patches, some {seconds:.2g} seconds; expected at most {self.max_chains:.3g}: lower mirror_order, "
                 "simplify the mesh (fewer, larger planar patches), or give more max_chains to MirrorTracer"
             )
-        ends = np.cumsum([0.0, *work])
+        ends, parts = np.cumsum([0.0, *work]), 1000  # of a search, in which its progress is reported
 
         def tick(share: float) -> None:
             if progress is not None:
                 behind = ends[k - 1] + share * (ends[k] - ends[k - 1])
-                progress("mirrors", round(_PARTS * behind / max(ends[-1], 1.0)), _PARTS)
+                progress("mirrors", round(parts * behind / max(ends[-1], 1.0)), parts)
 
         for k in range(1, order + 1):
             yield self.candidates(points, k, tick)
@@ -176,22 +171,16 @@ class MirrorImages:
         """Over which edges chains of ``order`` reflections, known from the transmitter on, reach ``point`` (3,), if nothing
         stands between: index of the edge ``(L,)`` and patches ``(L, order)``, whose boxes hold the mirror points."""
         parts = [(np.zeros(0, int), np.zeros((0, order), np.int32))]
-        step = max(1, _WORDS // max(len(leaves.radius), 1))
+        at_once = 16_000_000  # chains times leaves: the words that are held
+        step = max(1, at_once // max(len(leaves.radius), 1))
         kept = self._keep(order)
         known = min(order, len(kept) - 1)
         for chains, _ in self._descendants(kept[known], order - known, point, -1.0):
             for first in range(0, len(chains) if len(leaves.radius) else 0, step):
                 some = chains.take(slice(first, first + step))
-                patch = wp.array(some.patch, dtype=wp.int32, device=self.device)
                 words = wp.zeros((len(some), len(leaves.radius)), dtype=wp.uint32, device=self.device)
-                inputs = [
-                    self._on_device,
-                    patch,
-                    _cones(some, self.device),
-                    leaves.on_device,
-                    wp.vec3d(*point),
-                ]
-                inputs += [wp.float64(IN_PLANE), words]
+                inputs = [self._on_device, some.patch, _cones(some, self.device), leaves.on_device]
+                inputs += [wp.vec3d(*point), wp.float64(IN_PLANE), words]
                 _device.launch(find_over_edges, words.size, inputs, device=self.device)
                 chain, leaf, bit = _set_bits(words.numpy())
                 edge = leaves.edge[32 * leaf + bit]
@@ -294,39 +283,22 @@ class MirrorImages:
         children = kernels.Cones()
         children.apex, children.axis = (wp.zeros(size, dtype=wp.vec3d, device=where) for _ in range(2))
         children.sine = wp.zeros(size, dtype=wp.float64, device=where)
-        inputs = [
-            self._on_device,
-            wp.array(last, dtype=wp.int32, device=where),
-            _cones(chains, where),
-            wp.vec3d(*middle),
-            wp.float64(reach),
-            wp.array(start, dtype=wp.int32, device=where),
-            counted,
-            parent,
-            patch,
-            children,
-        ]
+        inputs = [self._on_device, last, _cones(chains, where), wp.vec3d(*middle), wp.float64(reach)]
+        inputs += [start, counted, parent, patch, children]
         _device.launch(kernels.extend_chains, len(chains), inputs, device=where, grain=16)
         arrays = (counted, parent, patch, children.apex, children.axis, children.sine)
         return tuple(a.numpy() for a in arrays)
 
     def _unfolded(self, chains: Chains, ends: _Ends) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        where, cones = self.device, _cones(chains, self.device)
-        patch = wp.array(chains.patch, dtype=wp.int32, device=where)
+        where = self.device
         words = wp.zeros((len(chains), len(ends.leaf_radius)), dtype=wp.uint32, device=where)
-        inputs = [self._on_device, patch, cones, ends.points, ends.leaf_middle, ends.leaf_radius, words]
+        inputs = [self._on_device, chains.patch, _cones(chains, where), *ends.on_device, words]
         _device.launch(kernels.find_chains, words.size, inputs, device=where)
         chain, leaf, bit = _set_bits(words.numpy())
         row = ends.order[32 * leaf + bit]
         patches = chains.patch[chain]
         point = wp.zeros(patches.shape, dtype=wp.vec3d, device=where)
-        inputs = [
-            self._on_device,
-            wp.array(patches, dtype=wp.int32, device=where),
-            wp.array(chains.image[chain], dtype=wp.vec3d, device=where),
-            wp.array(ends.positions[row], dtype=wp.vec3d, device=where),
-            point,
-        ]
+        inputs = [self._on_device, patches, chains.image[chain], ends.positions[row], point]
         _device.launch(kernels.unfold_chains, len(row), inputs, device=where)
         return row, patches, point.numpy().reshape(*patches.shape, 3)
 
@@ -338,11 +310,11 @@ class _Ends:
         self.positions, self.order = points, _along_curve(points)
         first = np.arange(0, len(points), 32)
         low, high = (f.reduceat(points[self.order], first) for f in (np.minimum, np.maximum))
-        self.points = wp.array(points[self.order], dtype=wp.vec3d, device=where)
-        self.leaf_middle = wp.array(0.5 * (low + high), dtype=wp.vec3d, device=where)
-        self.leaf_radius = wp.array(
-            1e-6 + 0.5 * np.linalg.norm(high - low, axis=1), dtype=wp.float64, device=where
+        self.leaf_radius = 1e-6 + 0.5 * np.linalg.norm(high - low, axis=1)
+        vectors = (
+            wp.array(a, dtype=wp.vec3d, device=where) for a in (points[self.order], 0.5 * (low + high))
         )
+        self.on_device = *vectors, wp.array(self.leaf_radius, dtype=wp.float64, device=where)
         low, high = low.min(axis=0), high.max(axis=0)
         self.middle, self.radius = 0.5 * (low + high), 1e-6 + 0.5 * float(np.linalg.norm(high - low))
 
@@ -371,12 +343,10 @@ class EdgeLeaves:
         self.radius = 1e-6 + 0.5 * np.linalg.norm(high - low, axis=1)
         below = np.cross(own.along, own.inward), own.n[:, None] * np.pi
         far = np.sin(below[1]) * own.inward - np.cos(below[1]) * below[0]
-        self.on_device = edge_kernels.EdgePieces()
-        for name, vectors in (("start", start), ("along", own.along), ("first", below[0]), ("last", far)):
-            setattr(self.on_device, name, wp.array(vectors, dtype=wp.vec3d, device=where))
-        self.on_device.leaf_middle = wp.array(0.5 * (low + high), dtype=wp.vec3d, device=where)
-        for name, lengths in (("length", piece), ("leaf_radius", self.radius)):
-            setattr(self.on_device, name, wp.array(lengths, dtype=wp.float64, device=where))
+        self.on_device = _device.filled(
+            edge_kernels.EdgePieces, where, start=start, along=own.along, first=below[0], last=far, length=piece,
+            leaf_middle=0.5 * (low + high), leaf_radius=self.radius,
+        )  # fmt: skip
 
 
 def _set_bits(words: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -388,11 +358,7 @@ def _set_bits(words: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _cones(chains: Chains, where: wp.Device) -> Any:
-    cones = kernels.Cones()
-    cones.apex = wp.array(chains.image, dtype=wp.vec3d, device=where)
-    cones.axis = wp.array(chains.axis, dtype=wp.vec3d, device=where)
-    cones.sine = wp.array(chains.sine, dtype=wp.float64, device=where)
-    return cones
+    return _device.filled(kernels.Cones, where, apex=chains.image, axis=chains.axis, sine=chains.sine)
 
 
 def _patches_on_device(patches: PlanarPatches, slack_m: float, where: wp.Device) -> Any:
@@ -405,19 +371,19 @@ def _patches_on_device(patches: PlanarPatches, slack_m: float, where: wp.Device)
         pairs = np.arange(0, len(low_), 2)
         levels.append((np.minimum.reduceat(low_, pairs), np.maximum.reduceat(high_, pairs)))
     tree_low, tree_high = (np.concatenate(a) for a in zip(*levels, strict=True))
-    result = kernels.Patches()
-
-    def put(array: np.ndarray, dtype: type) -> wp.array:
-        return wp.array(array, dtype=dtype, device=where)
-
-    result.normal = put(patches.normal, wp.vec3d)
-    result.plane_offset = put(patches.offset, wp.float64)
-    result.radius = put(0.5 * np.linalg.norm(high - low, axis=1), wp.float64)
-    result.box_middle, result.box_half = put(0.5 * (low + high), wp.vec3d), put(0.5 * (high - low), wp.vec3d)
-    result.order = put(order, wp.int32)
-    result.node_middle = put(0.5 * (tree_low + tree_high), wp.vec3d)
-    result.node_half = put(0.5 * (tree_high - tree_low), wp.vec3d)
-    result.level = put(np.cumsum([0, *(len(a) for a, _ in levels[:-1])]), wp.int32)
+    result = _device.filled(
+        kernels.Patches,
+        where,
+        normal=patches.normal,
+        plane_offset=patches.offset,
+        radius=0.5 * np.linalg.norm(high - low, axis=1),
+        box_middle=0.5 * (low + high),
+        box_half=0.5 * (high - low),
+        order=order,
+        node_middle=0.5 * (tree_low + tree_high),
+        node_half=0.5 * (tree_high - tree_low),
+        level=np.cumsum([0, *(len(a) for a, _ in levels[:-1])]),
+    )
     result.two_sided = patches.two_sided
     return result
 

@@ -232,11 +232,8 @@ class ZoneRays:
     ) -> None:
         self.patches, self.source, self.wavelength_m, self.walls = patches, source, wavelength_m, walls
         self.position_error_m, self.device = position_error_m, device
-        rings = (
-            (0.0, 1),
-            (0.5, 6),
-            (0.9, 8),
-        )  # radii, as shares of the zone's, and numbers of rays: about equal areas each
+        # radii, as shares of the zone's, and numbers of rays: about equal areas each
+        rings = (0.0, 1), (0.5, 6), (0.9, 8)
         self.samples = np.array(
             [
                 (radius * np.cos(a), radius * np.sin(a))

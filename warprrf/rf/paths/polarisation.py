@@ -14,10 +14,8 @@ from __future__ import annotations
 import numpy as np
 
 from warprrf.geometry.mesh import vectors_across
+from warprrf.rf.em.fresnel import EXCESS
 from warprrf.rf.spectra.spectrum import transverse_basis
-
-_PARALLEL = 1e-6  # sine of incidence below which a mirror has no plane of incidence of its own
-_EXCESS = (0.05, 200.0)  # of epsilon_r - 1, the range of :func:`warprrf.rf.em.fresnel.fresnel_curves`
 
 
 def turns(stops: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -42,29 +40,16 @@ def turns(stops: np.ndarray, normal: np.ndarray) -> np.ndarray:
 def vertical_ends(stops: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fields of antennas along the zenith unit vectors of departure and arrival, in the (TE, TM) of the first mirror and
     behind the last, shape ``(L, 2)`` each; arguments as for :func:`turns`."""
-    if normal.shape[1] == 0:
-        both = _directly(stops)[:, 0, 0]
-        return np.stack([both, 0.0 * both], axis=1), np.broadcast_to([1.0, 0.0], (len(both), 2))
-    into, out = _ends(stops, normal)
-    return into[:, :, 0], out[:, 0, :]
-
-
-def _directly(stops: np.ndarray) -> np.ndarray:
-    """From zenith and azimuth unit vectors of departure to those of arrival, without a mirror, shape ``(L, 2, 2)``."""
-    along = np.diff(stops, axis=1)[:, 0]
-    return transverse_basis(-along) @ np.swapaxes(transverse_basis(along), 1, 2)
-
-
-def _ends(stops: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """From zenith and azimuth unit vectors of departure to the first mirror's (TE, TM), and from those behind the last
-    mirror to the unit vectors of arrival, shape ``(L, 2, 2)`` each."""
     leg = np.diff(stops, axis=1)
+    sent, heard = np.swapaxes(transverse_basis(leg[:, 0]), 1, 2), transverse_basis(-leg[:, -1])
+    if normal.shape[1] == 0:
+        both = (heard @ sent)[:, 0, 0]
+        return np.stack([both, 0.0 * both], axis=1), np.broadcast_to([1.0, 0.0], (len(both), 2))
     along, across = _frames(stops, normal)
     first, last = across[:, 0], across[:, -1]
     before = np.stack([first, np.cross(first, along[:, 0])], axis=1)
     behind = np.stack([last, np.cross(last, along[:, -1])], axis=1)
-    into = before @ np.swapaxes(transverse_basis(leg[:, 0]), 1, 2)
-    return into, transverse_basis(-leg[:, -1]) @ np.swapaxes(behind, 1, 2)
+    return (before @ sent)[:, :, 0], (heard @ np.swapaxes(behind, 1, 2))[:, 0, :]
 
 
 def _frames(stops: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -76,13 +61,11 @@ def _frames(stops: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarr
     along = leg / np.maximum(np.linalg.norm(leg, axis=2, keepdims=True), 1e-12)
     across = np.cross(along[:, :-1], normal)
     sine = np.linalg.norm(across, axis=2, keepdims=True)
+    least = 1e-6  # sine of incidence below which a mirror has no plane of incidence of its own
     for k in range(normal.shape[1]):
-        if k:
-            other = across[:, k - 1]
-        else:
-            other = vectors_across(along[:, 0])[0]
-        own = across[:, k] / np.maximum(sine[:, k], _PARALLEL)
-        across[:, k] = np.where(sine[:, k] > _PARALLEL, own, other)
+        other = across[:, k - 1] if k else vectors_across(along[:, 0])[0]
+        own = across[:, k] / np.maximum(sine[:, k], least)
+        across[:, k] = np.where(sine[:, k] > least, own, other)
     return along, across
 
 
@@ -135,7 +118,7 @@ def chain_amplitude(
 
 def _half_space(log_excess: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Amplitudes (TE, TM) that a half-space reflects, shape ``(..., 2)``, and their derivatives to ``log_excess``."""
-    excess = np.clip(np.exp(log_excess), *_EXCESS)
+    excess = np.clip(np.exp(log_excess), *EXCESS)
     cos = np.clip(cosine, 0.0, 1.0)
     root = np.maximum(np.sqrt(excess + cos**2), 1e-12)
     dense = (1.0 + excess) * cos

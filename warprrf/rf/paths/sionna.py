@@ -21,9 +21,7 @@ from warprrf.checks import check_array, check_count, check_positive, checked, on
 from warprrf.rf.channel.arrays import End
 from warprrf.rf.channel.path_arrays import EDGE, SCATTER, SLAB, PathArrays, turned
 from warprrf.rf.channel.response import channel_taps, frequency_response, impulse_response
-from warprrf.rf.em.waves import carrier_phase, check_frequency
-
-MOST_TIME_STEPS = 1_000_000
+from warprrf.rf.em.waves import carrier_phase
 
 
 @checked
@@ -93,13 +91,8 @@ class SionnaPaths:
         ``normalize`` scales each link to unit mean energy.
         """
         f = self._paths.carrier_hz + check_array("frequencies", frequencies, (None,))
-        work = partial(
-            frequency_response,
-            frequencies_hz=f,
-            squint=False,
-            normalize_delays=normalize_delays,
-            **self._options,
-        )
+        options = self._options | {"squint": False, "normalize_delays": normalize_delays}
+        work = partial(frequency_response, frequencies_hz=f, **options)
         h = self._over_time(work, _times(num_time_steps, sampling_frequency))
         return _as(_normalised(h, normalize, mean=True), out_type)
 
@@ -117,15 +110,8 @@ class SionnaPaths:
     ) -> Any:
         """Taps ``(R, M, 1, N, T, l_max - l_min + 1)``, as ``sionna.rt.Paths.taps``; T of them a second are ``bandwidth`` by
         default."""
-        work = partial(
-            channel_taps,
-            bandwidth_hz=bandwidth,
-            l_min=l_min,
-            l_max=l_max,
-            squint=False,
-            normalize_delays=normalize_delays,
-            **self._options,
-        )
+        options = self._options | {"squint": False, "normalize_delays": normalize_delays}
+        work = partial(channel_taps, bandwidth_hz=bandwidth, l_min=l_min, l_max=l_max, **options)
         every = bandwidth if sampling_frequency is None else sampling_frequency
         h = self._over_time(work, _times(num_time_steps, every))
         return _as(_normalised(h, normalize, mean=False), out_type)
@@ -161,10 +147,7 @@ def to_sionna(
     several = paths.as_several()
     shift = np.zeros(several.gain.shape)
     if doppler_hz is not None:
-        given = check_array("doppler_hz", doppler_hz, paths.gain.shape, finite=False)
-        shift = np.where(several.valid, given.reshape(shift.shape), 0.0)
-        if not np.isfinite(shift).all():
-            raise ValueError("doppler_hz: got NaN or infinite shifts, expected one for every path")
+        shift[:] = check_shifts(paths, doppler_hz)
     options: dict[str, Any] = {"tx_array": tx_array, "rx_array": rx_array, "diffuse": diffuse, "seed": seed}
     coefficient, tau = impulse_response(several, **options)
     valid = several.valid & np.isfinite(tau)
@@ -179,10 +162,7 @@ def to_sionna(
     return SionnaPaths(
         a=passband[:, :, None],
         tau=np.where(valid, tau, -1.0)[:, None],
-        theta_t=angle(several.theta_t),
-        phi_t=angle(several.phi_t),
-        theta_r=angle(several.theta_r),
-        phi_r=angle(several.phi_r),
+        **{name: angle(getattr(several, name)) for name in ("theta_t", "phi_t", "theta_r", "phi_r")},
         valid=valid[:, None],
         interactions=np.moveaxis(np.where(there, several.interactions, 0).astype(int), -1, 0)[:, :, None],
         vertices=np.moveaxis(np.where(there[..., None], several.vertices, 0.0), -2, 0)[:, :, None],
@@ -192,16 +172,21 @@ def to_sionna(
     )
 
 
-def from_sionna(
-    paths: Any, frequency_hz: float, transmitter: int, drop_repeated: bool
-) -> list[dict[str, Any]]:
-    """Arrays of the paths of ``sionna.rt.Paths`` from one transmitter, of each receiver; see ``Paths.from_sionna``."""
-    each = by_delay(paths, check_frequency(frequency_hz), transmitter, drop_repeated)
-    return [vars(p.select(np.argsort(-np.abs(p.gain), kind="stable"))) for p in each]
+def check_shifts(paths: PathArrays, doppler_hz: ArrayLike) -> np.ndarray:
+    """Shifts [Hz] of ``paths``, shape as ``tau``, 0 where padded.
+
+    Raises:
+        ValueError: for another shape, or a path without a shift.
+    """
+    given = check_array("doppler_hz", doppler_hz, paths.tau.shape, finite=False)
+    if not np.isfinite(given[paths.valid]).all():
+        raise ValueError("doppler_hz: got NaN or infinite shifts, expected one for every path")
+    return np.where(paths.valid, given, 0.0)
 
 
 def by_delay(paths: Any, carrier: float, transmitter: int, drop_repeated: bool) -> Iterator[PathArrays]:
-    """The paths of each receiver by rising delay: in the same order, whatever Sionna's threads did."""
+    """The paths of ``sionna.rt.Paths`` from one transmitter, of each receiver, by rising delay: in the same order, whatever
+    Sionna's threads did; see :meth:`Paths.from_sionna`."""
     if not hasattr(paths, "synthetic_array"):
         raise TypeError(f"paths: got {type(paths).__name__}, expected what Sionna RT's PathSolver returned")
     real, imag = (np.asarray(part.numpy(), dtype=np.float64) for part in paths.a)
@@ -276,7 +261,7 @@ def _one_transmitter(h: np.ndarray) -> np.ndarray:
 def _times(count: int, per_second: float) -> np.ndarray:
     """Times [s] of ``count`` steps."""
     every = check_positive("sampling_frequency", per_second)
-    return np.arange(check_count("num_time_steps", count, most=MOST_TIME_STEPS)) / every
+    return np.arange(check_count("num_time_steps", count, most=1_000_000)) / every
 
 
 def _normalised(h: np.ndarray, normalize: bool, *, mean: bool) -> np.ndarray:

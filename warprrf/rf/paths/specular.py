@@ -87,19 +87,18 @@ class SpecularPaths:
         self._traced, self._shape = {name: traced[name] for name in TYPES}, found.patch.shape
         mirrors = found.patch >= 0
         self._there = mirrors | (found.slab >= 0)
-        columns = {
-            "receiver": (found.receiver, wp.int32),
-            "count": (self._there.sum(axis=1), wp.int32),
-            "mirrors": (mirrors, wp.int32),
-            "normal": (found.normal, wp.vec3d),
-            "plane_offset": (offset, wp.float64),
-            "material": (material, wp.int32),
-            "solid_m": (found.thickness_m, wp.float64),
-        }
-        self._sequences = kernels.Sequences()
-        self._sequences.frequency_hz = frequency_hz
-        for name, (array, dtype) in columns.items():
-            setattr(self._sequences, name, wp.array(array, dtype=dtype, device=self.device))
+        self._sequences = _device.filled(
+            kernels.Sequences,
+            device,
+            frequency_hz=frequency_hz,
+            receiver=found.receiver,
+            count=self._there.sum(axis=1),
+            mirrors=mirrors,
+            normal=found.normal,
+            plane_offset=offset,
+            material=material,
+            solid_m=found.thickness_m,
+        )
 
     @property
     def parameters(self) -> dict[str, np.ndarray]:

@@ -6,19 +6,19 @@ Angles: arrival points from the receiver to the last interaction, departure from
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count, checked
+from warprrf.checks import check_array, check_count, checked, whole
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, GeometryLike, as_mesh
 from warprrf.geometry.planar_patches import planar_patches
 from warprrf.rf.em.absorption import Gas
 from warprrf.rf.em.fresnel import SurfaceTable, surface_table
-from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, Hertz, check_frequency
 from warprrf.rf.paths.edge_paths import EdgeFinder, EdgePaths
 from warprrf.rf.paths.images import MOST_CHAINS, MirrorImages
 from warprrf.rf.paths.mirror_paths import MirrorPaths, exact_paths
@@ -27,6 +27,9 @@ from warprrf.rf.paths.slabs import MOST_SLABS, Walls
 from warprrf.rf.paths.specular import OUTPUTS, SpecularPaths, fixed_parameters
 from warprrf.rf.positions import Ends, check_positions, question_unit, warn_of_unmodelled
 
+Order: TypeAlias = Annotated[int, whole(0)]
+SlabCount: TypeAlias = Annotated[int, whole(0, MOST_SLABS)]
+
 
 @checked
 def trace_paths(
@@ -34,10 +37,10 @@ def trace_paths(
     *,
     transmitter: ArrayLike,
     receivers: ArrayLike,
-    frequency_hz: float,
-    mirror_order: int = 1,
-    transmissions: int = 0,
-    diffractions: int = 0,
+    frequency_hz: Hertz,
+    mirror_order: Order = 1,
+    transmissions: SlabCount = 0,
+    diffractions: Annotated[int, whole(0, 1)] = 0,
     gas: Gas = False,
     progress: Progress | None = None,
     device: DeviceLike = None,
@@ -85,18 +88,19 @@ def trace_paths(
     Warns:
         UserWarning: below 100 GHz and outdoors, of diffraction and transmission if not asked for.
     """
-    ends, frequency, order, most = _checked_question(
-        mesh_or_scene, receivers, transmitter, frequency_hz, mirror_order, transmissions, diffractions, device
-    )
+    ends = Ends.of(receivers, transmitter)
+    most = {"transmissions": transmissions, "diffractions": diffractions}
+    _check_question(mesh_or_scene, ends, frequency_hz, device, **most)
     tell: Progress = progress or (lambda stage, done, total: None)
     found: dict[int, Paths] = {}
     for source, own in ends.groups():
         tell("patches", 0, 1)
         tracer = MirrorTracer(
-            mesh_or_scene, transmitter=source, frequency_hz=frequency, device=device, **most
+            mesh_or_scene, transmitter=source, frequency_hz=frequency_hz, device=device, **most
         )
         tell("patches", 1, 1)
-        found |= zip(own.tolist(), tracer.trace_each(ends.receivers[own], order, progress), strict=True)
+        several = tracer.trace_each(ends.receivers[own], mirror_order, progress)
+        found |= zip(own.tolist(), several, strict=True)
     several = [found[k] for k in sorted(found)]
     return (several[0] if ends.single else Paths.stack(several)).with_gas(gas)
 
@@ -107,9 +111,9 @@ def trace_specular(
     *,
     transmitter: ArrayLike,
     receivers: ArrayLike,
-    frequency_hz: float,
-    mirror_order: int = 1,
-    transmissions: int = 0,
+    frequency_hz: Hertz,
+    mirror_order: Order = 1,
+    transmissions: SlabCount = 0,
     progress: Progress | None = None,
     device: DeviceLike = None,
 ) -> SpecularPaths:
@@ -140,40 +144,30 @@ def trace_specular(
     """
     if np.ndim(transmitter) != 1:
         raise ValueError(f"transmitter: got shape {np.shape(transmitter)}, expected (3,)")
-    ends, frequency, order, most = _checked_question(
-        mesh_or_scene, receivers, transmitter, frequency_hz, mirror_order, transmissions, 0, device
-    )
+    ends = Ends.of(receivers, transmitter)
+    _check_question(mesh_or_scene, ends, frequency_hz, device, transmissions)
     tracer = MirrorTracer(
-        mesh_or_scene, transmitter=ends.transmitters[0], frequency_hz=frequency, device=device, **most
-    )
-    return tracer.trace_specular(ends.receivers, order, progress)
+        mesh_or_scene, transmitter=ends.transmitters[0], frequency_hz=frequency_hz, transmissions=transmissions, device=device
+    )  # fmt: skip
+    return tracer.trace_specular(ends.receivers, mirror_order, progress)
 
 
-def _checked_question(
+def _check_question(
     mesh_or_scene: GeometryLike,
-    receivers: ArrayLike,
-    transmitter: ArrayLike,
+    ends: Ends,
     frequency_hz: float,
-    mirror_order: int,
-    transmissions: int,
-    diffractions: int,
     device: DeviceLike,
-) -> tuple[Ends, float, int, dict[str, int]]:
-    """What :func:`trace_paths` is asked, checked: ends, carrier, order, most slabs and edges."""
-    ends, frequency = Ends.of(receivers, transmitter), check_frequency(frequency_hz)
-    mesh, wavelength_m = as_mesh(mesh_or_scene), SPEED_OF_LIGHT / frequency
+    transmissions: int,
+    diffractions: int = 0,
+) -> None:
+    """Refuse places that :func:`trace_paths` cannot answer for, and warn of what it leaves out."""
+    mesh, wavelength_m = as_mesh(mesh_or_scene), SPEED_OF_LIGHT / frequency_hz
     question_unit(mesh, wavelength_m)
     for source, own in ends.groups():
         points = ends.shaped(ends.receivers[own])
         check_positions(mesh, source, points, wavelength_m, on_surfaces=True, device=device)
         modelled = {"transmission": transmissions > 0, "diffraction": diffractions > 0}
-        warn_of_unmodelled(mesh, source, points, frequency_hz=frequency, device=device, **modelled)
-    order = check_count("mirror_order", mirror_order, 0)
-    most = {
-        "transmissions": check_count("transmissions", transmissions, 0, MOST_SLABS),
-        "diffractions": check_count("diffractions", diffractions, 0, 1),
-    }
-    return ends, frequency, order, most
+        warn_of_unmodelled(mesh, source, points, frequency_hz=frequency_hz, device=device, **modelled)
 
 
 class MirrorTracer:
@@ -278,9 +272,9 @@ class MirrorTracer:
         own = found.take(np.flatnonzero(found.receiver == k))
         jones = (self.wavelength_m / (4.0 * np.pi * own.length_m))[:, None, None] * own.matrix
         kind = np.full(len(own), "edge", "<U7")
-        return Paths._from_points(
+        return Paths.from_points(
             self.transmitter, point, own.point, own.amplitude, kind, self.frequency_hz,
-            None if self.table is None else jones, own.excess_m, interactions=own.code,
+            jones=None if self.table is None else jones, excess_m=own.excess_m, interactions=own.code,
         )  # fmt: skip
 
     def find(

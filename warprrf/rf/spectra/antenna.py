@@ -21,7 +21,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,7 +29,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 from warprrf.cache import cached_property
-from warprrf.checks import check_array, check_number, check_positive, checked
+from warprrf.checks import Positive, check_array, checked, one_of, within
 from warprrf.rf.spectra.antenna_files import read_cuts
 from warprrf.rf.spectra.spectrum import (
     angles_from_directions,
@@ -73,17 +73,13 @@ class Antenna:
     """
 
     pattern: str | Shape | Sequence[Shape] = "isotropic"
-    polarisation: str | None = None
+    polarisation: Annotated[str | None, one_of(None, *SLANTS_RAD)] = None
     orientation: ArrayLike = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if isinstance(self.pattern, str) and self.pattern not in PATTERNS:
             raise ValueError(
                 f"pattern: got {self.pattern!r}, expected {', '.join(PATTERNS)}, an Antenna, a function or samples"
-            )
-        if self.polarisation is not None and self.polarisation not in SLANTS_RAD:
-            raise ValueError(
-                f"polarisation: got {self.polarisation!r}, expected None, {', '.join(SLANTS_RAD)}"
             )
         _ = self.rotation, self._probed
 
@@ -110,11 +106,7 @@ class Antenna:
         Raises:
             TypeError, ValueError: naming the argument.
         """
-        rows, columns, turn = (
-            check_array("zenith", zenith, (None,)),
-            check_array("azimuth", azimuth, (None,)),
-            2 * np.pi,
-        )
+        rows, columns = check_array("zenith", zenith, (None,)), check_array("azimuth", azimuth, (None,))
         for name, angles, least in (("zenith", rows, 2), ("azimuth", columns, 3)):
             if len(angles) < least or not (np.diff(angles) > 0).all():
                 raise ValueError(f"{name}: got {len(angles)} angles, expected {least} or more, rising [rad]")
@@ -123,10 +115,8 @@ class Antenna:
             raise ValueError(
                 f"zenith: got {rows[0]:g} to {rows[-1]:g}, expected 0 to pi (elevations: from the zenith down)"
             )
-        if (
-            columns[-1] - columns[0] > turn + 1e-6
-            or turn - (columns[-1] - columns[0]) > np.diff(columns).max() * 1.001
-        ):
+        missing = 2.0 * np.pi - (columns[-1] - columns[0])
+        if not -1e-6 <= missing <= np.diff(columns).max() * 1.001:
             raise ValueError(
                 f"azimuth: got {columns[0]:g} to {columns[-1]:g}, expected angles all the way round, 2 pi; give a gain of 0 "
                 "where nothing is sent"
@@ -181,20 +171,17 @@ class Antenna:
         if isinstance(self.pattern, _OffBoresight):  # a narrow beam may lie between the directions
             zenith, azimuth = np.full(3601, 0.5 * np.pi), np.linspace(0.0, np.pi, 3601)
         found = [_evaluated(shape, zenith, azimuth) for shape in self._shapes]
-        fields = [port.ndim == zenith.ndim + 1 for port in found]
+        fields = [port.ndim > zenith.ndim for port in found]
         if any(fields) and self.polarisation is not None:
             raise ValueError(
                 f"polarisation: got {self.polarisation!r} for a pattern of fields, which has its own; expected None"
             )
         if len(found) > 1 and not all(fields):
             raise ValueError("pattern: got gains for one of several ports, expected pairs of fields for each")
-        gains = [
-            (np.abs(port) ** 2).sum(axis=-1) if of_fields else port
-            for port, of_fields in zip(found, fields, strict=True)
-        ]
-        if not max(g.max() for g in gains) > 0:
+        peak = float(_mean_gain(self._shapes, zenith, azimuth).max())
+        if not peak > 0:
             raise ValueError("pattern: got no gain in any direction, expected linear power gains")
-        return any(fields), float(np.mean(gains, axis=0).max())
+        return any(fields), peak
 
     @property
     def _shapes(self) -> tuple[Shape, ...]:
@@ -233,15 +220,13 @@ class Antenna:
         """The same gain without polarisation, mean over the ports: for what reckons with powers, as beams and readings do."""
         if not self.polarised:
             return self
-        own: Shape | str = self.pattern if self.polarisation is not None else _GainOf(self._shapes)  # type: ignore[assignment]
+        own: Any = self.pattern if self.polarisation is not None else partial(_mean_gain, self._shapes)
         return replace(self, pattern=own, polarisation=None)
 
     def gain(self, directions: ArrayLike) -> np.ndarray:
         """Power gain [linear] towards ``directions`` (..., 3) of any length, shape ``(...)``; the mean over the ports."""
         local = check_array("directions", directions, (..., 3), finite=False) @ self.rotation
-        found = [_evaluated(shape, *angles_from_directions(local)) for shape in self._shapes]
-        gains = [(np.abs(port) ** 2).sum(axis=-1) if port.ndim == local.ndim else port for port in found]
-        return np.asarray(gains[0] if len(gains) == 1 else np.mean(gains, axis=0))
+        return _mean_gain(self._shapes, *angles_from_directions(local))
 
     def field(self, directions: ArrayLike) -> np.ndarray:
         """(F_theta, F_phi) along the zenith and azimuth unit vectors of unit vectors ``directions`` (..., 3).
@@ -352,7 +337,8 @@ def check_rotation(orientation: ArrayLike) -> np.ndarray:
     return value
 
 
-def horn(width_rad: float, floor_db: float = -60.0) -> Antenna:
+@checked
+def horn(width_rad: Positive, floor_db: Annotated[float, within(-200.0, 0.0)] = -60.0) -> Antenna:
     """A horn whose gain is Gaussian in the angle off boresight, lossless.
 
     Args:
@@ -362,15 +348,14 @@ def horn(width_rad: float, floor_db: float = -60.0) -> Antenna:
     Raises:
         ValueError: for other numbers.
     """
-    width, low = check_positive("width_rad", width_rad), check_number("floor_db", floor_db, -200.0, 0.0)
-    if width > 2.0 * np.pi / 3.0:
+    if width_rad > 2.0 * np.pi / 3.0:
         raise ValueError(
-            f"width_rad: got {width:g}, expected radians, at most 2.09: "
-            f"horn(np.radians({width:g})) is {width:g} degrees wide"
+            f"width_rad: got {width_rad:g}, expected radians, at most 2.09: "
+            f"horn(np.radians({width_rad:g})) is {width_rad:g} degrees wide"
         )
     angle = np.linspace(0.0, np.pi, 20_001)
-    mean = 0.5 * np.trapezoid(_horn_gain(width, low, 1.0, angle) * np.sin(angle), angle)
-    return Antenna(_OffBoresight(partial(_horn_gain, width, low, mean)))
+    mean = 0.5 * np.trapezoid(_horn_gain(width_rad, floor_db, 1.0, angle) * np.sin(angle), angle)
+    return Antenna(_OffBoresight(partial(_horn_gain, width_rad, floor_db, mean)))
 
 
 def main_lobe(antenna: Antenna) -> Antenna:
@@ -432,10 +417,7 @@ class _OffBoresight:
 
     def at(self, angle: np.ndarray) -> np.ndarray:
         """The gain at ``angle`` [rad], shape as ``angle``."""
-        gain = check_array("pattern", self.gain(angle), finite=False)
-        if gain.shape not in ((), angle.shape):
-            raise ValueError(f"pattern: got shape {gain.shape} for angles {angle.shape}, expected the same")
-        return _checked_gain(np.broadcast_to(gain, angle.shape), angle)
+        return _checked_gain(self.gain(angle), angle)
 
 
 @dataclass(frozen=True, eq=False)
@@ -462,15 +444,11 @@ class _Grid:
         return found if self.values.ndim == 2 else (found[..., 0], found[..., 1])
 
 
-@dataclass(frozen=True, eq=False)
-class _GainOf:
-    """Mean gain of ports of fields."""
-
-    ports: tuple[Shape, ...]
-
-    def __call__(self, zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
-        gains = [(np.abs(_evaluated(port, zenith, azimuth)) ** 2).sum(axis=-1) for port in self.ports]
-        return np.asarray(np.mean(gains, axis=0))
+def _mean_gain(ports: Sequence[Shape], zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    """Gain, the mean over ports of gains or fields, shape as ``zenith``."""
+    found = [_evaluated(port, zenith, azimuth) for port in ports]
+    gains = [(np.abs(port) ** 2).sum(axis=-1) if port.ndim > zenith.ndim else port for port in found]
+    return np.asarray(np.mean(gains, axis=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -513,8 +491,12 @@ def _interpolated(samples: np.ndarray, angle: np.ndarray) -> np.ndarray:
     return np.interp(angle, np.linspace(0.0, np.pi, len(samples)), samples)
 
 
-def _checked_gain(gain: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Gains that are none are refused; those at unknown angles (NaN) are unknown."""
+def _checked_gain(found: ArrayLike, angle: np.ndarray) -> np.ndarray:
+    """Gains ``found`` at ``angle``, of its shape. What is no gain is refused; those at unknown angles (NaN) are unknown."""
+    gain = check_array("pattern", found, finite=False)
+    if gain.shape not in ((), angle.shape):
+        raise ValueError(f"pattern: got shape {gain.shape} for angles {angle.shape}, expected the same")
+    gain = np.broadcast_to(gain, angle.shape)
     if not np.isfinite(gain[np.isfinite(angle)]).all() or (gain < 0).any():
         raise ValueError("pattern: got negative, NaN or infinite gains, expected linear power gains")
     return gain
@@ -534,7 +516,4 @@ def _evaluated(shape: Shape, zenith: np.ndarray, azimuth: np.ndarray) -> np.ndar
         if not np.isfinite(field[np.isfinite(zenith)]).all():
             raise ValueError("pattern: got NaN or infinite fields, expected finite ones")
         return field if np.iscomplexobj(found[0]) or np.iscomplexobj(found[1]) else field.real
-    gain = check_array("pattern", found, finite=False)
-    if gain.shape not in ((), zenith.shape):
-        raise ValueError(f"pattern: got shape {gain.shape} for angles {zenith.shape}, expected the same")
-    return _checked_gain(np.broadcast_to(gain, zenith.shape), zenith)
+    return _checked_gain(found, zenith)

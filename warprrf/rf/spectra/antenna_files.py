@@ -16,11 +16,6 @@ from pathlib import Path
 
 import numpy as np
 
-DIPOLE_DBI = 2.15
-"""Gain of the half-wave dipole that dBd counts from."""
-LARGEST_BYTES = 4_000_000  # of a file; those of 720 angles a cut have 20 thousand
-WIDEST_GAP_DEG = 30.0  # between angles of a cut: what lies between is guessed
-
 
 @dataclass(frozen=True, eq=False)
 class Cuts:
@@ -59,8 +54,9 @@ def read_cuts(path: str | os.PathLike[str]) -> Cuts:
         raise FileNotFoundError(f"path: there is no file {file}")
     if file.suffix.lower() not in (".msi", ".pln"):
         raise ValueError(f"path: {file}: got a file {file.suffix or 'without suffix'}, expected .msi or .pln")
-    if file.stat().st_size > LARGEST_BYTES:
-        raise ValueError(f"path: {file}: got {file.stat().st_size} bytes, expected at most {LARGEST_BYTES}")
+    most_bytes = 4_000_000  # a file of 720 angles a cut has 20 thousand
+    if file.stat().st_size > most_bytes:
+        raise ValueError(f"path: {file}: got {file.stat().st_size} bytes, expected at most {most_bytes}")
     try:
         return _parsed(file.read_text(encoding="utf-8", errors="replace").splitlines())
     except ValueError as error:
@@ -104,7 +100,8 @@ def _gain_dbi(rest: list[str], line: int) -> float:
         value = np.nan
     if not -100.0 <= value <= 100.0:
         raise ValueError(f"line {line}: GAIN: got {' '.join(rest)!r:.40}, expected a number, then dBd or dBi")
-    return value if unit == "dbi" else value + DIPOLE_DBI
+    dipole_dbi = 2.15  # gain of the half-wave dipole that dBd counts from
+    return value if unit == "dbi" else value + dipole_dbi
 
 
 def _cut(key: str, rest: list[str], lines: list[str], line: int) -> np.ndarray:
@@ -128,10 +125,11 @@ def _cut(key: str, rest: list[str], lines: list[str], line: int) -> np.ndarray:
         found[k] = angle, loss
     around = np.unique(found[:, 0] % 360.0)
     gap = np.diff(np.append(around, around[0] + 360.0)).max()
-    if gap > WIDEST_GAP_DEG:
+    widest_gap_deg = 30.0  # what lies between two angles is guessed
+    if gap > widest_gap_deg:
         raise ValueError(
             f"line {line}: {key}: got {gap:g} degrees without a value, expected angles all the way round, at most "
-            f"{WIDEST_GAP_DEG:g} apart"
+            f"{widest_gap_deg:g} apart"
         )
     return found
 

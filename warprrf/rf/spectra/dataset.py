@@ -5,17 +5,17 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Annotated, Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_chosen, check_count, check_positive, check_seed, checked
+from warprrf.checks import Seed, Shaped, check_array, check_chosen, check_count, checked, positive, whole
 from warprrf.device import DeviceLike
 from warprrf.rf.em.absorption import Air
-from warprrf.rf.em.waves import check_frequency
+from warprrf.rf.em.waves import Hertz
 from warprrf.rf.spectra import dataset_files
 from warprrf.rf.spectra.antenna import Pattern
 from warprrf.rf.spectra.deembedding import deembed
@@ -23,9 +23,11 @@ from warprrf.rf.spectra.levels import free_space_gain, question_levels
 from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
     DEFAULT_SHAPE,
+    Floor,
+    GridShape,
+    RangeDb,
     Spectrum,
     check_departures,
-    check_range_db,
     check_shape,
     check_whole,
     default_floor,
@@ -36,8 +38,8 @@ from warprrf.rf.spectra.spectrum import (
 
 POLARISATION = "mean over vertical and horizontal transmit, sum over both receive polarisations"
 
-_ROLES = ("train", "test")
-SAME_PLACE_M = 1e-3  # a spectrum measured this near is the same one
+
+BeamWidth: TypeAlias = Annotated[float, positive("beam width in radians")]
 
 
 @runtime_checkable
@@ -109,47 +111,29 @@ class SpectrumDataset:
             lists of them, under names that the file does not need itself.
     """
 
-    receivers: np.ndarray
-    transmitter: np.ndarray
-    frequency_hz: float
-    path_gain: np.ndarray
-    delay_s: np.ndarray
-    aod: np.ndarray
-    floor: float
-    range_db: tuple[float, float]
-    beam_sigma_rad: float
+    receivers: Annotated[np.ndarray, Shaped("R 3")]
+    transmitter: Annotated[np.ndarray, Shaped("3")]
+    frequency_hz: Hertz
+    path_gain: Annotated[np.ndarray, Shaped("R H W", np.float32, finite=False, least=0.0)]
+    delay_s: Annotated[np.ndarray, Shaped("R H W", finite=False, least=0.0)]
+    aod: Annotated[np.ndarray, Shaped("R H W 2", np.float32, finite=False)]
+    floor: Floor
+    range_db: RangeDb
+    beam_sigma_rad: BeamWidth
     engine: str
     polarisation: str
-    seed: int
+    seed: Seed
     role: NDArray[np.str_]
     line_of_sight: np.ndarray
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check shapes and values; ValueError or TypeError names the field."""
-        receivers = check_array("receivers", self.receivers, (None, 3))
-        count = len(receivers)
-        spectra = (count, None, None)
-        gain = check_array("path_gain", self.path_gain, spectra, np.float32, finite=False, least=0.0)
-        shape = check_shape(gain.shape[1:])
-        values: dict[str, Any] = {
-            "receivers": receivers,
-            "transmitter": check_array("transmitter", self.transmitter, (3,)),
-            "frequency_hz": check_frequency(self.frequency_hz),
-            "path_gain": gain,
-            "delay_s": check_array("delay_s", self.delay_s, (count, *shape), finite=False, least=0.0),
-            "aod": check_array("aod", self.aod, (count, *shape, 2), dtype=np.float32, finite=False),
-            "floor": check_positive("floor", self.floor, "linear noise floor"),
-            "range_db": check_range_db(self.range_db),
-            "beam_sigma_rad": check_positive("beam_sigma_rad", self.beam_sigma_rad, "beam width in radians"),
-            "seed": check_seed(self.seed),
-            "role": _check_roles(self.role, count),
-            "line_of_sight": _check_flags("line_of_sight", self.line_of_sight, count),
-            "attributes": _check_attributes(self.attributes),
-        }
-        check_departures(values["aod"])
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        check_shape(self.shape)
+        check_departures(self.aod)
+        object.__setattr__(self, "role", _check_roles(self.role, len(self)))
+        object.__setattr__(self, "line_of_sight", _check_flags(self.line_of_sight, len(self)))
+        object.__setattr__(self, "attributes", _check_attributes(self.attributes))
 
     def __repr__(self) -> str:
         train = int((self.role == "train").sum())
@@ -164,18 +148,18 @@ class SpectrumDataset:
     def from_spectra(
         cls,
         *,
-        receivers: np.ndarray,
-        transmitter: np.ndarray,
-        frequency_hz: float,
-        path_gain: np.ndarray,
+        receivers: Annotated[np.ndarray, Shaped("R 3")],
+        transmitter: Annotated[np.ndarray, Shaped("3")],
+        frequency_hz: Hertz,
+        path_gain: Annotated[np.ndarray, Shaped("R H W", np.float32, finite=False, least=0.0)],
         delay_s: np.ndarray | None = None,
         aod: np.ndarray | None = None,
         line_of_sight: np.ndarray | None = None,
-        beam_sigma_rad: float,
+        beam_sigma_rad: BeamWidth,
         engine: str = "measured",
-        seed: int = 0,
+        seed: Seed = 0,
         role: Sequence[str] | NDArray[np.str_] | None = None,
-        floor: float | None = None,
+        floor: Floor | None = None,
         attributes: Mapping[str, Any] | None = None,
     ) -> SpectrumDataset:
         """A data set with N0, its dB range and, if none are given, roles chosen for it.
@@ -196,15 +180,12 @@ class SpectrumDataset:
             UserWarning: naming receivers that get far more than line of sight would give; see
                 :data:`~warprrf.rf.spectra.levels.MARGIN_DB`.
         """
-        gain = check_array("path_gain", path_gain, (None, None, None), np.float32, finite=False, least=0.0)
+        gain = path_gain
         if len(gain) == 0 or np.isnan(gain).all():
             raise ValueError("path_gain: got no spectra, expected one receiver's or more")
-        places = check_array("receivers", receivers, (len(gain), 3))
-        source = check_array("transmitter", transmitter, (3,))
         if line_of_sight is None:
-            frequency, beam = check_frequency(frequency_hz), check_positive("beam_sigma_rad", beam_sigma_rad)
-            line_of_sight = _sees(places, source, gain, frequency, beam)
-        noise = default_floor(gain) if floor is None else check_positive("floor", floor, "linear noise floor")
+            line_of_sight = _sees(receivers, transmitter, gain, frequency_hz, beam_sigma_rad)
+        noise = default_floor(gain) if floor is None else floor
         found = cls(
             receivers=receivers,
             transmitter=transmitter,
@@ -230,7 +211,7 @@ class SpectrumDataset:
         cls,
         paths: PathsLike,
         *,
-        shape: tuple[int, int] = DEFAULT_SHAPE,
+        shape: GridShape = DEFAULT_SHAPE,
         beam_sigma_rad: float = BEAM_SIGMA_RAD,
         floor: float | None = None,
         role: Sequence[str] | NDArray[np.str_] | None = None,
@@ -262,8 +243,7 @@ class SpectrumDataset:
             )
         if np.ndim(paths.transmitter) != 1:
             raise ValueError("paths: got ones of several transmitters, expected those of one")
-        grid = check_shape(shape)
-        found = [Received.of(p, grid, beam_sigma_rad, device) for p in paths.each()]
+        found = [Received.of(p, shape, beam_sigma_rad, device) for p in paths.each()]
         return cls.from_spectra(
             receivers=np.atleast_2d(paths.receiver),
             transmitter=paths.transmitter,
@@ -282,10 +262,10 @@ class SpectrumDataset:
         cls,
         *,
         transmitter: ArrayLike,
-        frequency_hz: float,
-        shape: tuple[int, int] = DEFAULT_SHAPE,
+        frequency_hz: Hertz,
+        shape: GridShape = DEFAULT_SHAPE,
         beam_sigma_rad: float = BEAM_SIGMA_RAD,
-        floor: float | None = None,
+        floor: Floor | None = None,
     ) -> SpectrumDataset:
         """A data set before the first measurement: a field that is fitted to it is what is known without any.
 
@@ -299,14 +279,13 @@ class SpectrumDataset:
         Raises:
             TypeError, ValueError: naming the argument.
         """
-        rows, columns = check_shape(shape)
         away = np.array([10.0, 0.0, 0.0])
-        strongest = float(free_space_gain(away, np.zeros(3), check_frequency(frequency_hz)))
-        noise = 1e-6 * strongest if floor is None else check_positive("floor", floor, "linear noise floor")
+        strongest = float(free_space_gain(away, np.zeros(3), frequency_hz))
+        noise = 1e-6 * strongest if floor is None else floor
         return cls(
             receivers=np.zeros((0, 3)), transmitter=check_array("transmitter", transmitter, (3,)),
-            frequency_hz=frequency_hz, path_gain=np.zeros((0, rows, columns)),
-            delay_s=np.zeros((0, rows, columns)), aod=np.zeros((0, rows, columns, 2)), floor=noise,
+            frequency_hz=frequency_hz, path_gain=np.zeros((0, *shape)),
+            delay_s=np.zeros((0, *shape)), aod=np.zeros((0, *shape, 2)), floor=noise,
             range_db=(10.0 * float(np.log10(noise)), 10.0 * float(np.log10(max(noise, strongest)))),
             beam_sigma_rad=beam_sigma_rad, engine="none", polarisation=POLARISATION, seed=0,
             role=np.zeros(0, "<U5"), line_of_sight=np.zeros(0, bool),
@@ -324,20 +303,10 @@ class SpectrumDataset:
         """
         if isinstance(index, bool) or not isinstance(index, int | np.integer):
             raise TypeError(f"index: got {index!r}, expected a whole number; subset() takes several")
-        return Spectrum(
-            path_gain=self.path_gain[index],
-            delay_s=self.delay_s[index],
-            aod=self.aod[index],
-            floor=self.floor,
-            range_db=self.range_db,
-            attributes={
-                "receiver": self.receivers[index],
-                "transmitter": self.transmitter,
-                "frequency_hz": self.frequency_hz,
-                "beam_sigma_rad": self.beam_sigma_rad,
-                "engine": self.engine,
-            },
-        )
+        of_all = ("transmitter", "frequency_hz", "beam_sigma_rad", "engine")
+        attributes = {"receiver": self.receivers[index]} | {name: getattr(self, name) for name in of_all}
+        arrays = self.path_gain[index], self.delay_s[index], self.aod[index]
+        return Spectrum(*arrays, self.floor, self.range_db, attributes=attributes)
 
     def __iter__(self) -> Any:
         return (self[k] for k in range(len(self)))
@@ -363,7 +332,7 @@ class SpectrumDataset:
         per_receiver = ("receivers", "path_gain", "delay_s", "aod", "role", "line_of_sight")
         return replace(self, **{name: getattr(self, name)[chosen] for name in per_receiver})
 
-    def split(self, n_train: int, seed: int = 0) -> tuple[SpectrumDataset, SpectrumDataset]:
+    def split(self, n_train: int, seed: Seed = 0) -> tuple[SpectrumDataset, SpectrumDataset]:
         """``n_train`` training receivers and all test receivers.
 
         Subsets are nested: a larger ``n_train`` holds the smaller one. Seed 0 takes training receivers in the order of
@@ -377,7 +346,7 @@ class SpectrumDataset:
         check_count("n_train", n_train, most=len(train))
         if len(test) == 0:
             raise ValueError("role: there are no test receivers; give simulate(..., roles=) some")
-        if check_seed(seed) != 0:
+        if seed != 0:
             train = np.random.default_rng(seed).permutation(train)
         return self.subset(train[:n_train]), self.subset(test)
 
@@ -420,15 +389,8 @@ class SpectrumDataset:
             ValueError: on negative, NaN or infinite gains, a scanned antenna without directivity, another shape.
         """
         check_whole("path_gain", self.path_gain)
-        done = deembed(
-            self.path_gain,
-            pattern,
-            self.beam_sigma_rad,
-            boresight_gain_dbi=boresight_gain_dbi,
-            noise=noise,
-            progress=progress,
-            **options,
-        )
+        options |= {"boresight_gain_dbi": boresight_gain_dbi, "noise": noise, "progress": progress}
+        done = deembed(self.path_gain, pattern, self.beam_sigma_rad, **options)
         count, rows, columns = done.path_gain.shape
         there = done.source.reshape(count, -1)
         chosen = np.maximum(there, 0)
@@ -500,11 +462,10 @@ class SpectrumDataset:
         )
 
 
-def assign_roles(count: int, *, test: int | None = None, seed: int = 0) -> np.ndarray:
+@checked
+def assign_roles(count: Annotated[int, whole(0)], *, test: int | None = None, seed: Seed = 0) -> np.ndarray:
     """ "train" or "test" for each of ``count`` receivers, ``test`` of them (an eighth by default) drawn at random."""
-    check_count("count", count, least=0)
     wanted = count // 8 if test is None else check_count("test", test, least=0, most=count)
-    check_seed(seed)
     role = np.full(count, "train", dtype="<U5")
     role[np.random.default_rng(seed).choice(count, wanted, replace=False)] = "test"
     return role
@@ -533,25 +494,28 @@ def _sees(
 def measured_at(ds: SpectrumDataset, receivers: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
     """Which spectra of ``ds`` are of ``receivers`` (K, 3) under ``transmitter`` [m], (3,) or that of each (K, 3), shape
     ``(R,)`` bool."""
+    same_m = 1e-3  # a spectrum measured this near is the same one
     under = np.broadcast_to(transmitter, receivers.shape)
-    own = receivers[np.linalg.norm(under - ds.transmitter, axis=1) <= SAME_PLACE_M]
+    own = receivers[np.linalg.norm(under - ds.transmitter, axis=1) <= same_m]
     if len(own) == 0:
         return np.zeros(len(ds.receivers), dtype=bool)
-    return np.asarray(cKDTree(own).query(ds.receivers)[0] <= SAME_PLACE_M)
+    return np.asarray(cKDTree(own).query(ds.receivers)[0] <= same_m)
 
 
 def _check_roles(role: ArrayLike, count: int) -> np.ndarray:
     found = np.asarray(role)
-    if found.shape != (count,) or not np.isin(found, _ROLES).all():
+    if found.shape != (count,) or not np.isin(found, ("train", "test")).all():
         held = f" of {', '.join(sorted(map(repr, found.astype(str).tolist())))[:80]}" * (found.ndim == 1)
         raise ValueError(f"role: got shape {found.shape}{held}, expected ({count},) of 'train' and 'test'")
     return found.astype("<U5")
 
 
-def _check_flags(name: str, value: ArrayLike, count: int) -> np.ndarray:
-    found = check_array(name, value, (count,))
+def _check_flags(value: ArrayLike, count: int) -> np.ndarray:
+    found = check_array("line_of_sight", value, (count,))
     if not np.isin(found, (0.0, 1.0)).all():
-        raise ValueError(f"{name}: got {found[~np.isin(found, (0.0, 1.0))][0]:g}, expected True and False")
+        raise ValueError(
+            f"line_of_sight: got {found[~np.isin(found, (0.0, 1.0))][0]:g}, expected True and False"
+        )
     return found.astype(bool)
 
 

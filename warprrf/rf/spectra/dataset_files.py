@@ -21,30 +21,19 @@ from warprrf.device import require
 from warprrf.files import write_atomically
 from warprrf.netcdf_files import XYZ, Axis, Variable
 from warprrf.rf.spectra.spectrum import Spectrum
+from warprrf.tensor_files import named
 
-# What a compact file keeps. A relative step of 2^-7 errs by at most 0.017 dB, half of N0 / 64 moves the dB image by at
-# most 0.034 dB.
-COMPACT_GAIN_BITS = 7  # explicit mantissa bits
-COMPACT_GAIN_OF_FLOOR = 2.0**-6  # absolute step, times N0
+# What a compact file keeps; of path gain see _rounded.
 COMPACT_DELAY_STEP_S = 2.0**-39  # 1.8 ps between values: errors below 0.91 ps, 0.27 mm
 COMPACT_AOD_STEP_RAD = 2.0**-10  # 9.8e-4 rad between values: errors below 4.9e-4 rad
 
 _PIXEL = ("receiver", "zenith", "azimuth")
-_FIELD_OF = {
-    "receiver_position": "receivers",
-    "transmitter_position": "transmitter",
-    "path_gain": "path_gain",
-    "delay": "delay_s",
-    "aod": "aod",
-    "role": "role",
-    "line_of_sight": "line_of_sight",
-}
-"""Field of each variable."""
+_DELAY = {"long_name": "delay of the pixel's strongest path"}
 _VARIABLES = {
-    "receiver_position": Variable(("receiver", "xyz"), "m"),
-    "transmitter_position": Variable(("xyz",), "m"),
+    "receiver_position": Variable(("receiver", "xyz"), "m", field="receivers"),
+    "transmitter_position": Variable(("xyz",), "m", field="transmitter"),
     "path_gain": Variable(_PIXEL, "1", {"long_name": "path gain per pixel, linear"}, packed=True),
-    "delay": Variable(_PIXEL, "s", {"long_name": "delay of the pixel's strongest path"}, packed=True),
+    "delay": Variable(_PIXEL, "s", _DELAY, packed=True, field="delay_s"),
     "aod": Variable(
         (*_PIXEL, "angle"),
         "rad",
@@ -52,9 +41,11 @@ _VARIABLES = {
         packed=True,
     ),
     "role": Variable(
-        ("receiver",), about={"flag_values": np.array([0, 1], np.int8), "flag_meanings": "train test"}
+        ("receiver",),
+        about={"flag_values": np.array([0, 1], np.int8), "flag_meanings": "train test"},
+        codes=("train", "test"),
     ),
-    "line_of_sight": Variable(("receiver",), "1"),
+    "line_of_sight": Variable(("receiver",), "1", codes=(False, True)),
 }
 _AXES = {
     "zenith": Axis(lambda rows: (np.arange(rows) + 0.5) * np.pi / rows, "rad"),
@@ -74,7 +65,8 @@ _EXPLAINED = {
 }
 
 RESERVED = {
-    *_FIELDS, *_FIELD_OF.values(), "range_db", "attributes", "range_low_db", "range_high_db", *_EXPLAINED, "compact",
+    *_FIELDS, *(it.field or name for name, it in _VARIABLES.items()), "range_db", "attributes", "range_low_db",
+    "range_high_db", *_EXPLAINED, "compact",
     "compact_rounding", "CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST",
 }  # fmt: skip
 """Names that the file needs itself, fields among them, and those of HDF5's dimensions."""
@@ -87,9 +79,7 @@ _WORDS = ("engine", "polarisation")
 
 def write(path: str | os.PathLike[str], values: Mapping[str, Any], *, compact: bool = False) -> None:
     """Write the fields ``values`` of a data set; see :meth:`~warprrf.rf.spectra.dataset.SpectrumDataset.save`."""
-    arrays = {name: values[field] for name, field in _FIELD_OF.items()}
-    arrays["role"] = (arrays["role"] == "test").astype(np.int8)
-    arrays["line_of_sight"] = arrays["line_of_sight"].astype(np.int8)
+    arrays = netcdf_files.encoded(values, _VARIABLES)
     attributes: dict[str, Any] = {
         **_EXPLAINED,
         **{name: values[name] for name in _FIELDS},
@@ -99,11 +89,8 @@ def write(path: str | os.PathLike[str], values: Mapping[str, Any], *, compact: b
         **values["attributes"],
     }
     if compact:
-        arrays |= _rounded(arrays, values["floor"])
-        attributes["compact_rounding"] = (
-            f"path_gain: {COMPACT_GAIN_BITS} mantissa bits and steps of floor * {COMPACT_GAIN_OF_FLOOR:g}; "
-            f"delay: {COMPACT_DELAY_STEP_S:g} s; aod: {COMPACT_AOD_STEP_RAD:g} rad"
-        )
+        rounded, attributes["compact_rounding"] = _rounded(arrays, values["floor"])
+        arrays |= rounded
     netcdf_files.write(path, arrays, _VARIABLES, _AXES, attributes, level=9 if compact else 4)
 
 
@@ -118,26 +105,30 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
     arrays, attributes = netcdf_files.read(path, _VARIABLES, _AXES)
     if lacking := sorted({*_FIELDS, "range_low_db", "range_high_db"} - set(attributes)):
         raise ValueError(f"{file}: lacks {', '.join(lacking)}, expected a data set saved by warprrf")
-    for name in ("role", "line_of_sight"):
-        if not np.isin(arrays[name], (0, 1)).all():
-            raise ValueError(f"{file}: {name}: got {sorted(set(arrays[name].tolist()))}, expected 0 and 1")
+    with named(path, "damaged"):
+        fields = netcdf_files.decoded(arrays, _VARIABLES)
     return {
-        **{field: arrays[name] for name, field in _FIELD_OF.items()},
+        **fields,
         **{name: attributes[name] for name in _FIELDS},
         "range_db": (attributes["range_low_db"], attributes["range_high_db"]),
-        "role": np.where(arrays["role"] == 1, "test", "train"),
-        "line_of_sight": arrays["line_of_sight"].astype(bool),
         "attributes": {name: value for name, value in attributes.items() if name not in RESERVED},
     }
 
 
-def _rounded(arrays: Mapping[str, np.ndarray], floor: float) -> dict[str, np.ndarray]:
-    """What a compact file holds of path gain, delay and departure; a pixel that becomes zero is empty altogether."""
-    gain = _round_mantissa(arrays["path_gain"], COMPACT_GAIN_BITS, COMPACT_GAIN_OF_FLOOR * floor)
+def _rounded(arrays: Mapping[str, np.ndarray], floor: float) -> tuple[dict[str, np.ndarray], str]:
+    """What a compact file holds of path gain, delay and departure, and how that is rounded; a pixel that becomes zero is empty
+    altogether."""
+    # A relative step of 2^-7 errs by at most 0.017 dB, half of N0 / 64 moves the dB image by at most 0.034 dB.
+    bits, of_floor = 7, 2.0**-6
+    gain = _round_mantissa(arrays["path_gain"], bits, of_floor * floor)
     delay = np.round(arrays["delay"] / COMPACT_DELAY_STEP_S) * COMPACT_DELAY_STEP_S
     aod = (np.round(arrays["aod"] / COMPACT_AOD_STEP_RAD) * COMPACT_AOD_STEP_RAD).astype(np.float32)
     delay[gain == 0] = aod[gain == 0] = np.nan
-    return {"path_gain": gain, "delay": delay, "aod": aod}
+    how = (
+        f"path_gain: {bits} mantissa bits and steps of floor * {of_floor:g}; "
+        f"delay: {COMPACT_DELAY_STEP_S:g} s; aod: {COMPACT_AOD_STEP_RAD:g} rad"
+    )
+    return {"path_gain": gain, "delay": delay, "aod": aod}, how
 
 
 def _round_mantissa(values: np.ndarray, bits: int, step: float) -> np.ndarray:

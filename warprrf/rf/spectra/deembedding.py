@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_count, check_number, check_positive
+from warprrf.checks import Count, NotNegative, Positive, check_array, check_number, check_positive, checked
 from warprrf.device import DeviceLike
 from warprrf.rf.spectra.antenna import Antenna, Pattern, as_antenna
 from warprrf.rf.spectra.spectrum import (
@@ -32,6 +32,7 @@ SCANNED = "scanned antenna: Richardson-Lucy on the sphere, then spread by the st
 FIXED = "fixed antenna: divided by its gain in each direction"
 
 
+@checked
 @dataclass(frozen=True)
 class Scan:
     """How a scanned antenna is taken out.
@@ -47,17 +48,11 @@ class Scan:
         device: Where estimates are spread by the beam.
     """
 
-    noise: float = 0.0
-    snapshots: int = 1
-    iterations: int = 2000
-    tolerance: float = 1e-3
+    noise: NotNegative = 0.0
+    snapshots: Count = 1
+    iterations: Count = 2000
+    tolerance: Positive = 1e-3
     device: DeviceLike = None
-
-    def __post_init__(self) -> None:
-        check_number("noise", self.noise, 0.0)
-        for name in ("iterations", "snapshots"):
-            check_count(name, getattr(self, name))
-        check_positive("tolerance", self.tolerance)
 
 
 class Deembedded(NamedTuple):

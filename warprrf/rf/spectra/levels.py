@@ -7,20 +7,16 @@ them nearest to line of sight.
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import some_of, users_level
+from warprrf.checks import some_of, warn
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.spectra.spectrum import to_db
 
 MARGIN_DB = 18.0
 """By how much all paths together may exceed line of sight: three mirror reflections in a corridor of perfect conductors
 give 16.4 dB, two in a furnished room of them 10.3 dB, a lobby of building materials 3.9 dB."""
-FADING_DB = 10.0
-"""By how much a power at one place may exceed the mean of its fading: 1 in 20,000 does, if it is Rayleigh's."""
 
 
 def free_space_gain(transmitters: np.ndarray, receivers: np.ndarray, frequency_hz: float) -> np.ndarray:
@@ -60,11 +56,9 @@ def question_levels(
     end = f"{unit}{hint}; expected received over transmitted power"
     if len(impossible):
         raise ValueError(f"{rows} are up to {level_db[wrong].max():.4g} dB, not less than transmitted{end}")
-    warnings.warn(
+    warn(
         f"{rows} are up to {above[wrong].max():.3g} dB above line of sight in free space, where reflections add "
-        f"{float(np.max(margin_db)):g} dB at most{end}",
-        UserWarning,
-        stacklevel=users_level(),
+        f"{float(np.max(margin_db)):g} dB at most{end}"
     )
 
 

@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_choice, check_positive, checked
+from warprrf.checks import Positive, check_array, checked, one_of
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.metrics import psnr, unit_image
 from warprrf.rf.spectra.spectrum import Spectrum, check_whole, to_db
@@ -58,11 +59,16 @@ class Lookup:
 @checked
 def nearest(train: SpectrumDataset) -> Lookup:
     """The spectrum of the nearest training receiver, with its delays and angles of departure."""
-    return Lookup("nearest", "", train, partial(_nearest, _receivers(train), train))
+    return Lookup("nearest", "", _whole(train), partial(_nearest, train))
 
 
 @checked
-def idw(train: SpectrumDataset, *, power: float = 2.0, domain: str = "auto") -> Lookup:
+def idw(
+    train: SpectrumDataset,
+    *,
+    power: Positive = 2.0,
+    domain: Annotated[str, one_of("db", "linear", "auto")] = "auto",
+) -> Lookup:
     """Inverse-distance weighting of all training spectra.
 
     Args:
@@ -74,10 +80,7 @@ def idw(train: SpectrumDataset, *, power: float = 2.0, domain: str = "auto") -> 
     Raises:
         ValueError: for a power that is not positive, or an unknown domain.
     """
-    check_positive("power", power)
-    check_choice("domain", domain, ("db", "linear", "auto"))
-    receivers = _receivers(train)
-    floor, range_db = float(train.floor), train.range_db
+    receivers, floor, range_db = _whole(train).receivers, train.floor, train.range_db
     images = np.asarray(train.path_gain, dtype=np.float64)
     tables = {"db": to_db(images, floor), "linear": images}
     note = f"averaged in {domain}"
@@ -95,40 +98,30 @@ def idw(train: SpectrumDataset, *, power: float = 2.0, domain: str = "auto") -> 
             f"averaged in {domain}: leave-one-out PSNR {score['db']:.2f} dB in dB, {score['linear']:.2f} dB in linear "
             "power"
         )
-    return Lookup("idw", note, train, partial(_idw, train, receivers, tables[domain], domain, power))
+    return Lookup("idw", note, train, partial(_idw, train, tables[domain], domain, power))
 
 
 @checked
 def constant(train: SpectrumDataset) -> Lookup:
     """One number for every pixel and receiver: the mean of the training dB images."""
-    _receivers(train)
-    level = float(np.mean(to_db(np.asarray(train.path_gain, np.float64), float(train.floor))))
-    gain = np.full(train.path_gain.shape[1:], max(10 ** (level / 10) - float(train.floor), 0.0))
+    level = float(np.mean(_whole(train).path_gain_db))
+    gain = np.full(train.shape, max(10 ** (level / 10) - train.floor, 0.0))
     return Lookup("constant", f"{level:.2f} dB", train, partial(_same, _bare(gain, train)))
 
 
 @checked
 def mean(train: SpectrumDataset) -> Lookup:
     """The mean of the training dB images, wherever the receiver is."""
-    _receivers(train)
-    images = to_db(np.asarray(train.path_gain, np.float64), float(train.floor))
-    gain = np.maximum(10 ** (np.mean(images, axis=0) / 10) - float(train.floor), 0.0)
+    gain = np.maximum(10 ** (np.mean(_whole(train).path_gain_db, axis=0) / 10) - train.floor, 0.0)
     return Lookup("mean", "", train, partial(_same, _bare(gain, train)))
 
 
-def _nearest(receivers: np.ndarray, train: SpectrumDataset, receiver: np.ndarray) -> Spectrum:
-    return train[int(np.argmin(np.linalg.norm(receivers - receiver, axis=-1)))]
+def _nearest(train: SpectrumDataset, at: np.ndarray) -> Spectrum:
+    return train[int(np.argmin(np.linalg.norm(train.receivers - at, axis=-1)))]
 
 
-def _idw(
-    train: SpectrumDataset,
-    receivers: np.ndarray,
-    table: np.ndarray,
-    domain: str,
-    power: float,
-    at: np.ndarray,
-) -> Spectrum:
-    return _bare(_average(receivers, table, domain, float(train.floor), power, at), train)
+def _idw(train: SpectrumDataset, table: np.ndarray, domain: str, power: float, at: np.ndarray) -> Spectrum:
+    return _bare(_average(train.receivers, table, domain, train.floor, power, at), train)
 
 
 def _average(
@@ -147,13 +140,13 @@ def _same(spectrum: Spectrum, _: np.ndarray) -> Spectrum:
     return spectrum
 
 
-def _receivers(train: SpectrumDataset) -> np.ndarray:
-    if len(train.receivers) == 0:
+def _whole(train: SpectrumDataset) -> SpectrumDataset:
+    if len(train) == 0:
         raise ValueError("train: got no receivers, expected at least one")
     check_whole("train.path_gain", train.path_gain)
-    return train.receivers
+    return train
 
 
 def _bare(path_gain: np.ndarray, train: SpectrumDataset) -> Spectrum:
     """A spectrum without delays or angles of departure."""
-    return Spectrum(path_gain=path_gain.astype(np.float32), floor=float(train.floor), range_db=train.range_db)
+    return Spectrum(path_gain=path_gain.astype(np.float32), floor=train.floor, range_db=train.range_db)

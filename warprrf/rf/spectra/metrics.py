@@ -12,17 +12,16 @@ Figures for receivers without line of sight alone carry the suffix ``_blocked``.
 from __future__ import annotations
 
 import time
-import warnings
 from collections import defaultdict
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from warprrf.checks import check_alike, check_array, check_number, checked
-from warprrf.device import Progress
+from warprrf.checks import NotNegative, Shaped, check_alike, check_array, checked, warn, within
+from warprrf.device import Progress, with_progress
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.deembedding import respond, scanned_kernel
 from warprrf.rf.spectra.spectrum import (
@@ -36,17 +35,22 @@ from warprrf.rf.spectra.spectrum import (
 )
 
 SSIM_WINDOW = 7  # pixels; scikit-image's default, so that figures compare with other work
+BeamWidth: TypeAlias = Annotated[float, within(NARROWEST_BEAM_RAD, 2 * np.pi)]
+Directions: TypeAlias = Annotated[np.ndarray, Shaped("... 3", finite=False)]
+Image: TypeAlias = Annotated[np.ndarray, lambda name, value: _image(name, value)]
 PSNR_CEILING_DB = 150.0  # what two equal images score, instead of infinity
 
 
 @checked
-def unit_image(path_gain: np.ndarray, floor: float, range_db: tuple[float, float]) -> np.ndarray:
+def unit_image(
+    path_gain: Annotated[np.ndarray, Shaped("...", finite=False, least=0.0)],
+    floor: NotNegative,
+    range_db: tuple[float, float],
+) -> np.ndarray:
     """The dB image of a spectrum mapped to [0, 1] by the data set's range, shape of ``path_gain``, float64."""
     low, high = check_array("range_db", range_db, (2,))
     if not high > low:
         raise ValueError(f"range_db: got ({low}, {high}), expected (lowest, highest), the latter above")
-    path_gain = check_array("path_gain", path_gain, finite=False, least=0.0)
-    check_number("floor", floor, 0.0)
     return np.clip((np.asarray(to_db(path_gain, floor), dtype=np.float64) - low) / (high - low), 0.0, 1.0)
 
 
@@ -88,49 +92,45 @@ def ssim(prediction: np.ndarray, truth: np.ndarray) -> float:
 
 
 @checked
-def rmse_db(prediction_db: np.ndarray, truth_db: np.ndarray) -> float:
+def rmse_db(prediction_db: np.ndarray, truth_db: Image) -> float:
     """Root mean square difference [dB] of two dB images ``(height, width)``, weighted by solid angle."""
-    predicted, truth_db = _pair(prediction_db=prediction_db, truth_db=_image("truth_db", truth_db))
+    predicted, truth_db = _pair(prediction_db=prediction_db, truth_db=truth_db)
     weight = pixel_solid_angles(truth_db.shape)[:, None]
     error = (predicted - truth_db) ** 2
     return float(np.sqrt(np.sum(weight * error) / (np.sum(weight) * truth_db.shape[1])))
 
 
 @checked
-def strongest_direction(path_gain: np.ndarray) -> np.ndarray:
+def strongest_direction(path_gain: Image) -> np.ndarray:
     """Unit direction ``(3,)`` of the pixel with the most path gain per solid angle.
 
     Of equal pixels the first is taken (an empty or constant density has no direction: this is the first row's).
     """
-    path_gain = _image("path_gain", path_gain)
     density = path_gain / pixel_solid_angles(path_gain.shape)[:, None]
     row, column = np.unravel_index(np.argmax(density), density.shape)
     return pixel_directions(path_gain.shape)[row, column]
 
 
 @checked
-def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def angle_deg(a: Directions, b: Directions) -> np.ndarray:
     """Angle [degrees] between unit vectors ``(..., 3)``; accurate for small angles too."""
-    a, b = check_array("a", a, (..., 3), finite=False), check_array("b", b, (..., 3), finite=False)
     check_alike(a=a, b=b)
     return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
 
 @checked
-def beam_kappa(width_rad: float) -> float:
+def beam_kappa(width_rad: BeamWidth) -> float:
     """Concentration of the von Mises-Fisher beam whose power falls to half at ``width_rad / 2`` off its axis."""
-    check_number("width_rad", width_rad, NARROWEST_BEAM_RAD, 2 * np.pi)
     return float(np.log(2.0) / (2.0 * np.sin(width_rad / 4) ** 2))
 
 
 @checked
-def beam_response(path_gain: np.ndarray, width_rad: float) -> np.ndarray:
+def beam_response(path_gain: Image, width_rad: BeamWidth) -> np.ndarray:
     """Power a beam collects when steered to each pixel centre, shape ``(height, width)``.
 
     The beam's power pattern is ``exp(kappa (cos(angle) - 1))``, one on its axis, with :func:`beam_kappa`. The sum over
     the sphere is exact on the grid: rows are convolved in azimuth by FFT.
     """
-    path_gain = _image("path_gain", path_gain)
     return respond(path_gain, _beam_kernel(path_gain.shape, beam_kappa(width_rad)))
 
 
@@ -140,18 +140,18 @@ def _beam_kernel(shape: tuple[int, int], kappa: float) -> np.ndarray:
 
 
 @checked
-def beam_gain_loss_db(path_gain: np.ndarray, direction: np.ndarray, width_rad: float) -> float:
+def beam_gain_loss_db(
+    path_gain: Image, direction: Annotated[np.ndarray, Shaped("3")], width_rad: BeamWidth
+) -> float:
     """Loss [dB] of a beam steered to ``direction`` (3,) on the spectrum ``path_gain`` against its best steering.
 
     The best is sought over pixel centres, so steering between them can score slightly below zero.
     """
-    power = path_gain = _image("path_gain", path_gain)
-    toward = check_array("direction", direction, (3,))
-    best = float(np.max(beam_response(power, width_rad)))
+    best = float(np.max(beam_response(path_gain, width_rad)))
     if best <= 0:
         return 0.0
-    cosine = pixel_directions(path_gain.shape) @ toward
-    got = float(np.sum(power * np.exp(beam_kappa(width_rad) * (cosine - 1.0))))
+    cosine = pixel_directions(path_gain.shape) @ direction
+    got = float(np.sum(path_gain * np.exp(beam_kappa(width_rad) * (cosine - 1.0))))
     return float(10.0 * np.log10(best / max(got, best * 1e-30)))
 
 
@@ -175,7 +175,7 @@ def evaluate(
     test: SpectrumDataset,
     predict: Callable[[np.ndarray], Any],
     *,
-    beam_width_rad: float = np.radians(10.0),
+    beam_width_rad: BeamWidth = np.pi / 18.0,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Score ``predict`` on every receiver of ``test``.
@@ -212,17 +212,15 @@ def evaluate(
     check_whole("test.path_gain", test.path_gain)
     fitted_on = _fitted_on(predict, test)
     if fitted_on:
-        warnings.warn(
+        warn(
             f"test: {fitted_on} of its {count} receivers are among those that the predictor was fitted on: these are "
-            "no errors of prediction; score receivers that were held out (ds.split)",
-            stacklevel=2,
+            "no errors of prediction; score receivers that were held out (ds.split)"
         )
     predict = _on_grid(predict, test.path_gain.shape[1:])
-    check_number("beam_width_rad", beam_width_rad, NARROWEST_BEAM_RAD, 2 * np.pi)
     floor, range_db = float(test.floor), test.range_db
     rows = defaultdict[str, np.ndarray](lambda: np.full(count, np.nan))
     seconds = np.zeros(count)
-    for i, receiver in enumerate(np.asarray(test.receivers, dtype=np.float64)):
+    for i, receiver in enumerate(with_progress(test.receivers, "evaluate", progress)):
         start = time.perf_counter()
         prediction = predict(receiver)
         seconds[i] = time.perf_counter() - start
@@ -245,8 +243,6 @@ def evaluate(
             if weight.any() and _predicts(prediction.aod):
                 error = angle_deg(_unit(prediction.aod), _unit(test.aod[i]))
                 rows["aod_error_deg"][i] = weighted_median(np.where(np.isnan(error), np.inf, error), weight)
-        if progress is not None:
-            progress("evaluate", i + 1, count)
     line_of_sight = np.asarray(test.line_of_sight, dtype=bool)
     report: dict[str, Any] = _summary(rows, np.ones(count, dtype=bool), "")
     report.update(_summary(rows, ~line_of_sight, "_blocked"))

@@ -9,34 +9,32 @@ from __future__ import annotations
 
 import csv
 import os
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, Self, runtime_checkable
+from typing import Annotated, Any, ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import digamma, polygamma
 
 from warprrf.checks import (
+    Count,
+    Positive,
     check_array,
-    check_choice,
     check_chosen,
-    check_count,
     check_each,
-    check_number,
-    check_positive,
-    check_type,
     checked,
+    one_of,
     some_of,
-    users_level,
+    warn,
+    within,
 )
 from warprrf.rf.em.absorption import Air
-from warprrf.rf.em.waves import NEPER, check_frequency
+from warprrf.rf.em.waves import NEPER, Hertz
 from warprrf.rf.spectra.antenna import Antenna, Pattern, as_antenna, main_lobe, turned_gain
-from warprrf.rf.spectra.levels import FADING_DB, MARGIN_DB, free_space_gain, question_levels
+from warprrf.rf.spectra.levels import MARGIN_DB, free_space_gain, question_levels
 
 COLUMNS = {
     "transmitter": ("tx_x", "tx_y", "tx_z"),
@@ -49,7 +47,6 @@ NEEDED = (*COLUMNS["transmitter"], *COLUMNS["receiver"], "power_db")
 NUMBERS = (*NEEDED, *COLUMNS["arrival"], *COLUMNS["departure"], "delay_ns", "std_db")
 NOT_MEASURED = ("", "na", "n/a", "#n/a", "<na>", "nan", "null", "none")
 """What stands in a file, in small letters, for a power that was not measured."""
-WINDOWS = ("rectangular", "hann")
 
 
 @runtime_checkable
@@ -70,7 +67,7 @@ class PowerTable:
     transmitters: np.ndarray
     receivers: np.ndarray
     power: np.ndarray
-    frequency_hz: float
+    frequency_hz: Hertz
 
     _rows: ClassVar[tuple[str, ...]] = ("transmitters", "receivers", "power")
 
@@ -92,8 +89,9 @@ class PowerTable:
             raise ValueError(
                 f"power: got {count} rows, expected one or more, each of linear powers, or NaN where not measured"
             )
-        places = {name: check_each(name, getattr(self, name), count, 3) for name in self._rows[:2]}
-        return {"power": power, "frequency_hz": check_frequency(self.frequency_hz), **places}
+        return {"power": power} | {
+            name: check_each(name, getattr(self, name), count, 3) for name in self._rows[:2]
+        }
 
 
 @checked
@@ -144,16 +142,16 @@ class Readings(PowerTable):
     receive_pattern: Pattern | None = None
     transmit_pattern: Pattern | None = None
     delay_s: np.ndarray | None = None
-    bandwidth_hz: float | None = None
-    window: str = "rectangular"
+    bandwidth_hz: Positive | None = None
+    window: Annotated[str, one_of("rectangular", "hann")] = "rectangular"
     chain: Sequence[str] | NDArray[np.str_] | None = None
     std_db: ArrayLike = 0.0
-    samples: int | None = None
+    samples: Count | None = None
     air: Air | None = None
     name: str = "readings"
     azimuth_known: bool = True
     clock_known: bool = True
-    position_std_m: float = 0.0
+    position_std_m: Annotated[float, within(0.0, 1.0)] = 0.0
 
     _rows = (*PowerTable._rows, "floor", "arrival", "departure", "delay_s", "chain", "std_db")
 
@@ -166,35 +164,26 @@ class Readings(PowerTable):
         if not (fields["power"] > floor).any():
             raise ValueError(f"power: got no value above the floor of {floor.min():g}")
         fields |= {"floor": floor, "std_db": std}
-        for turned, pattern in (("arrival", "receive_pattern"), ("departure", "transmit_pattern")):
-            value, gain = getattr(self, turned), getattr(self, pattern)
-            if (value is None) != (gain is None):
-                raise ValueError(f"{pattern}: got one of it and {turned}; expected both or neither")
-            if value is not None:
-                fields[turned] = check_turned(turned, value, count)
-                fields[pattern] = antenna_of(pattern, gain)
-        if (self.delay_s is None) != (self.bandwidth_hz is None):
-            raise ValueError("bandwidth_hz: got one of it and delay_s; expected both or neither")
+        ends = ("arrival", "receive_pattern"), ("departure", "transmit_pattern")
+        for one, other in (*ends, ("delay_s", "bandwidth_hz")):
+            if (getattr(self, one) is None) != (getattr(self, other) is None):
+                raise ValueError(f"{other}: got one of it and {one}; expected both or neither")
+        for turned, pattern in ends:
+            if getattr(self, turned) is not None:
+                fields[turned] = check_turned(turned, getattr(self, turned), count)
+                fields[pattern] = antenna_of(pattern, getattr(self, pattern))
         if self.delay_s is not None:
             fields["delay_s"] = check_array("delay_s", self.delay_s, (count,))
-            fields["bandwidth_hz"] = check_positive("bandwidth_hz", self.bandwidth_hz)
-        check_type("azimuth_known", self.azimuth_known, bool)
-        if not self.azimuth_known and self.arrival is None:
-            raise ValueError("azimuth_known: got False without arrival, whose zero is to be found")
-        check_type("clock_known", self.clock_known, bool)
-        if not self.clock_known and self.delay_s is None:
-            raise ValueError("clock_known: got False without delay_s, whose zero is to be found")
+        for known, of in (("azimuth_known", "arrival"), ("clock_known", "delay_s")):
+            if not getattr(self, known) and getattr(self, of) is None:
+                raise ValueError(f"{known}: got False without {of}, whose zero is to be found")
         if not self.clock_known and not self.azimuth_known:
             raise ValueError("clock_known: got False, and azimuth_known too; expected one zero known")
-        check_number("position_std_m", self.position_std_m, 0.0, 1.0)
         if self.position_std_m > 0 and self.total:
             raise ValueError(
                 "position_std_m: got readings of power alone, which say nothing of where they were taken; expected "
                 "directions or delays"
             )
-        if self.samples is not None:
-            check_count("samples", self.samples)
-        check_choice("window", self.window, WINDOWS)
         chain = np.full(count, "") if self.chain is None else np.asarray(self.chain, dtype=object)
         if chain.shape != (count,) or not all(isinstance(name, str) for name in chain):
             raise ValueError(f"chain: got {self.chain!r:.200}, expected a name for each of {count} readings")
@@ -317,11 +306,7 @@ def _check_columns(names: Sequence[str]) -> None:
         if elevation in names and azimuth not in names:
             raise ValueError(f"table: got {elevation} without {azimuth}, expected both or neither")
     if unknown:
-        warnings.warn(
-            f"table: columns {', '.join(unknown)} are not read; those that are: {', '.join(known)}",
-            UserWarning,
-            stacklevel=users_level(),
-        )
+        warn(f"table: columns {', '.join(unknown)} are not read; those that are: {', '.join(known)}")
 
 
 def question_readings(readings: Readings) -> None:
@@ -336,15 +321,16 @@ def question_readings(readings: Readings) -> None:
     free_space = np.minimum(
         free_space_gain(r.transmitters, r.receivers, r.frequency_hz) * 10.0 ** (gain_db / 10.0), 1.0
     )
-    margin_db = MARGIN_DB + FADING_DB * (r.samples is not None)
+    fading_db = 10.0 * (
+        r.samples is not None
+    )  # a power at one place above the mean of its fading: 1 in 20,000, if Rayleigh's
+    margin_db = MARGIN_DB + fading_db
     question_levels("power", np.where(known, r.power, np.nan), free_space, margin_db=margin_db)
     above = np.flatnonzero(~known & (r.power > 1.0))
     if len(above):
-        warnings.warn(
+        warn(
             f"power: {len(above)} readings (rows {some_of(above)}) of chains of unknown gain are above 0 dB, more than was "
-            "transmitted: were minus signs lost, or are they linear?",
-            UserWarning,
-            stacklevel=users_level(),
+            "transmitted: were minus signs lost, or are they linear?"
         )
 
 
@@ -430,28 +416,20 @@ def path_weights(
         departure: unit vectors from the transmitter, shape ``(K, 3)``.
         delay_s: delays [s], shape ``(K,)``.
     """
-    weight = np.empty((len(rows), len(delay_s)), dtype)
+    r, weight = readings, np.empty((len(rows), len(delay_s)), dtype)
+    ends = (r.arrival, r.receive_pattern, arrival), (r.departure, r.transmit_pattern, departure)
     weights_at_once = 1_000_000  # of readings and paths: some MB of temporary arrays
     at_once = max(1, weights_at_once // max(1, len(delay_s)))
     for first in range(0, len(rows), at_once):
         some = rows[first : first + at_once]
-        weight[first : first + at_once] = _path_weights(readings, some, arrival, departure, delay_s)
-    return weight
-
-
-def _path_weights(
-    r: Readings, rows: np.ndarray, arrival: np.ndarray, departure: np.ndarray, delay_s: np.ndarray
-) -> np.ndarray:
-    weight = np.ones((len(rows), len(delay_s)))
-    for turned, pattern, path in (
-        (r.arrival, r.receive_pattern, arrival),
-        (r.departure, r.transmit_pattern, departure),
-    ):
-        if turned is not None and pattern is not None:
-            once, own = np.unique(turned[rows], axis=0, return_inverse=True)
-            weight *= turned_gain(as_antenna(pattern), once, path)[own.reshape(-1)]
-    if r.delay_s is not None and r.bandwidth_hz is not None:
-        weight *= tap_share(r.bandwidth_hz * (r.delay_s[rows, None] - delay_s), r.window)
+        own = np.ones((len(some), len(delay_s)))
+        for turned, pattern, path in ends:
+            if turned is not None and pattern is not None:
+                once, which = np.unique(turned[some], axis=0, return_inverse=True)
+                own *= turned_gain(as_antenna(pattern), once, path)[which.reshape(-1)]
+        if r.delay_s is not None and r.bandwidth_hz is not None:
+            own *= tap_share(r.bandwidth_hz * (r.delay_s[some, None] - delay_s), r.window)
+        weight[first : first + at_once] = own
     return weight
 
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from types import EllipsisType
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import warp as wp
@@ -23,12 +23,13 @@ from warprrf import device as _device
 from warprrf.checks import (
     check_array,
     check_count,
+    check_items,
     check_known_whole,
     check_number,
     check_positive,
-    check_type,
     checked,
     one_line,
+    positive,
 )
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
@@ -78,6 +79,12 @@ def check_range_db(range_db: Sequence[float]) -> tuple[float, float]:
     if not -1e4 <= low <= high <= 1e4:
         raise ValueError(f"range_db: got {low:g} to {high:g}, expected decibels, the lowest value first")
     return low, high
+
+
+GridShape: TypeAlias = Annotated[tuple[int, int], lambda _, shape: check_shape(shape)]
+Beam: TypeAlias = Annotated[float, lambda _, width: check_beam(width)]
+RangeDb: TypeAlias = Annotated[tuple[float, float], lambda _, range_db: check_range_db(range_db)]
+Floor: TypeAlias = Annotated[float, positive("linear noise floor")]
 
 
 def check_departures(aod: np.ndarray) -> None:
@@ -278,14 +285,9 @@ def spread_paths(
     grid = _beam_grid((rows, columns), float(sigma), str(where))
     known = beam_sums(d, shape, sigma, device=where) if beams is None else beams[positive]
     near, total = np.ascontiguousarray(known[order].T)
-    toward = wp.array(d[order], dtype=wp.vec3d, device=where)
-    nearest = wp.array(near, dtype=wp.float64, device=where)
-    beam = [grid.pixels, grid.solid_angles, grid.half_widths, grid.kappa, grid.chord_limit]
-    scaled = wp.array(power[order] / total, dtype=wp.float64, device=where)
     image = wp.zeros((rows, columns), dtype=wp.float64, device=where)
     best = wp.zeros((rows, columns), dtype=wp.int32, device=where)
-    first = wp.array(starts, dtype=wp.int32, device=where)
-    inputs = [toward, scaled, nearest, first, *beam, image, best]
+    inputs = [d[order], power[order] / total, near, starts, *grid, image, best]
     _device.launch(beam_kernels.gather_beams, rows * columns, inputs, device=where)
     index = best.numpy()
     return SpreadPaths(image.numpy(), np.where(index >= 0, positive[order][index], -1).astype(np.int32))
@@ -297,21 +299,12 @@ def beam_sums(
     """Squared chord from each unit vector ``directions`` (L, 3) to its pixel's centre, and the sum of its beam over all
     pixels, one there, shape ``(L, 2)``."""
     where = _device.resolve(device)
-    grid, toward, cells = _ends_of_beams(directions, shape, sigma, where)
-    sums = [wp.zeros(len(directions), dtype=wp.float64, device=where) for _ in range(2)]
-    _device.launch(beam_kernels.beam_normaliser, len(directions), [toward, cells, *grid, *sums], device=where)
-    return np.stack([one.numpy() for one in sums], axis=1)
-
-
-def _ends_of_beams(
-    directions: np.ndarray, shape: tuple[int, int], sigma: float, where: wp.Device
-) -> tuple[list[Any], wp.array, wp.array]:
-    """What kernels take of the grid and the beam, the unit vectors (L, 3), and the pixels that these fall in."""
     grid = _beam_grid(shape, float(sigma), str(where))
     row, column = pixel_of(directions, shape)
-    beam = [grid.pixels, grid.solid_angles, grid.half_widths, grid.kappa, grid.chord_limit]
-    toward = wp.array(directions, dtype=wp.vec3d, device=where)
-    return beam, toward, wp.array(row * shape[1] + column, dtype=wp.int32, device=where)
+    sums = [wp.zeros(len(directions), dtype=wp.float64, device=where) for _ in range(2)]
+    inputs = [directions, row * shape[1] + column, *grid, *sums]
+    _device.launch(beam_kernels.beam_normaliser, len(directions), inputs, device=where)
+    return np.stack([one.numpy() for one in sums], axis=1)
 
 
 def strongest_rays(
@@ -342,11 +335,8 @@ def strongest_rays(
     top = log_power.reshape(rows * columns, -1).max(axis=1)
     best = wp.zeros(rows * columns, dtype=wp.int32, device=where)
     first_row, least_fall = _least_falls((rows, columns), float(sigma), str(where))
-    inputs = [
-        directions, len(power) // (rows * columns), wp.array(log_power, dtype=wp.float64, device=where),
-        wp.array(top, dtype=wp.float64, device=where), wp.float64(top.max()), grid.pixels, grid.half_widths, first_row,
-        least_fall, grid.kappa, grid.chord_limit, best,
-    ]  # fmt: skip
+    inputs = [directions, len(power) // (rows * columns), log_power, top, wp.float64(top.max())]
+    inputs += [grid.pixels, grid.half_widths, first_row, least_fall, grid.kappa, grid.chord_limit, best]
     _device.launch(beam_kernels.strongest_rays, rows * columns, inputs, device=where)
     return best.numpy().reshape(rows, columns)
 
@@ -360,13 +350,11 @@ def unit_beams(
     """
     rows, columns = check_shape(shape)
     where = _device.resolve(device)
-    grid, toward, cells = _ends_of_beams(directions, (rows, columns), sigma, where)
+    row, column = pixel_of(directions, (rows, columns))
+    near, total = beam_sums(directions, shape, sigma, device=where).T
     images = wp.zeros((len(directions), rows, columns), dtype=wp.float32, device=where)
-    known = [
-        wp.array(np.ascontiguousarray(own), dtype=wp.float64, device=where)
-        for own in beam_sums(directions, shape, sigma, device=where).T
-    ]
-    inputs = [toward, cells, *known, *grid, images]
+    beam = _beam_grid((rows, columns), float(sigma), str(where))
+    inputs = [directions, row * columns + column, near, total, *beam, images]
     _device.launch(beam_kernels.separate_beams, len(directions), inputs, device=where)
     return images.numpy()
 
@@ -507,14 +495,10 @@ class Spectrum:
         Raises:
             TypeError, ValueError: for none, or what are no spectra.
         """
-        if not isinstance(spectra, Sequence) or not len(spectra):
-            raise ValueError(f"spectra: got {spectra!r:.60}, expected a list of at least one")
-        for k, one in enumerate(spectra):
-            check_type(f"spectra[{k}]", one, Spectrum)
-        several: dict[str, Any] = {}
-        for name, first in spectra[0]._arrays().items():
-            several[name] = None if first is None else np.stack([getattr(one, name) for one in spectra])
-        return replace(spectra[0], **several)
+        each, several = check_items("spectra", spectra, Spectrum, 1), dict[str, Any]()
+        for name, first in each[0]._arrays().items():
+            several[name] = None if first is None else np.stack([getattr(one, name) for one in each])
+        return replace(each[0], **several)
 
     def __getitem__(self, receiver: int) -> Spectrum:
         """The spectrum of one of several receivers."""

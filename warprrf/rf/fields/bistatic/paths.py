@@ -51,7 +51,7 @@ def paths_of(
         over[whole],
         codes[whole],
     )
-    paths = Paths._from_points(
+    paths = Paths.from_points(
         view.tracer.transmitter,
         view.receivers[0],
         np.concatenate([vertices, over]),

@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import warp as wp
@@ -30,15 +30,7 @@ from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.cache import Cache
-from warprrf.checks import (
-    Expected,
-    check_array,
-    check_arrays,
-    check_number,
-    check_positive,
-    checked,
-    one_line,
-)
+from warprrf.checks import Expected, Positive, check_array, check_arrays, checked, one_line, within
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.geometry.splats.gaussians import Gaussians, discs_on_mesh, gaussians_of
@@ -47,14 +39,7 @@ from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField, with_settings
-from warprrf.rf.fields.harmonic.fitting import (
-    KINDS,
-    State,
-    fit_layer,
-    load_states,
-    save_states,
-    targets,
-)
+from warprrf.rf.fields.harmonic import fitting
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining, list_responses
 from warprrf.rf.fields.harmonic.options import CHANNEL_RATES, GAIN_RATES, FieldOptions
 from warprrf.rf.fields.harmonic.paths import View, near_line_of_sight, paths_of
@@ -116,8 +101,8 @@ class HarmonicField(RadioField):
     beam_sigma_rad: float
     options: FieldOptions
     layers: dict[str, np.ndarray] = field(repr=False)
-    gain_unit: float
-    delay_unit: float
+    gain_unit: Positive
+    delay_unit: Annotated[float, within(0.0, 1.0)]
     air: Air | None = None
     fitted_on: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
     report: dict[str, Any] = field(default_factory=dict, repr=False)
@@ -132,8 +117,6 @@ class HarmonicField(RadioField):
         most_coefficient = 1e9
         table = Expected(f"N {_kernels.COEFFICIENTS}", -most_coefficient, most_coefficient)
         check_arrays(self.layers, dict.fromkeys(self.layers, table), N=len(self.gaussians))
-        check_positive("gain_unit", self.gain_unit)
-        check_number("delay_unit", self.delay_unit, 0.0, 1.0)
 
     @property
     def model(self) -> str:
@@ -189,11 +172,8 @@ class HarmonicField(RadioField):
             gaussians=gaussians,
             mesh=mesh,
             transmitter=transmitter,
-            frequency_hz=float(ds.frequency_hz),
+            **{n: getattr(ds, n) for n in ("frequency_hz", "floor", "range_db", "beam_sigma_rad")},
             shape=images.shape[1:],  # type: ignore[arg-type]
-            floor=float(ds.floor),
-            range_db=(float(ds.range_db[0]), float(ds.range_db[1])),
-            beam_sigma_rad=float(ds.beam_sigma_rad),
             options=replace(chosen, checkpoint=None),
             layers={},
             gain_unit=1.0,
@@ -250,13 +230,8 @@ class HarmonicField(RadioField):
         """At least one diffuse path is kept to carry what is below the floor. With ``line_of_sight="explicit"`` the ``los``
         path carries Friis gain; without, the power of the pixels within 3 beam sigmas of the transmitter's direction,
         merged. Direction and delay of ``los`` are exact; a diffuse path arrives from its pixel's centre."""
-        found = paths_of(
-            self._view_from(receiver, transmitter),
-            beam_sigma_rad=self.beam_sigma_rad,
-            frequency_hz=self.frequency_hz,
-            max_paths=max_paths,
-        )
-        return replace(found, air=self.air)
+        view = self._view_from(receiver, transmitter)
+        return replace(paths_of(view, self.beam_sigma_rad, self.frequency_hz, max_paths), air=self.air)
 
     def _taken_apart(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         tensors = {f"layer/{name}": table for name, table in self.layers.items()}
@@ -271,15 +246,13 @@ class HarmonicField(RadioField):
         layers = {n.removeprefix("layer/"): t for n, t in tensors.items() if n.startswith("layer/")}
         if "gain" not in layers:
             raise ValueError("it has no layer of gain")
+        held = "mesh/faces" in tensors
         return {
             "gaussians": Gaussians(**{f.name: tensors[f"gaussians/{f.name}"] for f in fields(Gaussians)}),
-            "mesh": Mesh(tensors["mesh/vertices"], tensors["mesh/faces"])
-            if "mesh/faces" in tensors
-            else None,
+            "mesh": Mesh(tensors["mesh/vertices"], tensors["mesh/faces"]) if held else None,
             "options": FieldOptions(**header["options"]),
             "layers": layers,
-            "gain_unit": header["gain_unit"],
-            "delay_unit": header["delay_unit"],
+            **{name: header[name] for name in ("gain_unit", "delay_unit")},
         }
 
     def _on_device(self) -> Parameters:
@@ -333,17 +306,13 @@ class HarmonicField(RadioField):
         """The blended layer ``name`` of one receiver, shape ``(H, W)`` float64."""
         device, (view,) = seen.device, seen.views
         kernels = _kernels.build(wp.float32)
-        kind = KINDS[self.options.gain] if name == "gain" else KINDS["signed"]
+        kind = fitting.KINDS[self.options.gain if name == "gain" else "signed"]
         out = wp.zeros(self.shape[0] * self.shape[1], dtype=float, device=device)
-        inputs = [
-            kind,
-            view.start,
-            view.gaussian,
-            view.weight,
-            self._uploaded.get("basis", lambda: harmonics(self.shape, wp.float32, device)),
-            self._uploaded.get(name, lambda: wp.array(self.layers[name], dtype=kernels.vec16, device=device)),
-            out,
-        ]
+        basis = self._uploaded.get("basis", lambda: harmonics(self.shape, wp.float32, device))
+        layer = self._uploaded.get(
+            name, lambda: wp.array(self.layers[name], dtype=kernels.vec16, device=device)
+        )
+        inputs = [kind, view.start, view.gaussian, view.weight, basis, layer, out]
         _device.launch(kernels.predict, len(out), inputs, device=device)
         return out.numpy().reshape(self.shape).astype(np.float64)
 
@@ -353,7 +322,8 @@ class HarmonicField(RadioField):
         visible, friis = self._line_of_sight(receiver, source)
         (lengths,) = self._lengths(seen, source)
         power = self._factor(lengths.total) * self.gain_unit * self._blend("gain", seen)
-        point, delay, departure = lengths.point, lengths.delay_s, lengths.departure
+        point, delay = lengths.point, lengths.total / SPEED_OF_LIGHT
+        departure = point - source
         if self.options.model == "rf3dgs":
             point = np.full_like(point, np.nan)
             delay, departure = self._channels(seen)
@@ -367,13 +337,7 @@ class HarmonicField(RadioField):
         toward = receiver - source
         delay = np.where(direct, np.linalg.norm(toward) / SPEED_OF_LIGHT, delay)
         angles = np.where(direct[..., None], np.stack(angles_from_directions(toward)), angles)
-        spectrum = Spectrum(
-            path_gain=power.astype(np.float32),
-            delay_s=delay,
-            aod=angles,
-            floor=self.floor,
-            range_db=self.range_db,
-        )
+        spectrum = Spectrum(power.astype(np.float32), delay, angles, self.floor, self.range_db)
         return View(spectrum, receiver, source, point, visible, friis, beam)
 
     def _channels(self, seen: Transport) -> tuple[np.ndarray, np.ndarray]:
@@ -424,30 +388,30 @@ def _train(
         beams = [blank._beam(receiver, blank.transmitter) for receiver in seen.receivers]
         extra = np.stack([np.zeros(blank.shape) if beam is None else beam for beam in beams])
     problem = Problem(seen, batch=options.batch, seed=options.seed, device=device)
-    plan, gain_unit, delay_unit = targets(options, ds, images, problem, factor, extra)
+    plan, gain_unit, delay_unit = fitting.targets(options, ds, images, problem, factor, extra)
     channel_steps = 100  # of each delay and AoD channel: they start at means that are nearly right
     steps = {
         name: options.iterations if name == "gain" else min(channel_steps, options.iterations)
         for name in plan
     }
     identity = "" if checkpoint is None else digest(options, seen.values, plan)
-    states, before = load_states(checkpoint, identity), 0
+    states, before = fitting.load_states(checkpoint, identity), 0
     layers: dict[str, np.ndarray] = {}
 
-    def each(name: str, done: int, state: Callable[[], State]) -> None:
+    def each(name: str, done: int, state: Callable[[], fitting.State]) -> None:
         """What follows each step of a layer: progress, and now and then the checkpoint."""
         if progress is not None:
             progress("fit", before + done, sum(steps.values()))
         if checkpoint is not None and (done % 50 == 0 or done == steps[name]):
             states[name] = state()
-            save_states(checkpoint, identity, states)
+            fitting.save_states(checkpoint, identity, states)
 
     for name, target in plan.items():
         is_gain, state, opacity = name == "gain", states.get(name), None
         if listed is not None and is_gain:
             logits = None if state is None else state.opacity
             opacity = OpacityTraining(problem, listed, gaussians.opacities, logits)
-        states[name] = state = fit_layer(
+        states[name] = state = fitting.fit_layer(
             problem, target, steps=steps[name], rates=GAIN_RATES if is_gain else CHANNEL_RATES,
             degree=options.sh_degree, opacity=opacity, state=state, each=partial(each, name),
         )  # fmt: skip

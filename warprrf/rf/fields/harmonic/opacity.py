@@ -77,7 +77,8 @@ def list_responses(
     blending = Blending(share * rules.alpha_min, rules.alpha_max, 1e-4, "product")
     raster = Rasterizer(device=device, blending=blending)
     scene, views, responses = raster.upload(thin), [], []
-    for k, (position, view) in enumerate(zip(seen.receivers, seen.views, strict=True)):
+    pairs_of = list(zip(seen.receivers, seen.views, strict=True))
+    for position, view in _device.with_progress(pairs_of, "transport", progress):
         found = strongest(raster, scene, position, seen.shape, top_k)
         start, pairs, _, _ = kept(device, found, 0.0)
         gaussian, response = (wp.empty(pairs, dtype=kind, device=device) for kind in (int, float))
@@ -85,8 +86,6 @@ def list_responses(
         _device.launch(write_responses, len(start) - 1, inputs, device=device)
         views.append(replace(view, start=start, gaussian=gaussian, weight=response))
         responses.append(response)
-        if progress is not None:
-            progress("transport", k + 1, len(seen.receivers))
     listed = Listed(replace(seen, views=tuple(views)), tuple(responses), rules.alpha_max)
     return replace(listed, transport=listed.with_opacities(gaussians.opacities))
 

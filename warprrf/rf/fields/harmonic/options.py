@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from typing import Annotated
 
-from warprrf.checks import check_choice, check_count, check_seed, checked
+from warprrf.checks import Count, Seed, checked, one_of, whole
 from warprrf.kernels.raster.sh import COEFFICIENTS as DEGREE_TO_COUNT
-from warprrf.rf.fields.harmonic.transport import INTERACTION_POINTS, TOP_K, TRANSMITTANCE
-
-MODELS = ("rf3dgs+", "rf3dgs")
-GAINS = ("exp", "linear")
+from warprrf.rf.fields.harmonic.transport import TOP_K
 
 
 @dataclass(frozen=True)
@@ -62,31 +60,19 @@ class FieldOptions:
         ValueError: for a value that is not allowed.
     """
 
-    model: str = "rf3dgs+"
-    transmittance: str = "product"
-    interaction_point: str = "centre"
-    gain: str = "exp"
-    sh_degree: int = 3
-    top_k: int = TOP_K
-    line_of_sight: str | None = None
-    iterations: int = 300
-    batch: int = 10
+    model: Annotated[str, one_of("rf3dgs+", "rf3dgs")] = "rf3dgs+"
+    transmittance: Annotated[str, one_of("product", "exp")] = "product"
+    interaction_point: Annotated[str, one_of("centre", "peak", "expected", "mesh")] = "centre"
+    gain: Annotated[str, one_of("exp", "linear")] = "exp"
+    sh_degree: Annotated[int, one_of(*DEGREE_TO_COUNT)] = 3
+    top_k: Count = TOP_K
+    line_of_sight: Annotated[str | None, one_of(None, "explicit")] = None
+    iterations: Annotated[int, whole(0)] = 300
+    batch: Count = 10
     train_opacity: bool = False
     checkpoint: str | os.PathLike[str] | None = None
-    seed: int = 0
+    seed: Seed = 0
 
     def __post_init__(self) -> None:
-        for name, known in (
-            ("model", MODELS),
-            ("transmittance", TRANSMITTANCE),
-            ("interaction_point", INTERACTION_POINTS),
-            ("gain", GAINS),
-            ("sh_degree", tuple(DEGREE_TO_COUNT)),
-            ("line_of_sight", (None, "explicit")),
-        ):
-            check_choice(name, getattr(self, name), known)
-        for name, least in (("top_k", 1), ("iterations", 0), ("batch", 1)):
-            check_count(name, getattr(self, name), least)
-        check_seed(self.seed)
         if self.train_opacity and self.transmittance != "product":
             raise ValueError(f"train_opacity: got transmittance {self.transmittance!r}, expected 'product'")

@@ -36,7 +36,7 @@ class View:
     beam: np.ndarray | None
 
 
-def paths_of(view: View, *, beam_sigma_rad: float, frequency_hz: float, max_paths: int | None) -> Paths:
+def paths_of(view: View, beam_sigma_rad: float, frequency_hz: float, max_paths: int | None) -> Paths:
     """Paths of ``view``, strongest first; see :meth:`RadioField.paths`."""
     spectrum, shape = view.spectrum, view.spectrum.shape
     power = np.asarray(spectrum.path_gain, np.float64)

@@ -131,7 +131,7 @@ class Problem:
         pixels of NaN do not count, and without any it is NaN."""
         total, summed = (wp.zeros(len(self.seen), dtype=wp.float64, device=self.device) for _ in range(2))
         for batch in self.batches:
-            own = wp.array(values[batch.receivers].ravel(), dtype=wp.float64, device=self.device)
+            own = values[batch.receivers].ravel()
             inputs = batch.row_start, batch.pair_pixel, batch.pair_weight, own, total, summed
             self.launch(self.kernels.add_to_means, len(self.seen), *inputs)
         weight = total.numpy()

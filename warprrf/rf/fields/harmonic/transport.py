@@ -27,10 +27,8 @@ from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import Blending, Parameters, Rasterizer
 from warprrf.kernels.radio import transport as _kernels
-from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.spectra.spectrum import check_shape, pixel_directions
 
-TRANSMITTANCE = ("product", "exp")
 TOP_K = 16  # Gaussians kept per pixel
 
 
@@ -158,10 +156,8 @@ def transport(
     raster = Rasterizer(device=device, blending=cutoffs(range_db, rule))
     scene = raster.upload(gaussians) if uploaded is None else uploaded
     views = []
-    for k, position in enumerate(positions):
+    for position in _device.with_progress(positions, "transport", progress):
         views.append(_rows(raster, strongest(raster, scene, position, size, top_k)))
-        if progress is not None:
-            progress("transport", k + 1, len(positions))
     return Transport(size, positions, tuple(views), len(gaussians), rule)
 
 
@@ -202,22 +198,17 @@ def _rows(raster: Rasterizer, found: Strongest) -> Rows:
     return Rows(start, gaussian, out, dominant, expected)
 
 
-INTERACTION_POINTS = ("centre", "peak", "expected", "mesh")
-
-
 @dataclass(frozen=True)
 class Lengths:
     """Single-bounce path geometry of one receiver's pixels; NaN where the ray meets nothing.
 
     Attributes:
         shape: rows and columns.
-        transmitter: position [m], shape ``(3,)``.
         points: interaction points on the device [m], ``H * W`` vectors.
         lengths: transmitter - point - receiver on the device [m], shape ``(H * W,)``.
     """
 
     shape: tuple[int, int]
-    transmitter: np.ndarray
     points: wp.array
     lengths: wp.array
 
@@ -230,16 +221,6 @@ class Lengths:
     def total(self) -> np.ndarray:
         """Length transmitter - point - receiver [m], shape ``(H, W)``."""
         return np.asarray(self.lengths.numpy().reshape(self.shape))
-
-    @property
-    def delay_s(self) -> np.ndarray:
-        """Time of flight [s], shape ``(H, W)``."""
-        return self.total / SPEED_OF_LIGHT
-
-    @property
-    def departure(self) -> np.ndarray:
-        """Way from the transmitter to the point [m], shape ``(H, W, 3)``."""
-        return self.point - self.transmitter
 
 
 def path_lengths(
@@ -271,11 +252,11 @@ def path_lengths(
         ranges = view.expected_range if kind == "expected" else nowhere
         if mesh is not None and kind == "mesh":
             hit = mesh.cast(origin, pixel_directions(seen.shape).reshape(-1, 3), device=device)
-            ranges = wp.array(hit.t, dtype=wp.float64, device=device)
+            ranges = hit.t
         points = wp.empty(pixels, dtype=wp.vec3d, device=device)
         lengths = wp.empty(pixels, dtype=wp.float64, device=device)
         inputs = [
             how, wp.vec3d(origin), wp.vec3d(transmitter), directions, *scene[:3], view.dominant, ranges, points, lengths
         ]  # fmt: skip
         _device.launch(_kernels.single_bounces, pixels, inputs, device=device)
-        yield Lengths(seen.shape, transmitter, points, lengths)
+        yield Lengths(seen.shape, points, lengths)
