@@ -50,35 +50,43 @@ TOUCHED = (
 BLOCK_VOXELS, BLOCKS = 16, 20_000  # voxels along a block's side; blocks set aside at first, the grid grows
 
 
-def fuse_gaussians(
+def depth_views(cameras: Sequence[Camera], config: SurfaceConfig) -> list[Camera]:
+    """Cameras of the depth maps: some of ``cameras``, spread over all, with fewer pixels."""
+    return [
+        c.resized(max(1, c.width // config.downscale), max(1, c.height // config.downscale))
+        for c in spread(cameras, VIEWS)
+    ]
+
+
+def depth_maps(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
     *,
     photos: PosedPhotos | None = None,
-    planes: Sequence[Plane] = (),
     config: ReconstructionConfig | None = None,
     progress: Progress | None = None,
     device: DeviceLike = None,
-) -> tuple[PlanarPatches, bool]:
-    """Mesh of Gaussians from depth maps rendered at ``cameras``, with its planar patches, the largest first; and whether
-    its holes were closed.
+) -> list[np.ndarray]:
+    """Ranges [m] that :func:`depth_views` of ``cameras`` see of Gaussians, 0 where none is reliable.
 
     Args:
-        photos: what these cameras saw, in the same order; the depth maps are mended by them.
-        planes: known beforehand; the mesh is snapped to them.
+        photos: what ``cameras`` saw, in the same order; the depth maps are mended by them.
     """
     config = config or ReconstructionConfig()
     report = progress or (lambda stage, done, total: None)
-    chosen = spread(range(len(cameras)), VIEWS)
-    views, depths = depth_maps(
-        gaussians, [cameras[k] for k in chosen], config=config.surface, progress=report, device=device
-    )
-    if photos is not None and config.stereo:
-        seen = photos.subset(chosen)
-        depths, proved = mended(depths, views, seen, progress=report, device=device)
-        if config.segments:
-            depths = _flat(depths, proved, views, seen, report)
-    return fuse_maps(views, depths, planes=planes, config=config, progress=report)
+    views, depths = depth_views(cameras, config.surface), []
+    for k, view in enumerate(views):
+        report("depth", k, len(views))
+        out = render(gaussians, view, features=np.zeros((len(gaussians), 1), dtype=np.float32), device=device)
+        with np.errstate(invalid="ignore"):
+            agree = np.abs(out.depth - out.peak) <= DEPTH_SPREAD * out.peak
+        depths.append(np.where(agree & (out.alpha >= ALPHA), out.depth, 0.0))
+    report("depth", len(views), len(views))
+    if photos is None or not config.stereo:
+        return depths
+    seen = photos.subset(spread(range(len(cameras)), VIEWS))
+    depths, proved = mended(depths, views, seen, progress=report, device=device)
+    return _flat(depths, proved, views, seen, report) if config.segments else depths
 
 
 def _flat(
@@ -105,7 +113,13 @@ def fuse_maps(
     config: ReconstructionConfig | None = None,
     progress: Progress | None = None,
 ) -> tuple[PlanarPatches, bool]:
-    """As :func:`fuse_gaussians`, from ranges [m], 0 where unknown, that are there already, each of one of ``views``."""
+    """Mesh of depth maps with its planar patches, the largest first; and whether its holes were closed.
+
+    Args:
+        views: pinhole cameras.
+        depths: ranges [m], 0 where unknown, each of one of ``views``.
+        planes: known beforehand; the mesh is snapped to them.
+    """
     config = config or ReconstructionConfig()
     report = progress or (lambda stage, done, total: None)
     report("surface", 0, 4)
@@ -118,30 +132,6 @@ def fuse_maps(
     result = largest_first(simplified(whole), MIN_PATCH_M2)
     report("surface", 4, 4)
     return result, whole is not patches
-
-
-def depth_maps(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    *,
-    config: SurfaceConfig,
-    progress: Progress,
-    device: DeviceLike = None,
-) -> tuple[list[Camera], list[np.ndarray]]:
-    """Smaller ``cameras``, and the ranges that they see [m], 0 where no Gaussian is reliable."""
-    views, depths = [], []
-    for k, camera in enumerate(cameras):
-        progress("depth", k, len(cameras))
-        view = camera.resized(
-            max(1, camera.width // config.downscale), max(1, camera.height // config.downscale)
-        )
-        out = render(gaussians, view, features=np.zeros((len(gaussians), 1), dtype=np.float32), device=device)
-        with np.errstate(invalid="ignore"):
-            agree = np.abs(out.depth - out.peak) <= DEPTH_SPREAD * out.peak
-        depths.append(np.where(agree & (out.alpha >= ALPHA), out.depth, 0.0))
-        views.append(view)
-    progress("depth", len(cameras), len(cameras))
-    return views, depths
 
 
 def _with_voxels(
