@@ -28,12 +28,12 @@ from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.fusion import depth_maps, depth_views, fuse_maps
-from warprrf.geometry.photos.report import write_report
 from warprrf.geometry.photos.sfm import read_colmap
 from warprrf.geometry.photos.sparse import known_similarity
 from warprrf.geometry.photos.undistort import Lens, lenses_in_use
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.planes import Plane
+from warprrf.geometry.report import write_report
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.tensor_files import named

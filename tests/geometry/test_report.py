@@ -8,8 +8,8 @@ from radio_scenes import box_mesh, joined
 from views import look
 
 import warprrf as wr
-from warprrf.geometry.photos.report import colours_matched, psnr_db
-from warprrf.geometry.photos.sight import CLASSES, from_outside, how_seen
+from warprrf.geometry.report import colours_matched, psnr_db
+from warprrf.geometry.report.sight import CLASSES, from_outside, how_seen
 from warprrf.geometry.splats.gaussians import discs_on_mesh
 
 image = pytest.importorskip("PIL.Image")
