@@ -116,7 +116,7 @@ def test_geometry_is_counted_up_with_its_steps():
             "initial": 2,
             "refined": 2,
             "depth": 1,
-            "surface": 6,
+            "surface": 7,
         },
     )
 

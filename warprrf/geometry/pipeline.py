@@ -23,7 +23,6 @@ from warprrf.checks import checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh_files import UP
 from warprrf.geometry.photos import sfm
-from warprrf.geometry.photos.cells import surface_shares
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.fusion import depth_maps, depth_views, fuse_maps
 from warprrf.geometry.photos.initialise import initialise
@@ -53,10 +52,11 @@ from warprrf.geometry.reconstruction import (
     to_patches,
     to_planes,
 )
+from warprrf.geometry.report.sight import how_seen
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.steps import Attempt, Steps
 
-VERSIONS = {**sfm.VERSIONS, "initial": 2, "refined": 2, "depth": 1, "surface": 6}
+VERSIONS = {**sfm.VERSIONS, "initial": 2, "refined": 2, "depth": 1, "surface": 7}
 """Of all steps: counted up by whoever changes what a step computes."""
 
 MUCH_UNKNOWN = 0.25  # share of a surface that is worth a warning
@@ -273,7 +273,6 @@ def _steps(
         return {str(k): map_ for k, map_ in enumerate(ranges)}
 
     def surface(attempt: Attempt) -> Arrays:
-        everywhere = list(sparse.cameras.values())
         if measured:
             maps = range_maps(sparse, measured).values()
             views, ranges = (list(part) for part in zip(*maps, strict=True))
@@ -282,8 +281,8 @@ def _steps(
             ranges = [rendered[str(k)] for k in range(len(views))]
         patches, whole = fuse_maps(views, ranges, planes=planes, config=config, progress=attempt.progress)
         skipped = float(config.completion and not whole)
-        shares = np.array([*surface_shares(patches.mesh, planes, everywhere), skipped])
-        return of_patches(patches) | {"shares": shares}
+        seen = how_seen(patches.mesh, list(sparse.cameras.values()), device=device)
+        return of_patches(patches) | {"shares": np.array([*seen.unseen_and_plain(planes), skipped])}
 
     settings = [
         config.planes,
