@@ -18,6 +18,7 @@ from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.completion import complete
 from warprrf.geometry.photos.config import ReconstructionConfig
+from warprrf.geometry.photos.grey import lens_matrix
 from warprrf.geometry.photos.photo_files import spread
 from warprrf.geometry.photos.segments import with_segments
 from warprrf.geometry.photos.stereo import kept_pixels, mended
@@ -177,7 +178,7 @@ def fuse_depth(
             continue
         image = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(z, dtype=np.float32)))
         # The grid reads the pixel that a voxel's projection falls into: pixel centres at +0.5, as ours.
-        lens = core.Tensor(np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]]))
+        lens = core.Tensor(lens_matrix(camera))
         pose = core.Tensor(np.array(camera.world_to_camera, dtype=np.float64))
         limits = (1.0, config.max_range_m, config.truncation_voxels)
         blocks = grid.compute_unique_block_coordinates(image, lens, pose, *limits)
