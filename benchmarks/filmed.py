@@ -311,7 +311,10 @@ def run(options: Options, job: Job) -> Report:
     figures |= errors | score(rec.mesh, reference, rays) | {"laid_on_scale": laying["scale"]}
     figures |= {f"laid_on_{name}": value for name, value in score(laid.mesh, reference, rays).items()}
     between = range(1, len(film.stems), options.reference_every)
-    rooms = {"other_frames": scanned_patches(film.surface(between, job.progress)).mesh, "mesh": laid}
+    rooms: dict[str, Mesh | wr.Reconstruction] = {
+        "other_frames": scanned_patches(film.surface(between, job.progress)).mesh,
+        "mesh": laid,
+    }
     figures["field"] = field_errors(reference, film.free(reference, options.every), rooms, job)
     return Report("filmed", figures, _text(figures))
 
