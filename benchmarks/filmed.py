@@ -20,13 +20,15 @@ from benchmarks.report import Report, table
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.device import Progress, require
 from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.photos.cells import in_frame
 from warprrf.geometry.photos.fusion import fuse_depth
 from warprrf.geometry.photos.sparse import fit_similarity
-from warprrf.geometry.scans import SurfaceConfig
+from warprrf.geometry.scans import SurfaceConfig, scanned_patches
 
 HELP = """\
 Reconstructs every eighth frame of a film from its colours, lays the cameras on the reference ones by a similarity, and
-measures how far the mesh is from the fused reference depth, where the reference saw a surface.
+measures how far the mesh is from the fused reference depth, where the reference saw a surface. Then fits a radio field on
+the mesh, and one on the reference, to spectra that Sionna RT makes on the reference.
 
 examples:
   python -m benchmarks filmed --frames data/redkitchen
@@ -40,6 +42,11 @@ LEVEL_CONES_DEG = (35, 20, 10, 5, 5, 5)  # what faces up, more and more exactly
 STRIDE = 8  # every so many-th row and column of a depth image is a ray
 RARE, ROUNDS = 13, 30  # every so many-th ray, and how often, when one mesh is laid on the other
 CLOSE_M = 0.05
+GRID_M, CLEAR_M = 0.4, 0.25  # between places of receivers, and from them to the nearest surface
+THROUGH = 3  # frames that must see through a place
+ENGINE, FREQUENCY_HZ, SHAPE = "sionna", 60e9, (90, 180)  # of the spectra
+SCATTERING = 0.3  # of the plasterboard that all of the reference is made of
+TRAINING = 20  # spectra that a field is fitted to
 ROWS = (
     ("distance", "mesh to reference surface"),
     ("range", "along the reference's rays"),
@@ -124,9 +131,8 @@ class Film:
         ahead = camera.directions() @ self.poses[index][:3, 2]
         return np.where(z <= FAR_M, z / ahead, 0.0), camera
 
-    def surface(self, every: int, progress: Progress) -> Mesh:
-        """Depth of each ``every``-th frame fused."""
-        chosen = range(0, len(self.stems), every)
+    def surface(self, chosen: Sequence[int], progress: Progress) -> Mesh:
+        """Depth of the frames of these numbers fused."""
         depths, cameras = [], []
         for k, index in enumerate(chosen):
             progress("reference", k, len(chosen))
@@ -150,6 +156,18 @@ class Film:
         turn[:3, :3] = np.stack([np.cross(ahead, up), ahead, up])
         mesh = Mesh(surface.vertices @ turn[:3, :3].T, surface.faces)
         return replace(self, poses=turn @ self.poses), mesh
+
+    def free(self, surface: Mesh, every: int) -> np.ndarray:
+        """Places of a grid which several of each ``every``-th frame see through, off the ``surface``, shape ``(K, 3)`` [m]."""
+        axes = [np.arange(low + GRID_M / 2, high, GRID_M) for low, high in surface.bounds.T]
+        places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        through = np.zeros(len(places), dtype=np.int64)
+        for index in range(0, len(self.stems), every):
+            depth, camera = self.depth(index)
+            inside, pixels = in_frame(camera, places)
+            seen = np.where(inside, depth[pixels[:, 0], pixels[:, 1]], 0.0)
+            through += seen > np.linalg.norm(places - camera.position, axis=1) + CLEAR_M
+        return places[(through >= THROUGH) & (surface.distance(places) > CLEAR_M)]
 
     def rays(self, every: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Origins, directions and ranges [m] of known pixels of each ``every``-th frame."""
@@ -211,11 +229,9 @@ def score(mesh: Mesh, reference: Mesh, rays: tuple[np.ndarray, np.ndarray, np.nd
     return figures | {"f_5_cm": 2 * there * back / max(there + back, 1e-9)}
 
 
-def laid_on(
-    mesh: Mesh, reference: Mesh, rays: tuple[np.ndarray, np.ndarray, np.ndarray]
-) -> tuple[Mesh, float]:
-    """``mesh`` moved, turned and scaled until what the rays meet of it lies best on ``reference``, and this scale: without
-    the errors of the cameras that it was aligned by (iterated closest points, Besl and McKay 1992)."""
+def laid_on(mesh: Mesh, reference: Mesh, rays: tuple[np.ndarray, np.ndarray, np.ndarray]) -> dict[str, Any]:
+    """Scale, rotation and shift of the similarity after which what the rays meet of ``mesh`` lies best on ``reference``:
+    without the errors of the cameras that it was aligned by (iterated closest points, Besl and McKay 1992)."""
     met = mesh.cast(rays[0][::RARE], rays[1][::RARE])
     source = met.point[met.valid]
     scale, rotation, shift = 1.0, np.eye(3), np.zeros(3)
@@ -224,7 +240,38 @@ def laid_on(
         error = np.linalg.norm(scale * source @ rotation.T + shift - near, axis=1)
         kept = error < max(3 * np.median(error), CLOSE_M)
         scale, rotation, shift = fit_similarity(source[kept], near[kept])
-    return Mesh(scale * mesh.vertices @ rotation.T + shift, mesh.faces), scale
+    return {"scale": scale, "rotation": rotation, "shift": shift}
+
+
+def field_errors(
+    reference: Mesh, places: np.ndarray, rooms: Mapping[str, Mesh | wr.Reconstruction], job: Job
+) -> dict[str, Any]:
+    """Errors of radio fields on the ``reference`` and on each of ``rooms``, fitted to spectra made on the reference.
+
+    Args:
+        places: free places, shape ``(K, 3)`` [m]: one is drawn for the transmitter, then those of training and test.
+
+    Raises:
+        ValueError: if there are too few.
+        ImportError: if Sionna RT is not installed.
+    """
+    if len(places) < 2 * TRAINING:
+        raise ValueError(f"frames: they show {len(places)} free places, expected {2 * TRAINING} at least")
+    truth = scanned_patches(reference).mesh
+    material = replace(wr.em.itu_material("plasterboard"), scattering=SCATTERING)
+    places = np.random.default_rng(job.seed).permutation(places)
+    data = wr.simulate(
+        wr.Scene(truth, [material], np.zeros(len(truth.faces), np.int32)), transmitter=places[0], receivers=places[1:],
+        frequency_hz=FREQUENCY_HZ, shape=SHAPE, engine=ENGINE, seed=job.seed, workspace=job.out / "spectra",
+        progress=job.progress, device=job.device,
+    )  # fmt: skip
+    train, test = data.subset(range(TRAINING)), data.subset(range(TRAINING, len(data)))
+    found: dict[str, Any] = {"train": len(train), "test": len(test)}
+    for name, room in ({"reference": truth} | dict(rooms)).items():
+        field = wr.RadioField.fit(room, train, model="bistatic", progress=job.progress, device=job.device)
+        errors = wr.evaluate(test, field.spectrum, progress=job.progress)
+        found[name] = {key: errors[key] for key in ("psnr_db", "rmse_db", "direction_within_3deg")}
+    return found
 
 
 def run(options: Options, job: Job) -> Report:
@@ -234,7 +281,8 @@ def run(options: Options, job: Job) -> Report:
         ValueError: for a folder that holds no such frames, or what :func:`warprrf.reconstruct` refuses.
     """
     film = Film.open(options.frames)
-    film, reference = film.levelled(film.surface(options.reference_every, job.progress))
+    fused = range(0, len(film.stems), options.reference_every)
+    film, reference = film.levelled(film.surface(fused, job.progress))
     chosen = range(0, len(film.stems), options.every)
     photos = {film.photo(k).name: k for k in chosen}
     fresh, start = not (job.out / "workspace").exists(), time.perf_counter()
@@ -257,11 +305,17 @@ def run(options: Options, job: Job) -> Report:
         figures["seconds"] = seconds
     taken = film.poses[[photos[name] for name in rec.cameras]]
     errors, (scale, rotation, shift) = score_cameras(list(rec.cameras.values()), taken)
-    mesh = Mesh(scale * rec.mesh.vertices @ rotation.T + shift, rec.mesh.faces)
-    rays = film.rays(options.every)
-    laid, scale = laid_on(mesh, reference, rays)
-    figures |= errors | score(mesh, reference, rays) | {"laid_on_scale": scale}
-    figures |= {f"laid_on_{name}": value for name, value in score(laid, reference, rays).items()}
+    rec, rays = rec.transformed(scale=scale, rotation=rotation, shift=shift), film.rays(options.every)
+    laying = laid_on(rec.mesh, reference, rays)
+    laid = rec.transformed(**laying)
+    figures |= errors | score(rec.mesh, reference, rays) | {"laid_on_scale": laying["scale"]}
+    figures |= {f"laid_on_{name}": value for name, value in score(laid.mesh, reference, rays).items()}
+    between = range(1, len(film.stems), options.reference_every)
+    rooms: dict[str, Mesh | wr.Reconstruction] = {
+        "other_frames": scanned_patches(film.surface(between, job.progress)).mesh,
+        "mesh": laid,
+    }
+    figures["field"] = field_errors(reference, film.free(reference, options.every), rooms, job)
     return Report("filmed", figures, _text(figures))
 
 
@@ -270,6 +324,8 @@ def _text(figures: Mapping[str, Any]) -> str:
         [title, *(f"{figures[f'{key}_{part}']:.3f}" for part in ("median_m", "p90_m", "within_5_cm"))]
         for key, title in ROWS
     ]
+    field = figures["field"]
+    psnr = {name: field[name]["psnr_db"] for name in ("reference", "other_frames", "mesh")}
     took = f", {figures['seconds']:.0f} s" if "seconds" in figures else ""
     return (
         f"{figures['posed']} of {figures['frames']} frames posed{took}; cameras "
@@ -279,6 +335,9 @@ def _text(figures: Mapping[str, Any]) -> str:
         "is aligned by its cameras; *laid "
         f"on it*, by its surface: scale {figures['laid_on_scale']:.3f}, what is left is the error of its shape.\n\n"
         + table(("", "median [m]", "90th percentile [m]", "within 5 cm"), rows)
+        + f"\n\nA field fitted to {field['train']} of Sionna RT's spectra on the reference, PSNR at {field['test']} other "
+        f"places: {psnr['reference']:.1f} dB on the reference, {psnr['other_frames']:.1f} dB on one of the frames in between, "
+        f"{psnr['mesh']:.1f} dB on this mesh.\n"
     )
 
 

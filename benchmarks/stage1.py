@@ -98,7 +98,8 @@ class Room:
         if not (root / "scene.xml").is_file():
             film = Film.open(folder)
             every = max(1, round(len(film.stems) / count))
-            film, reference = film.levelled(film.surface(max(1, len(film.stems) // FUSED), progress))
+            fused = range(0, len(film.stems), max(1, len(film.stems) // FUSED))
+            film, reference = film.levelled(film.surface(fused, progress))
             chosen = range(0, len(film.stems), every)
             known = {film.photo(k).name: film.poses[k][:3, 3] for k in chosen}
             return cls([film.photo(k) for k in chosen], [], known, reference, film.rays(every))
@@ -149,7 +150,7 @@ def without(
             config=config, seed=job.seed, progress=progress, device=job.device,
         )  # fmt: skip
         seconds = time.perf_counter() - start[0] if start else None
-        mesh, _ = laid_on(found.mesh, room.reference, room.rays)
+        mesh = found.mesh.transformed(**laid_on(found.mesh, room.reference, room.rays))
         figures = score(mesh, room.reference, room.rays)
         holes = 1 - figures["covered"]
         return {"posed": len(found.cameras), "seconds": seconds, "holes": holes, **figures}

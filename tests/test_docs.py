@@ -108,7 +108,16 @@ def test_a_part_whose_goldens_change_is_counted_up(part):
 def test_geometry_is_counted_up_with_its_steps():
     assert (tables.common.VERSIONS["geometry"], pipeline.VERSIONS) == (
         4,
-        {"features": 2, "matches": 2, "model": 4, "photos": 1, "initial": 2, "refined": 2, "surface": 6},
+        {
+            "features": 2,
+            "matches": 2,
+            "model": 4,
+            "photos": 1,
+            "initial": 2,
+            "refined": 2,
+            "depth": 1,
+            "surface": 7,
+        },
     )
 
 

@@ -12,7 +12,9 @@ from radio_scenes import box_mesh
 from scipy.spatial.transform import Rotation
 
 import warprrf as wr
+from benchmarks import filmed
 from benchmarks.filmed import Film, laid_on, score, score_cameras
+from benchmarks.runner import Job
 from benchmarks.stage1 import Room
 
 pytest.importorskip("open3d")
@@ -54,7 +56,7 @@ def film(cameras, tmp_path_factory):
 def reference(film):
     depth, _ = film.depth(0)
     assert (depth[:2] == 0).all() and (depth[2:] > 0).all()  # what is unknown is no ray
-    return film.levelled(film.surface(1, lambda stage, done, total: None))
+    return film.levelled(film.surface(range(24), lambda stage, done, total: None))
 
 
 def test_a_tilted_reference_is_levelled(reference):
@@ -94,10 +96,32 @@ def test_a_moved_mesh_is_laid_on_the_reference(reference, cameras):
     vertices, faces = box_mesh(LOW, HIGH, inward=True)
     true = vertices @ rotation.T + shift
     moved = wr.Mesh((true @ turn.T + [0.03, -0.02, 0.04]) / 1.04, faces)
-    mesh, scale = laid_on(moved, surface, levelled.rays(3))
-    assert scale == pytest.approx(1.04, abs=0.004)
+    laying = laid_on(moved, surface, levelled.rays(3))
+    assert laying["scale"] == pytest.approx(1.04, abs=0.004)
     # A voxel of the reference; moved by 5 to 17 cm.
-    np.testing.assert_allclose(mesh.vertices, true, atol=0.02)
+    np.testing.assert_allclose(moved.transformed(**laying).vertices, true, atol=0.02)
+
+
+def test_free_places_are_seen_through_and_off_the_walls(reference, monkeypatch):
+    film, surface = reference
+    monkeypatch.setattr(filmed, "GRID_M", 0.2)
+    places = film.free(surface, 1)
+    assert len(places) >= 8 and surface.distance(places).min() > filmed.CLEAR_M
+    assert ((places > surface.bounds[0]) & (places < surface.bounds[1])).all()
+    assert not len(film.free(surface, 12))  # two frames prove nothing
+
+
+def test_a_field_on_a_moved_mesh_is_worse_than_on_the_reference(reference, tmp_path, monkeypatch):
+    film, surface = reference
+    for name, value in {"ENGINE": "exact", "SHAPE": (18, 36), "TRAINING": 4, "GRID_M": 0.2}.items():
+        monkeypatch.setattr(filmed, name, value)
+    moved = surface.transformed(shift=[0.15, 0.1, 0.0])
+    job = Job(tmp_path, device="cpu")
+    found = filmed.field_errors(surface, film.free(surface, 1)[:14], {"moved": moved}, job)
+    assert found["train"] == 4 and found["test"] >= 4
+    assert found["reference"]["psnr_db"] > found["moved"]["psnr_db"] + 3
+    with pytest.raises(ValueError, match="free places"):
+        filmed.field_errors(surface, np.zeros((7, 3)), {}, job)
 
 
 @pytest.mark.parametrize("drawn", [False, True])

@@ -96,24 +96,25 @@ def test_ten_photos_become_gaussians_mesh_and_patches(whole, lobby_scene):
 
 def test_a_killed_run_continues_to_the_same_result(whole, monkeypatch):
     workspace, rec = whole
-    for name in ("refined", "surface"):
+    for name in ("refined", "depth", "surface"):
         (workspace / f"{name}.safetensors").unlink()
 
     def killed(*args, **kwargs):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(from_photos, "fuse_gaussians", killed)
+        patch.setattr(from_photos, "fuse_maps", killed)
         with pytest.raises(KeyboardInterrupt):
             made(workspace)
     (workspace / "surface.safetensors.partial").write_bytes(b"half")
     resumed, told = made(workspace)
-    assert steps(told) == {"depth", "stereo", "segments", "surface"}
+    assert steps(told) == {"surface"}  # depth maps were kept
     np.testing.assert_array_equal(resumed.gaussians.means, rec.gaussians.means)
     np.testing.assert_array_equal(resumed.mesh.vertices, rec.mesh.vertices)
 
 
 def test_a_changed_setting_is_not_served_from_the_old_run(whole):
+    assert steps(made(whole[0], config=replace(SMALL, completion=False))[1]) == {"surface"}
     less = replace(SMALL, stereo=False, completion=False)
     other, told = made(whole[0], held_out=VIEWS[4:6], iterations=2, config=less)
     assert steps(told) == {"planes", "refine", "depth", "surface"}  # the photos' poses stay

@@ -23,9 +23,8 @@ from warprrf.checks import checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh_files import UP
 from warprrf.geometry.photos import sfm
-from warprrf.geometry.photos.cells import surface_shares
 from warprrf.geometry.photos.config import ReconstructionConfig
-from warprrf.geometry.photos.fusion import fuse_gaussians, fuse_maps
+from warprrf.geometry.photos.fusion import depth_maps, depth_views, fuse_maps
 from warprrf.geometry.photos.initialise import initialise
 from warprrf.geometry.photos.measured_depth import range_maps, with_points
 from warprrf.geometry.photos.photo_files import (
@@ -53,10 +52,11 @@ from warprrf.geometry.reconstruction import (
     to_patches,
     to_planes,
 )
+from warprrf.geometry.report.sight import how_seen
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.steps import Attempt, Steps
 
-VERSIONS = {**sfm.VERSIONS, "initial": 2, "refined": 2, "surface": 6}
+VERSIONS = {**sfm.VERSIONS, "initial": 2, "refined": 2, "depth": 1, "surface": 7}
 """Of all steps: counted up by whoever changes what a step computes."""
 
 MUCH_UNKNOWN = 0.25  # share of a surface that is worth a warning
@@ -266,20 +266,23 @@ def _steps(
         )
         return of_gaussians(gaussians)
 
+    def depth(attempt: Attempt) -> Arrays:
+        ranges = depth_maps(
+            gaussians, list(cameras.values()), photos=photos(), config=config, progress=attempt.progress, device=device
+        )  # fmt: skip
+        return {str(k): map_ for k, map_ in enumerate(ranges)}
+
     def surface(attempt: Attempt) -> Arrays:
-        everywhere = list(sparse.cameras.values())
         if measured:
             maps = range_maps(sparse, measured).values()
             views, ranges = (list(part) for part in zip(*maps, strict=True))
-            patches, whole = fuse_maps(views, ranges, planes=planes, config=config, progress=attempt.progress)
         else:
-            patches, whole = fuse_gaussians(
-                gaussians, list(cameras.values()), photos=photos(), planes=planes, config=config,
-                progress=attempt.progress, device=device,
-            )  # fmt: skip
+            views = depth_views(list(cameras.values()), config.surface)
+            ranges = [rendered[str(k)] for k in range(len(views))]
+        patches, whole = fuse_maps(views, ranges, planes=planes, config=config, progress=attempt.progress)
         skipped = float(config.completion and not whole)
-        shares = np.array([*surface_shares(patches.mesh, planes, everywhere), skipped])
-        return of_patches(patches) | {"shares": shares}
+        seen = how_seen(patches.mesh, list(sparse.cameras.values()), device=device)
+        return of_patches(patches) | {"shares": np.array([*seen.unseen_and_plain(planes), skipped])}
 
     settings = [
         config.planes,
@@ -291,11 +294,13 @@ def _steps(
     first = _kept(steps, "initial", initial, [sparse, list(fitted), masks, *settings])
     planes = to_planes(first)
     gaussians = to_gaussians(_kept(steps, "refined", refined, [steps.key("initial"), config.refine]))
-    inputs: list[Any] = [
-        steps.key("refined"), config.stereo, config.segments, config.surface, config.completion,
-    ]  # fmt: skip
+    inputs: list[Any] = [steps.key("refined"), config.surface, config.completion]
     if measured:
         inputs.append({name: [file.path, file.unit_m] for name, file in measured.items()})
+    else:
+        made_by = [steps.key("refined"), config.stereo, config.segments, config.surface.downscale]
+        rendered = _kept(steps, "depth", depth, made_by)
+        inputs.append(steps.key("depth"))
     kept = _kept(steps, "surface", surface, inputs)
     return gaussians, to_patches(kept), _said_of_surface(*kept["shares"])
 

@@ -27,13 +27,13 @@ from warprrf.checks import (
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.config import ReconstructionConfig
-from warprrf.geometry.photos.fusion import fuse_gaussians
-from warprrf.geometry.photos.report import write_report
+from warprrf.geometry.photos.fusion import depth_maps, depth_views, fuse_maps
 from warprrf.geometry.photos.sfm import read_colmap
 from warprrf.geometry.photos.sparse import known_similarity
 from warprrf.geometry.photos.undistort import Lens, lenses_in_use
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.planes import Plane
+from warprrf.geometry.report import write_report
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.tensor_files import named
@@ -353,9 +353,10 @@ class Reconstruction:
             mesh = mesh if isinstance(mesh, Mesh) else Mesh.load(mesh)
             patches = planar_patches(mesh)
         elif cameras and gaussians is not None:
-            patches, _ = fuse_gaussians(
-                gaussians, list(cameras.values()), config=config, progress=progress, device=device
-            )
+            config, poses = config or ReconstructionConfig(), list(cameras.values())
+            depths = depth_maps(gaussians, poses, config=config, progress=progress, device=device)
+            views = depth_views(poses, config.surface)
+            patches, _ = fuse_maps(views, depths, config=config, progress=progress)
             mesh = patches.mesh
         return cls(gaussians, mesh, cameras, patches=patches)
 

@@ -34,12 +34,13 @@ def patch_agreement(
     views: wp.array2d(dtype=wp.int32),
     projections: wp.array2d(dtype=wp.vec4),
     images: wp.array(dtype=wp.float32),
-    width: int,
-    height: int,
+    sizes: wp.array(dtype=wp.vec3i),
     agreement: wp.array(dtype=wp.float32),
     contrast: wp.array(dtype=wp.float32),
 ):
     """Mean normalised cross-correlation over all pairs of views, and the mean contrast of the patch in them.
+
+    ``sizes`` says where each photo begins in ``images``, its width and its height.
 
     With unit, zero-mean patches p_i of V views, the mean over pairs is (|sum p_i|^2 - V) / (V (V - 1)).
     """
@@ -51,6 +52,7 @@ def patch_agreement(
     for s in range(views.shape[1]):
         c = views[n, s]
         if c >= 0:
+            shape = sizes[c]
             values = patch()
             mean = float(0.0)
             inside = int(1)
@@ -63,8 +65,8 @@ def patch_agreement(
                 if z > 0.05:
                     u = wp.dot(projections[c, 0], h) / z
                     v = wp.dot(projections[c, 1], h) / z
-                    if u > 0.5 and v > 0.5 and u < float(width) - 0.51 and v < float(height) - 0.51:
-                        grey = bilinear(images, c * width * height, width, u, v)
+                    if u > 0.5 and v > 0.5 and u < float(shape[1]) - 0.51 and v < float(shape[2]) - 0.51:
+                        grey = bilinear(images, shape[0], shape[1], u, v)
                         values[k] = grey
                         mean = mean + grey
                     else:

@@ -92,6 +92,16 @@ def test_planes_go_as_far_as_photos_show_them_and_take_fine_discs_where_these_ar
     np.testing.assert_allclose(grey[plain], 0.5, atol=1e-3)
 
 
+def test_photos_of_two_sizes_are_compared(sparse):
+    cameras = {
+        name: camera.resized(200, 150) if k % 2 else camera for k, (name, camera) in enumerate(sparse.cameras.items())
+    }  # fmt: skip
+    config = ReconstructionConfig(plain=False, gaussians=3000)
+    planes, _ = initialise(sparse, cameras, [photo(c) for c in cameras.values()], config=config)
+    assert [p.offset for p in planes if p.normal[2] > 0.99] == pytest.approx([0, TABLE[2]], abs=5e-3)
+    assert planes[-1].area() == pytest.approx(np.prod(TABLE[1] - TABLE[0]), rel=0.1)
+
+
 def test_compared_photos_differ_in_direction():
     eyes = [*([2.0, 0.02 * k, 1.0] for k in range(10)), [0, 2.0, 1.0]]
     cameras = [look(eye, [0, 0, 0.0]) for eye in eyes]

@@ -18,7 +18,6 @@ CONTESTED_M = 0.25  # of parallel planes closer than this, such as a sign and it
 PARALLEL = np.cos(np.radians(10.0))  # planes that face alike
 REACH_CELLS = 3  # a gap at an inner corner up to this wide is closed, an overhang of any width cut
 NEAR_M = 0.5  # cells this close to the other plane tell on which side of it they stand
-ON_PLANE_M = 0.1  # a face this close to a plane lies on it
 INNER, OUTER = 0.8, 0.6  # share of them that has to be on one side
 
 
@@ -146,22 +145,6 @@ def seen_cells(planes: Sequence[Plane], cameras: Sequence[Camera]) -> list[Plane
         occupied[plane.occupied] = seen.sum(axis=1) >= 2
         result.append(replace(plane, occupied=occupied))
     return result
-
-
-def surface_shares(mesh: Mesh, planes: Sequence[Plane], cameras: Sequence[Camera]) -> tuple[float, float]:
-    """Shares of the area of ``mesh`` that no camera sees, and that some see but only edges show (plain planes)."""
-    centres, normals, areas = mesh.triangles.mean(axis=1), mesh.face_normals, mesh.areas
-    seen = np.zeros(len(centres), dtype=bool)
-    for camera in cameras:
-        left = np.flatnonzero(~seen)
-        seen[left] = visible_from(mesh, centres[left], normals[left], [camera])[:, 0]
-    plain = np.zeros(len(centres), dtype=bool)
-    for plane in planes:
-        if plane.plain:
-            near = (np.abs(plane.distance(centres)) < ON_PLANE_M) & (normals @ plane.normal > PARALLEL)
-            plain |= near & plane.covers(centres)
-    whole = max(float(areas.sum()), 1e-30)
-    return float(areas[~seen].sum() / whole), float(areas[seen & plain].sum() / whole)
 
 
 def meeting(planes: Sequence[Plane]) -> list[Plane]:

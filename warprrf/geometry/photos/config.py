@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from warprrf.checks import check_count, check_seed
 from warprrf.geometry.planes import PlaneConfig
 from warprrf.geometry.scans import SurfaceConfig
-from warprrf.kernels.raster.sh import COEFFICIENTS
 
 LENSES = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 """COLMAP's lens models that photos can be taken through; "auto": the simplest that explains them."""
@@ -23,15 +22,9 @@ class RefineConfig:
     Attributes:
         iterations: steps, one photo each.
         downscale: photos are averaged over squares of this many pixels while training.
-        coarse_pixels: for most of the iterations squares are twice as wide, and twice again, as long as photos would
-            have more pixels than this.
-        full_from: share of the iterations after which photos are taken as they are.
-        sh_degree: of the colours; rendered rooms are nearly matt, so 1.
         fit_exposure: whether every photo has a gain for each colour of its own.
         mean_rate: metres a step at the start.
         densify_from, densify_every: in iterations.
-        densify_to: up to half of the Gaussians are split or cloned at a time where otherwise fewer than these would be
-            there in the end.
         max_gaussians: densification stops here.
         max_scale_m: larger ones are removed ("abnormally large"; the paper's centre approximation relies on it).
         thickness_m: upper bound of the smallest scale.
@@ -41,14 +34,10 @@ class RefineConfig:
 
     iterations: int = 2400
     downscale: int = 2
-    coarse_pixels: int = 100_000
-    full_from: float = 0.9
-    sh_degree: int = 1
     fit_exposure: bool = True
     mean_rate: float = 4e-4
     densify_from: int = 300
     densify_every: int = 200
-    densify_to: int = 30_000
     max_gaussians: int = 60_000
     max_scale_m: float = 0.3
     thickness_m: float = 0.004
@@ -59,7 +48,6 @@ class RefineConfig:
         counts = (
             "iterations",
             "downscale",
-            "coarse_pixels",
             "densify_every",
             "max_gaussians",
             "checkpoint_every",
@@ -67,8 +55,6 @@ class RefineConfig:
         for name in counts:
             check_count(name, getattr(self, name))
         check_seed(self.seed)
-        if self.sh_degree not in COEFFICIENTS:
-            raise ValueError(f"sh_degree: got {self.sh_degree!r}, expected 0, 1, 2 or 3")
 
 
 @dataclass(frozen=True)
@@ -80,8 +66,6 @@ class ReconstructionConfig:
         lens: COLMAP's model of the lenses, one of :data:`LENSES`; ``"auto"`` takes the simplest of pinhole,
             ``"SIMPLE_RADIAL"``, ``"RADIAL"`` and ``"OPENCV"`` that explains the photos. A fisheye has to be named.
         max_pixels: undistorted photos are reduced to about so many pixels.
-        pairs: ``"exhaustive"`` matches every pair of photos; ``"auto"`` only those that a coarse comparison of their
-            largest features finds promising, once there are more than 2000 pairs.
         planes: how planes are found among sparse points.
         sweep: whether planes are corrected and completed by comparing the photos.
         plain: whether surfaces without features are found from their edges.
@@ -96,7 +80,6 @@ class ReconstructionConfig:
     max_features: int = 2400
     lens: str = "auto"
     max_pixels: int = 1_000_000
-    pairs: str = "auto"
     planes: PlaneConfig = field(default_factory=PlaneConfig)
     sweep: bool = True
     plain: bool = True

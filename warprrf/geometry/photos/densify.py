@@ -37,7 +37,8 @@ PRUNE_OPACITY = 0.02  # fainter ones are removed
 APART = 0.7  # of its largest standard deviation: how far the halves of a split Gaussian lie from its centre
 SMALLER = 1.6  # the largest standard deviation of a split Gaussian is divided by this
 DENSIFY_SHARE = 0.08  # at most of the Gaussians is split or cloned at a time, those pulled hardest
-LARGEST_SHARE = 0.5  # of the Gaussians that is split or cloned at a time
+DENSIFY_TO, LARGEST_SHARE = 30_000, 0.5
+"""Up to this share of the Gaussians is split or cloned at a time where fewer than so many would be there in the end."""
 JITTER = 0.3  # standard deviation of a clone's place, in those of the Gaussian
 
 
@@ -68,7 +69,7 @@ def densified(
         )
     pull = np.where(keep, arrays["pull"][:, 0] / np.maximum(hits, 1), 0.0)
     kept = int(keep.sum())
-    catching_up = min((config.densify_to - kept) / rounds_left, LARGEST_SHARE * kept)
+    catching_up = min((DENSIFY_TO - kept) / rounds_left, LARGEST_SHARE * kept)
     room = min(config.max_gaussians - kept, int(max(DENSIFY_SHARE * kept, catching_up)))
     chosen = np.argsort(-pull, kind="stable")[: max(room, 0)]
     chosen = np.sort(chosen[pull[chosen] > 0])

@@ -18,6 +18,7 @@ from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.completion import complete
 from warprrf.geometry.photos.config import ReconstructionConfig
+from warprrf.geometry.photos.grey import lens_matrix
 from warprrf.geometry.photos.photo_files import spread
 from warprrf.geometry.photos.segments import with_segments
 from warprrf.geometry.photos.stereo import kept_pixels, mended
@@ -50,35 +51,43 @@ TOUCHED = (
 BLOCK_VOXELS, BLOCKS = 16, 20_000  # voxels along a block's side; blocks set aside at first, the grid grows
 
 
-def fuse_gaussians(
+def depth_views(cameras: Sequence[Camera], config: SurfaceConfig) -> list[Camera]:
+    """Cameras of the depth maps: some of ``cameras``, spread over all, with fewer pixels."""
+    return [
+        c.resized(max(1, c.width // config.downscale), max(1, c.height // config.downscale))
+        for c in spread(cameras, VIEWS)
+    ]
+
+
+def depth_maps(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
     *,
     photos: PosedPhotos | None = None,
-    planes: Sequence[Plane] = (),
     config: ReconstructionConfig | None = None,
     progress: Progress | None = None,
     device: DeviceLike = None,
-) -> tuple[PlanarPatches, bool]:
-    """Mesh of Gaussians from depth maps rendered at ``cameras``, with its planar patches, the largest first; and whether
-    its holes were closed.
+) -> list[np.ndarray]:
+    """Ranges [m] that :func:`depth_views` of ``cameras`` see of Gaussians, 0 where none is reliable.
 
     Args:
-        photos: what these cameras saw, in the same order; the depth maps are mended by them.
-        planes: known beforehand; the mesh is snapped to them.
+        photos: what ``cameras`` saw, in the same order; the depth maps are mended by them.
     """
     config = config or ReconstructionConfig()
     report = progress or (lambda stage, done, total: None)
-    chosen = spread(range(len(cameras)), VIEWS)
-    views, depths = depth_maps(
-        gaussians, [cameras[k] for k in chosen], config=config.surface, progress=report, device=device
-    )
-    if photos is not None and config.stereo:
-        seen = photos.subset(chosen)
-        depths, proved = mended(depths, views, seen, progress=report, device=device)
-        if config.segments:
-            depths = _flat(depths, proved, views, seen, report)
-    return fuse_maps(views, depths, planes=planes, config=config, progress=report)
+    views, depths = depth_views(cameras, config.surface), []
+    for k, view in enumerate(views):
+        report("depth", k, len(views))
+        out = render(gaussians, view, features=np.zeros((len(gaussians), 1), dtype=np.float32), device=device)
+        with np.errstate(invalid="ignore"):
+            agree = np.abs(out.depth - out.peak) <= DEPTH_SPREAD * out.peak
+        depths.append(np.where(agree & (out.alpha >= ALPHA), out.depth, 0.0))
+    report("depth", len(views), len(views))
+    if photos is None or not config.stereo:
+        return depths
+    seen = photos.subset(spread(range(len(cameras)), VIEWS))
+    depths, proved = mended(depths, views, seen, progress=report, device=device)
+    return _flat(depths, proved, views, seen, report) if config.segments else depths
 
 
 def _flat(
@@ -105,7 +114,13 @@ def fuse_maps(
     config: ReconstructionConfig | None = None,
     progress: Progress | None = None,
 ) -> tuple[PlanarPatches, bool]:
-    """As :func:`fuse_gaussians`, from ranges [m], 0 where unknown, that are there already, each of one of ``views``."""
+    """Mesh of depth maps with its planar patches, the largest first; and whether its holes were closed.
+
+    Args:
+        views: pinhole cameras.
+        depths: ranges [m], 0 where unknown, each of one of ``views``.
+        planes: known beforehand; the mesh is snapped to them.
+    """
     config = config or ReconstructionConfig()
     report = progress or (lambda stage, done, total: None)
     report("surface", 0, 4)
@@ -118,30 +133,6 @@ def fuse_maps(
     result = largest_first(simplified(whole), MIN_PATCH_M2)
     report("surface", 4, 4)
     return result, whole is not patches
-
-
-def depth_maps(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    *,
-    config: SurfaceConfig,
-    progress: Progress,
-    device: DeviceLike = None,
-) -> tuple[list[Camera], list[np.ndarray]]:
-    """Smaller ``cameras``, and the ranges that they see [m], 0 where no Gaussian is reliable."""
-    views, depths = [], []
-    for k, camera in enumerate(cameras):
-        progress("depth", k, len(cameras))
-        view = camera.resized(
-            max(1, camera.width // config.downscale), max(1, camera.height // config.downscale)
-        )
-        out = render(gaussians, view, features=np.zeros((len(gaussians), 1), dtype=np.float32), device=device)
-        with np.errstate(invalid="ignore"):
-            agree = np.abs(out.depth - out.peak) <= DEPTH_SPREAD * out.peak
-        depths.append(np.where(agree & (out.alpha >= ALPHA), out.depth, 0.0))
-        views.append(view)
-    progress("depth", len(cameras), len(cameras))
-    return views, depths
 
 
 def _with_voxels(
@@ -187,7 +178,7 @@ def fuse_depth(
             continue
         image = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(z, dtype=np.float32)))
         # The grid reads the pixel that a voxel's projection falls into: pixel centres at +0.5, as ours.
-        lens = core.Tensor(np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]]))
+        lens = core.Tensor(lens_matrix(camera))
         pose = core.Tensor(np.array(camera.world_to_camera, dtype=np.float64))
         limits = (1.0, config.max_range_m, config.truncation_voxels)
         blocks = grid.compute_unique_block_coordinates(image, lens, pose, *limits)

@@ -42,7 +42,10 @@ ENOUGH_TO_FILL = 100
 CHECKPOINT = "warprrf refinement 2"
 
 DENSIFY_UNTIL = 0.65  # of the iterations Gaussians are split and cloned
-FINE_FROM = 0.8  # until this share of the iterations photos with many pixels are made still smaller
+SH_DEGREE = 1  # of the colours: rooms are nearly matt
+FINE_FROM, COARSE_PIXELS = 0.8, 100_000
+"""Until this share of the iterations squares are twice as wide, and twice again, as long as photos would have more pixels."""
+FULL_FROM = 0.9  # share of the iterations after which photos are taken as they are
 FULL_PIXELS = 400_000  # of larger photos fewer iterations see all, so that they take as long
 SSIM_SHARE = 0.2  # weight of 1 - SSIM; L1 has the rest
 FINAL_MEAN_RATE = 4e-5  # metres a step at the end; exponential from that at the start
@@ -113,7 +116,7 @@ class _Refinement:
         """Begin with ``gaussians``, and others where they leave holes in the photos, if there is time to move those."""
         if self.config.iterations >= ENOUGH_TO_FILL:
             gaussians = filled(gaussians, self.targets.photos, device=self.device)
-        self.load(self.on_planes(_initial(gaussians, self.config)))
+        self.load(self.on_planes(_initial(gaussians)))
 
     def on_planes(self, arrays: Arrays) -> Arrays:
         """``arrays`` with ``plane_of``, the nearest plane that each Gaussian lies on, -1 for none."""
@@ -179,11 +182,11 @@ class _Refinement:
     def scale(self, iteration: int) -> int:
         """Side in pixels of the squares that photos are averaged over."""
         c, scale = self.config, self.config.downscale
-        in_full = (1 - c.full_from) * min(1.0, FULL_PIXELS / self.targets.pixels)
+        in_full = (1 - FULL_FROM) * min(1.0, FULL_PIXELS / self.targets.pixels)
         if iteration >= c.iterations - round(in_full * c.iterations):
             return 1
         if iteration < FINE_FROM * c.iterations:
-            while self.targets.pixels > c.coarse_pixels * scale**2:
+            while self.targets.pixels > COARSE_PIXELS * scale**2:
                 scale *= 2
         return scale
 
@@ -269,12 +272,12 @@ class _Refinement:
         self.load(arrays)
 
 
-def _initial(g: Gaussians, config: RefineConfig) -> Arrays:
+def _initial(g: Gaussians) -> Arrays:
     """Parameters with the thin axis last, moments and statistics zero."""
     order = np.argsort(-g.scales, axis=1, kind="stable")
     rotations = np.take_along_axis(g.rotations, order[:, None, :], axis=2)
     rotations[:, :, 2] *= np.linalg.det(rotations)[:, None]
-    sh = np.zeros((len(g), COEFFICIENTS[config.sh_degree], 3))
+    sh = np.zeros((len(g), COEFFICIENTS[SH_DEGREE], 3))
     kept = min(sh.shape[1], g.sh.shape[1])
     sh[:, :kept] = g.sh[:, :kept]
     opacity = np.clip(g.opacities.astype(np.float64), 1e-4, 1 - 1e-4)

@@ -102,7 +102,7 @@ def structure_from_motion(
     Args:
         photos: a folder, or a sequence of image files.
         workspace: folder for the feature database, the model and the undistorted photos; made if it is not there.
-        config: features, lens, pixels and pairs.
+        config: features, lens and pixels.
         poses: poses and lenses that are known; points are triangulated, where they and depth are not known too.
         seed: seed of every random draw.
         progress: called as ``progress("features" | "comparing" | "matching" | "mapping" | "undistorting", done, total)``.
@@ -113,9 +113,8 @@ def structure_from_motion(
         ImportError: if pycolmap is not installed.
     """
     config = config or ReconstructionConfig()
-    lens, pairs = config.lens, config.pairs
-    for name, value, known_values in (("lens", lens, LENSES), ("pairs", pairs, ("auto", "exhaustive"))):
-        check_choice(name, value, known_values)
+    lens = config.lens
+    check_choice("lens", lens, LENSES)
     max_features = check_count("max_features", config.max_features, 100)
     max_pixels = check_count("max_pixels", config.max_pixels, LEAST_PIXELS)
     everything = named = find_photos(photos)
@@ -135,7 +134,7 @@ def structure_from_motion(
         return {}
 
     def matches(attempt: Attempt) -> dict[str, Any]:
-        _match(colmap, folder, list(named), pairs, seed, attempt)
+        _match(colmap, folder, list(named), seed, attempt)
         return {}
 
     def model(attempt: Attempt) -> dict[str, Any]:
@@ -157,7 +156,7 @@ def structure_from_motion(
             steps.run(
                 "features", features, version=VERSIONS["features"], inputs=inputs, outputs=["features.db"]
             )
-            inputs = [steps.key("features"), pairs, seed]
+            inputs = [steps.key("features"), seed]
             steps.run("matches", matches, version=VERSIONS["matches"], inputs=inputs, outputs=["matches.db"])
             inputs = [steps.key("matches"), lens, seed]
         if known is not None:
@@ -371,9 +370,7 @@ def _write_masks(named: Mapping[str, Path], folder: Path) -> Path:
     return folder
 
 
-def _match(
-    colmap: ModuleType, folder: Path, names: list[str], pairs: str, seed: int, attempt: Attempt
-) -> None:
+def _match(colmap: ModuleType, folder: Path, names: list[str], seed: int, attempt: Attempt) -> None:
     """Verified matches of pairs of photos, into ``matches.db``."""
     working, listing = (
         _copied(folder / "features.db", attempt.folder / "matches.db"),
@@ -388,7 +385,7 @@ def _match(
                 f"blurred?), too few remain to work with: {some(blank)}"
             )
         chosen = list(itertools.combinations(names, 2))
-        if pairs == "auto" and len(chosen) > MAX_EXHAUSTIVE_PAIRS:
+        if len(chosen) > MAX_EXHAUSTIVE_PAIRS:
             chosen = _promising_pairs(database, names, attempt.progress)
     matching = colmap.FeatureMatchingOptions(use_gpu=False)
     verification = colmap.TwoViewGeometryOptions()

@@ -15,13 +15,13 @@ import numpy as np
 import warp as wp
 from scipy import ndimage
 
-from warprrf.device import DeviceLike, Progress, launch, require, resolve
+from warprrf.device import DeviceLike, Progress, launch
 from warprrf.geometry.photos.cells import in_frame
+from warprrf.geometry.photos.grey import GreyPhotos, lens_matrix
 from warprrf.geometry.photos.targets import PosedPhotos
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.patch_match import UNKNOWN, match
 
-LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 GOOD_ANGLE_DEG = 9.0  # between two lines of sight: less tells depths badly, more changes what a window shows
 SOURCES = 3  # photos that one is compared with
 ROUNDS = ((range(3), 0.0), (range(3, 4), 0.3))
@@ -54,8 +54,9 @@ def mended(
         return list(depths), [np.zeros(depth.shape, dtype=bool) for depth in depths]
     near, far = np.percentile(np.concatenate(known), [0.5, 99.5])
     bounds = 1 / (1.6 * float(far)), 1 / (0.6 * float(near))
-    comparison = _Comparison.of(views, photos, bounds, device)
-    others = [_companions(k, views, depths, comparison.sharpness, SOURCES) for k in range(len(views))]
+    comparison = _Comparison(GreyPhotos.upload(views, photos.images, device), bounds)
+    sharpness = comparison.sharpness
+    others = [_companions(k, views, depths, sharpness, SOURCES) for k in range(len(views))]
     started = [comparison.start(k, depth) for k, depth in enumerate(depths)]
     planes = list(started)
     work, costs = len(ROUNDS) * len(views), [np.zeros(0)] * len(views)
@@ -69,7 +70,7 @@ def mended(
     for k, (view, depth, plane) in enumerate(zip(views, depths, planes, strict=True)):
         moved = (plane[..., 0] != started[k][..., 0]) | (depth == 0)
         there = np.where(moved, 1 / (np.maximum(plane[..., 0], 1e-6) * ahead(view)), depth)
-        found.append(np.where((costs[k] < PROVED) & comparison.kept[k], there, 0.0))
+        found.append(np.where((costs[k] < PROVED) & kept_pixels(photos, k, view), there, 0.0))
     result, proved = [], []
     for k, (view, depth) in enumerate(zip(views, depths, strict=True)):
         checked = _companions(k, views, depths, np.ones(len(views)), CHECKED)
@@ -99,53 +100,26 @@ def kept_pixels(photos: PosedPhotos, number: int, camera: Camera) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Comparison:
-    """Grey photos on a device, and how they are compared.
+    """Photos to compare, and how.
 
     Attributes:
-        cameras: of the photos, at the size at which they are compared.
-        sizes: where each photo begins in ``grey``, its width and its height, shape ``(N, 3)``.
-        grey: all photos, flat.
-        kept: pixels that are not masked, ``(H, W)`` each.
-        sharpness: of each photo, over the median.
+        photos: at the size at which they are compared.
         bounds: least and largest inverse depth [1/m].
     """
 
-    cameras: Sequence[Camera]
-    sizes: np.ndarray
-    grey: wp.array
-    kept: Sequence[np.ndarray]
-    sharpness: np.ndarray
+    photos: GreyPhotos
     bounds: tuple[float, float]
-    device: wp.Device
 
-    @classmethod
-    def of(
-        cls,
-        cameras: Sequence[Camera],
-        photos: PosedPhotos,
-        bounds: tuple[float, float],
-        device: DeviceLike,
-    ) -> _Comparison:
-        """The photos at the sizes of ``cameras``."""
-        image, where = require("PIL.Image", extra="photos"), resolve(device)
-        grey, kept = [], []
-        for k, (photo, camera) in enumerate(zip(photos.images, cameras, strict=True)):
-            whole = image.fromarray(np.asarray(photo, dtype=np.float32) @ LUMA)
-            grey.append(np.asarray(whole.resize((camera.width, camera.height), image.BOX)))
-            kept.append(kept_pixels(photos, k, camera))
-        ends = np.cumsum([0, *(g.size for g in grey)])[:-1]
-        sizes = np.array(
-            [(end, g.shape[1], g.shape[0]) for end, g in zip(ends, grey, strict=True)], dtype=np.int32
-        )
-        blur = np.array([ndimage.laplace(g).var() for g in grey])  # small where a photo is blurred
-        flat = wp.array(np.concatenate([g.ravel() for g in grey]), dtype=wp.float32, device=where)
-        sharpness = np.clip(blur / max(float(np.median(blur)), 1e-12), 0.3, 1.5)
-        return cls(cameras, sizes, flat, kept, sharpness, bounds, where)
+    @property
+    def sharpness(self) -> np.ndarray:
+        """Of each photo, over the median."""
+        blur = np.array([ndimage.laplace(grey).var() for grey in self.photos.pixels])
+        return np.clip(blur / max(float(np.median(blur)), 1e-12), 0.3, 1.5)
 
     def start(self, view: int, depth: np.ndarray) -> np.ndarray:
         """Planes along a depth map, ``(H, W, 3)``; at any depth where it is unknown."""
         known = depth > 0
-        w = np.where(known, 1 / np.where(known, depth * ahead(self.cameras[view]), 1.0), 0.0)
+        w = np.where(known, 1 / np.where(known, depth * ahead(self.photos.cameras[view]), 1.0), 0.0)
         planes = np.stack([w, *np.gradient(w)[::-1]], axis=-1)
         bent = ~known | (np.abs(planes[..., 1:]).max(axis=-1) > 0.05 * w)  # across an edge
         planes[bent, 1:] = 0.0
@@ -154,7 +128,8 @@ class _Comparison:
 
     def upload(self, planes: Sequence[np.ndarray]) -> wp.array:
         """Planes of all photos, flat."""
-        return wp.array(np.concatenate([p.reshape(-1, 3) for p in planes]), dtype=wp.vec3, device=self.device)
+        flat = np.concatenate([p.reshape(-1, 3) for p in planes])
+        return wp.array(flat, dtype=wp.vec3, device=self.photos.device)
 
     def match(
         self,
@@ -172,38 +147,35 @@ class _Comparison:
             turns: in which planes are handed on between pixels.
             contradicting: cost of a plane that contradicts what is told of another photo.
         """
-        camera, device = self.cameras[view], self.device
+        cameras, sizes, device = self.photos.cameras, self.photos.sizes, self.photos.device
+        camera = cameras[view]
         if len(others) < 2:
             return first, np.full(first.shape[:2], float(UNKNOWN))
         planes = wp.array(first.reshape(-1, 3), dtype=wp.vec3, device=device)
         costs = wp.full(len(planes), float(UNKNOWN), dtype=wp.float32, device=device)
-        inverse = np.linalg.inv(_lens(camera))
-        turn = [self.cameras[s].rotation @ camera.rotation.T for s in others]
+        inverse = np.linalg.inv(lens_matrix(camera))
+        turn = [cameras[s].rotation @ camera.rotation.T for s in others]
         shift = [
-            self.cameras[s].world_to_camera[:3, 3] - r @ camera.world_to_camera[:3, 3]
+            cameras[s].world_to_camera[:3, 3] - r @ camera.world_to_camera[:3, 3]
             for s, r in zip(others, turn, strict=True)
         ]
-        lenses = [_lens(self.cameras[s]) for s in others]
+        lenses = [lens_matrix(cameras[s]) for s in others]
         rotations = np.array([k @ r @ inverse for k, r in zip(lenses, turn, strict=True)], dtype=np.float32)
         shifts = np.array([k @ t for k, t in zip(lenses, shift, strict=True)], dtype=np.float32)
         sources = [
             wp.array(rotations, dtype=wp.mat33, device=device), wp.array(shifts, dtype=wp.vec3, device=device),
-            wp.array(self.sizes[others], dtype=wp.vec3i, device=device), self.grey, told, contradicting,
+            wp.array(sizes[others], dtype=wp.vec3i, device=device), self.photos.flat, told, contradicting,
             planes, costs,
         ]  # fmt: skip
         for number in (-1, *turns):
             for colour in (0, 1):
                 settings = [
                     colour, number, view, 1 / camera.fx, wp.vec2(*self.bounds), SETTLED,
-                    wp.vec3i(*map(int, self.sizes[view])),
+                    wp.vec3i(*map(int, sizes[view])),
                 ]  # fmt: skip
                 count = camera.height * ((camera.width + 1) // 2)
                 launch(match, count, [*settings, *sources], device=device, grain=32)
         return planes.numpy().reshape(first.shape), costs.numpy().reshape(first.shape[:2])
-
-
-def _lens(camera: Camera) -> np.ndarray:
-    return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
 
 
 def _companions(

@@ -14,9 +14,10 @@ import numpy as np
 import warp as wp
 from scipy import ndimage
 
-from warprrf.device import DeviceLike, launch, resolve
+from warprrf.device import launch
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.cells import CONTESTED_M, PARALLEL, plane_mesh, visible_from
+from warprrf.geometry.photos.grey import GreyPhotos, lens_matrix
 from warprrf.geometry.planes import AROUND, Plane, dilate, plane_axes
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.photo_consistency import SIDE, patch_agreement
@@ -34,61 +35,25 @@ UP_M2, DOWN_M2 = 0.3, 2.0  # least area of a new plane that faces up, or down
 FINE_M = 0.005  # a plane's height is settled in steps of this length
 
 
-@dataclass(frozen=True)
-class GreyPhotos:
-    """Grey photos and their projections on a device.
-
-    Attributes:
-        cameras: pinhole cameras of one size.
-        grey: all photos, flat float32.
-        projections: rows of the 3x4 projection matrices, shape ``(cameras, 3)`` of vec4.
-        device: Warp device.
-    """
-
-    cameras: Sequence[Camera]
-    grey: wp.array
-    projections: wp.array
-    device: wp.Device
-
-    @classmethod
-    def upload(
-        cls,
-        cameras: Sequence[Camera],
-        images: Sequence[np.ndarray],
-        device: DeviceLike = None,
-    ) -> GreyPhotos:
-        """Photos ``(H, W, 3)`` in [0, 1] of ``cameras``."""
-        where = resolve(device)
-        luma = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
-        grey = np.stack([i @ luma for i in images])
-        rows = np.zeros((len(cameras), 3, 4), dtype=np.float32)
-        for k, c in enumerate(cameras):
-            lens = np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]])
-            rows[k] = lens @ c.world_to_camera[:3]
-        return cls(
-            cameras,
-            wp.array(grey.ravel(), dtype=wp.float32, device=where),
-            wp.array(rows, dtype=wp.vec4, device=where),
-            where,
-        )
-
-    def agreement(
-        self, centres: np.ndarray, axes: np.ndarray, views: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Correlation in [-1, 1] and contrast of the patches at ``centres`` (N, 3) over ``views`` (N, V), -1 padded."""
-        n, device = len(centres), self.device
-        result, contrast = (wp.zeros(n, dtype=wp.float32, device=device) for _ in range(2))
-        launch(
-            patch_agreement,
-            n,
-            [
-                wp.array(centres, dtype=wp.vec3, device=device), wp.vec3(*axes[0]), wp.vec3(*axes[1]),
-                PATCH_M / (SIDE - 1), wp.array(views, dtype=wp.int32, device=device), self.projections,
-                self.grey, self.cameras[0].width, self.cameras[0].height, result, contrast,
-            ],
-            device=device,
-        )  # fmt: skip
-        return result.numpy(), contrast.numpy()
+def agreement_of(
+    photos: GreyPhotos, centres: np.ndarray, axes: np.ndarray, views: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Correlation in [-1, 1] and contrast of the patches at ``centres`` (N, 3) over ``views`` (N, V), -1 padded."""
+    n, device = len(centres), photos.device
+    projections = np.array([lens_matrix(c) @ c.world_to_camera[:3] for c in photos.cameras])
+    result, contrast = (wp.zeros(n, dtype=wp.float32, device=device) for _ in range(2))
+    launch(
+        patch_agreement,
+        n,
+        [
+            wp.array(centres, dtype=wp.vec3, device=device), wp.vec3(*axes[0]), wp.vec3(*axes[1]), PATCH_M / (SIDE - 1),
+            wp.array(views, dtype=wp.int32, device=device),
+            wp.array(projections.astype(np.float32), dtype=wp.vec4, device=device), photos.flat,
+            wp.array(photos.sizes, dtype=wp.vec3i, device=device), result, contrast,
+        ],
+        device=device,
+    )  # fmt: skip
+    return result.numpy(), contrast.numpy()
 
 
 def choose_views(
@@ -156,7 +121,7 @@ def _scored(plane: Plane, surface: Mesh | None, points: np.ndarray, photos: Grey
     middle = full.to_world(full.corner + (2 * key + 1.0) * full.cell_m)
     seen = visible_from(surface, middle, full.normal, photos.cameras)
     views = choose_views(middle, full.normal, seen, photos.cameras)[group.ravel()]
-    agreement, contrast = photos.agreement(full.cells(), full.axes, views)
+    agreement, contrast = agreement_of(photos, full.cells(), full.axes, views)
     score = np.full(full.occupied.shape, np.nan)
     score[full.occupied] = np.where((contrast > CONTRAST) & (views[:, 1] >= 0), agreement, np.nan)
     visible = np.zeros_like(full.occupied)
@@ -249,7 +214,7 @@ def _swept(whole: Plane, levels: np.ndarray, surface: Mesh | None, photos: GreyP
             views = choose_views(middle, whole.normal, seen, photos.cameras)[group.ravel()]
             some = np.flatnonzero(views[:, 2] >= 0)  # three photos at least
         cells[:, 2] = z
-        value, contrast = photos.agreement(cells[some], whole.axes, views[some])
+        value, contrast = agreement_of(photos, cells[some], whole.axes, views[some])
         agreement[k, some] = np.where(contrast > CONTRAST, value, -1.0)
     return agreement.reshape(len(levels), *whole.occupied.shape)
 
@@ -284,7 +249,9 @@ def _settled(piece: Plane, surface: Mesh | None, photos: GreyPhotos) -> Plane | 
     seen = visible_from(surface, centres, piece.normal, photos.cameras)
     views = choose_views(centres, piece.normal, seen, photos.cameras)
     steps = np.arange(-0.05, 0.0501, FINE_M)
-    scores = [float(photos.agreement(centres + [0, 0, step], piece.axes, views)[0].mean()) for step in steps]
+    scores = [
+        float(agreement_of(photos, centres + [0, 0, step], piece.axes, views)[0].mean()) for step in steps
+    ]
     best = int(np.argmax(scores))
     if best in (0, len(steps) - 1) or scores[best] < 0.5:
         return None

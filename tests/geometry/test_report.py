@@ -1,6 +1,7 @@
 """The page of a reconstruction: whole, safe, and its figures by closed form."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,8 +9,9 @@ from radio_scenes import box_mesh, joined
 from views import look
 
 import warprrf as wr
-from warprrf.geometry.photos.report import colours_matched, psnr_db
-from warprrf.geometry.photos.sight import CLASSES, from_outside, how_seen
+from warprrf.geometry.planes import Plane
+from warprrf.geometry.report import colours_matched, psnr_db
+from warprrf.geometry.report.sight import CLASSES, from_outside, how_seen
 from warprrf.geometry.splats.gaussians import discs_on_mesh
 
 image = pytest.importorskip("PIL.Image")
@@ -27,6 +29,21 @@ def test_a_surface_is_seen_by_the_cameras_that_look_at_it():
     assert on_wall.mean() == pytest.approx(3 * 2.5 / 59, rel=0.05)
     assert seen.shares.sum() == pytest.approx(1.0) and seen.shares[3] == seen.shares[4] == 0.0
     assert [CLASSES[k][0] for k in np.unique(seen.classes)] == [0, 3]
+
+
+def test_what_no_photo_shows_and_what_only_edges_found_are_told_apart():
+    ahead = look([1.0, 1.5, 1.2], [4.0, 1.5, 1.2], f=1.0)
+    seen = how_seen(ROOM, [ahead])
+    facing, behind = (
+        Plane(np.array([-sign, 0, 0.0]), -sign * x, np.zeros(0, dtype=int), occupied=np.ones((99, 99), bool), plain=True)
+        for sign, x in ((1, 4.0), (-1, 0.0))
+    )  # fmt: skip
+    facing, behind = (replace(p, corner=np.array([-5.0, -5.0])) for p in (facing, behind))
+    unseen = (seen.photos == 0).mean()
+    assert 0.2 < unseen < 0.5
+    assert seen.unseen_and_plain([behind]) == (unseen, 0.0)
+    assert seen.unseen_and_plain([facing]) == (unseen, pytest.approx(3 * 2.5 / 59, rel=0.05))
+    assert seen.unseen_and_plain([replace(facing, plain=False)]) == (unseen, 0.0)
 
 
 def test_what_stands_before_a_surface_hides_it():

@@ -10,12 +10,14 @@ from scipy.spatial import cKDTree
 
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos.cells import in_frame
+from warprrf.geometry.photos.cells import PARALLEL, in_frame
+from warprrf.geometry.planes import Plane
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Y00, Gaussians
 
 SAMPLES = 30_000  # points of the surface, spread by area
 FARTHEST_M, GRAZING = 15.0, 0.1  # a photo shows a point nearer than this, at a cosine of incidence above this
+ON_PLANE_M = 0.1  # a point this close to a plane lies on it
 CLASSES = ((0, "no photo", "#b2182b"), (1, "1 or 2", "#ef8a62"), (3, "3 to 5", "#f7d98b"),
            (6, "6 to 11", "#92c5de"), (12, "12 or more", "#2166ac"))  # fmt: skip
 """Least number of photos, its name and colour."""
@@ -28,11 +30,12 @@ class Seen:
     """Points spread over a surface by area, and by how many photos each is seen.
 
     Attributes:
-        points: [m], shape ``(S, 3)``.
+        points, normals: [m] and unit, shape ``(S, 3)``.
         photos: shape ``(S,)`` int64.
     """
 
     points: np.ndarray
+    normals: np.ndarray
     photos: np.ndarray
 
     @property
@@ -44,6 +47,14 @@ class Seen:
     def shares(self) -> np.ndarray:
         """Part of the surface in each of :data:`CLASSES`."""
         return np.bincount(self.classes, minlength=len(CLASSES)) / len(self.photos)
+
+    def unseen_and_plain(self, planes: Sequence[Plane]) -> tuple[float, float]:
+        """Parts of the surface that no photo shows, and that some show but only edges found: those on plain ``planes``."""
+        plain = np.zeros(len(self.points), dtype=bool)
+        for plane in (plane for plane in planes if plane.plain):
+            near = np.abs(plane.distance(self.points)) < ON_PLANE_M
+            plain |= near & (self.normals @ plane.normal > PARALLEL) & plane.covers(self.points)
+        return float((self.photos == 0).mean()), float((plain & (self.photos > 0)).mean())
 
     @property
     def colours(self) -> np.ndarray:
@@ -68,7 +79,7 @@ def how_seen(mesh: Mesh, cameras: Sequence[Camera], *, device: DeviceLike = None
         facing = np.einsum("si,si->s", towards, normals) > GRAZING * distance
         some = np.flatnonzero(inside & facing & (distance < FARTHEST_M))
         photos[some] += mesh.visible(camera.position, points[some], clearance=1e-3, device=device)
-    return Seen(points, photos)
+    return Seen(points, normals, photos)
 
 
 def from_outside(

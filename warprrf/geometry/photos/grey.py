@@ -1,0 +1,60 @@
+"""Grey photos of any sizes, one behind the other on a device, as kernels compare them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warprrf.device import DeviceLike, require, resolve
+from warprrf.geometry.splats.camera import Camera
+
+LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
+
+
+@dataclass(frozen=True)
+class GreyPhotos:
+    """Grey photos.
+
+    Attributes:
+        cameras: pinhole cameras of the sizes at which photos are compared.
+        pixels: of each, in [0, 1], ``(H, W)`` float32.
+        sizes: where each begins in ``flat``, its width and its height, shape ``(N, 3)`` int32.
+        flat: all pixels, on the device.
+    """
+
+    cameras: Sequence[Camera]
+    pixels: Sequence[np.ndarray]
+    sizes: np.ndarray
+    flat: wp.array
+
+    @classmethod
+    def upload(
+        cls, cameras: Sequence[Camera], images: Sequence[np.ndarray], device: DeviceLike = None
+    ) -> GreyPhotos:
+        """Photos ``(H, W, 3)`` in [0, 1] at the sizes of ``cameras``."""
+        pixels = []
+        for camera, photo in zip(cameras, images, strict=True):
+            grey, size = np.asarray(photo, dtype=np.float32) @ LUMA, (camera.width, camera.height)
+            if grey.shape != size[::-1]:
+                image = require("PIL.Image", extra="photos")
+                grey = np.asarray(image.fromarray(grey).resize(size, image.BOX))
+            pixels.append(grey)
+        first = np.cumsum([0, *(grey.size for grey in pixels)])[:-1]
+        sizes = np.array(
+            [(start, c.width, c.height) for start, c in zip(first, cameras, strict=True)], dtype=np.int32
+        )
+        flat = np.concatenate([grey.ravel() for grey in pixels])
+        return cls(cameras, pixels, sizes, wp.array(flat, dtype=wp.float32, device=resolve(device)))
+
+    @property
+    def device(self) -> wp.Device:
+        """Where they lie."""
+        return self.flat.device
+
+
+def lens_matrix(camera: Camera) -> np.ndarray:
+    """Pixels ``(u, v, 1)`` of directions ``(x, y, 1)`` of a pinhole camera, shape ``(3, 3)``."""
+    return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
