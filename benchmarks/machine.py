@@ -35,7 +35,7 @@ PACKAGES = (
 )
 
 VERSIONS = {
-    "geometry": 4,
+    "geometry": 5,
     "renderer": 1,
     "metrics": 1,
     "exact": 2,
