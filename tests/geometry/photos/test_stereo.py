@@ -99,6 +99,14 @@ def test_what_photos_prove_is_right(room, searched):
     assert proved[patterned(room)].mean() > 0.8 and proved[~near].mean() < 0.02
 
 
+def test_a_photo_whose_pose_is_wrong_proves_next_to_nothing(room):
+    cameras, true, photos = room
+    raised = look(cameras[3].position + [0, 0, 0.2], [0.6, 2.0, 1.3])
+    images = [truth(raised)[1] if k == 3 else image for k, image in enumerate(photos.images)]
+    shares = [proved.mean() for proved in search(true, cameras, PosedPhotos(images, cameras))[1]]
+    assert shares[3] < 0.08 and min(shares[:3] + shares[4:]) > 0.6
+
+
 def test_right_depths_stay_as_they_are(room, spoiled, found):
     true = np.array(room[1])
     error = np.abs(found / true - 1)[~spoiled[1]]
