@@ -15,7 +15,7 @@ from scipy.sparse import block_diag, bsr_matrix, csr_matrix, identity
 
 from warprrf.checks import Expected, check_array, check_arrays, check_count, check_number, check_type, checked
 from warprrf.kernels.radio.records import EXCESS_COLUMN, MIRRORED_COLUMN, THROUGH_COLUMN
-from warprrf.rf.em.fresnel import fresnel_curves
+from warprrf.rf.em.fresnel import EXCESS, fresnel_curves
 from warprrf.rf.em.materials import NARROWEST_LOBE
 from warprrf.rf.paths.slabs import MOST_SLABS
 
@@ -70,7 +70,6 @@ SETS = {
 """Sets of effects that a fit tries. None has slabs or edges: ``effects="auto"`` adds them where the scene needs them."""
 
 MOST_NEPERS = 40.0  # of any logarithm: 174 dB from one, where no surface is
-_EXCESS = (0.05, 200.0)  # of epsilon_r - 1: the last reflects like metal
 ROUGHNESS = 2.0
 """Power of the carrier that roughness goes with (Ament 1953)."""
 ARRAYS = {
@@ -135,7 +134,7 @@ class Parameters:
     @property
     def excess(self) -> np.ndarray:
         """epsilon_r - 1, from 0.05 to 200, shape ``(G,)``."""
-        return np.clip(np.exp(self.log_excess), *_EXCESS)
+        return np.clip(np.exp(self.log_excess), *EXCESS)
 
     @property
     def gain(self) -> float:

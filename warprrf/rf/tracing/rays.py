@@ -21,7 +21,6 @@ from warprrf.kernels.radio import illumination
 from warprrf.rf.spectra.spectrum import sub_pixel_directions
 from warprrf.rf.tracing.surface import Surface
 
-LEAST_M = 1e-6  # range of what is hit at the ray's very start
 REALS = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
 """Warp's types of precisions."""
 NEAREST_M = 0.05  # an element at the transmitter spans directions: its distance counts as no less
@@ -131,13 +130,14 @@ class RayGrid:
     ) -> Hits:
         """What rays hit: ``origins`` (O, 3), a whole number of ``directions`` (K, 3) each, or all of them each if they are
         ``shared``."""
+        least_m = 1e-6  # range of what is hit at the ray's very start
         each = len(directions) if shared else len(directions) // max(len(origins), 1)
         hit = self.surface.mesh.cast(
             origins, directions, per_origin=max(each, 1), device=self.device, backend=self._backend(each * len(origins))
         )  # fmt: skip
         return Hits(
             origins, directions, np.asarray(solid_angle, self.dtype), np.asarray(hit.face, np.int32),
-            np.maximum(hit.t, LEAST_M, out=hit.t),
+            np.maximum(hit.t, least_m, out=hit.t),
         )  # fmt: skip
 
     def _backend(self, count: int) -> str:

@@ -24,9 +24,6 @@ from warprrf.rf.em.fresnel import COSINES, SurfaceTable, fresnel_curves, lobe_no
 from warprrf.rf.tracing.model import Parameters
 from warprrf.rf.tracing.rays import REALS
 
-FINE_COSINES = 4097
-"""Entries of a lobe's table for a truth: interpolation errs by 1e-6 at most up to an exponent of 100."""
-
 
 @dataclass(frozen=True)
 class Interactions:
@@ -337,7 +334,8 @@ class SlabMaterials(Materials):
         for name, value in values.items():
             setattr(m, name, wp.array(value, dtype=real, device=where))
         m.reciprocal = wp.array(table.reciprocal, dtype=wp.int32, device=where)
-        m.exponent, m.scale = _lobes(*zip(*lobes, strict=True), real, where, FINE_COSINES)
+        fine = 4097  # entries of a lobe's table: interpolation errs by 1e-6 at most up to an exponent of 100
+        m.exponent, m.scale = _lobes(*zip(*lobes, strict=True), real, where, fine)
         return m
 
 

@@ -37,7 +37,6 @@ from warprrf.rf.tracing.surface import Surface
 
 MIRROR_SLACK_M = 0.1
 """How far beside its faces a patch may still mirror [m]: outlines of a reconstructed mesh are torn."""
-THROUGH_MIRRORS = 3  # rays of a pixel that look for light by way of mirrors
 UNMODELLED = {("MTS", "M"), ("MTS", "T")}
 """Ways of light and of sight that are not traced together."""
 SPECULAR = "specular"
@@ -375,7 +374,8 @@ class Tracer:
     def lit_by_mirrors(self, rays: Rays, most: int = 0) -> Records:
         """What some rays of each pixel see of surfaces that images of the transmitter light; with ``most`` those that they light
         through slabs alone, up to that many."""
-        places = ((np.arange(THROUGH_MIRRORS) + 0.5) * self.grid.per_pixel / THROUGH_MIRRORS).astype(int)
+        most_rays = 3  # of a pixel
+        places = ((np.arange(most_rays) + 0.5) * self.grid.per_pixel / most_rays).astype(int)
         places = np.unique(places)
         times = self.grid.per_pixel / len(places)
         chosen = np.flatnonzero((rays.hits.face >= 0) & np.isin(rays.ray % self.grid.per_pixel, places))

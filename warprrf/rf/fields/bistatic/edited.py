@@ -23,10 +23,6 @@ from warprrf.rf.tracing.edits import Called, Room, edited
 from warprrf.rf.tracing.model import ARRAYS, MOST_NEPERS, Parameters
 from warprrf.rf.tracing.surface import Surface
 
-LOST = 0.02, 0.01
-"""Share of a material's area, and area [m^2], whose loss is worth a warning."""
-MOST_EXCESS = 1e6  # of epsilon_r - 1, of a conductor
-
 
 def with_geometry(field: Any, geometry: GeometryLike) -> dict[str, Any]:
     """The parts of a bistatic ``field`` that are others in ``geometry``, by name."""
@@ -44,7 +40,8 @@ def with_geometry(field: Any, geometry: GeometryLike) -> dict[str, Any]:
                 f"{after[g]:.3g} m^2 are new, of {new.group_names[g]!r}, a material that nobody knows: it is taken for what "
                 "surfaces are before any measurement; name it after one of ITU-R P.2040, or use with_objects(materials=)"
             )
-    for k in np.flatnonzero(before - after > np.maximum(LOST[0] * before, LOST[1])):
+    lost_share, lost_m2 = 0.02, 0.01  # of a material's area, whose loss is worth a warning
+    for k in np.flatnonzero(before - after > np.maximum(lost_share * before, lost_m2)):
         what = f"of {before[k]:.3g} m^2 of the fitted surface {old.group_names[k]!r}"
         _warn(f"{what}, {before[k] - after[k]:.3g} m^2 have vanished")
     return parts
@@ -134,7 +131,8 @@ def _of_material(material: Material, frequency_hz: float, lobes: tuple[int, ...]
     )
     root = np.sqrt(material.permittivity(frequency_hz))
     reflected = min(abs((1.0 - root) / (1.0 + root)), 1.0 - 1e-6)
-    excess = np.clip(((1.0 + reflected) / (1.0 - reflected)) ** 2 - 1.0, 1e-6, MOST_EXCESS)
+    of_conductor = 1e6
+    excess = np.clip(((1.0 + reflected) / (1.0 - reflected)) ** 2 - 1.0, 1e-6, of_conductor)
     mirrored = np.log(max(1.0 - scattered, np.exp(-MOST_NEPERS)))
     return Parameters(weight, np.log([excess]), np.array([mirrored]), lobes)
 

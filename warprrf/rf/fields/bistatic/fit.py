@@ -48,17 +48,9 @@ from warprrf.rf.tracing.model import SETS, Effects, Model
 from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.surface import Surface
 
-LEAST_HELD_OUT = 2
-"""Receivers held out below which they choose no effects: one alone likes what others do not."""
-MOST_TO_JUDGE = 200
-"""Receivers that the residual is learned from to judge it: more make it no worse."""
 SHORT_STEPS = 10  # of a fit that only decides about something
-BETTER, MUCH_BETTER = 0.995, 0.8
-"""Share to which further effects must lower the mean square error of receivers held out; to which single bounces must lower
-it where receivers are too few to hold any out."""
-CLEARLY_WORSE, NOT_MUCH_WORSE = 1.05, 1.25
-"""Share to which the residual may raise it (one that is learned from all receivers gains more), and to which fewer materials
-may that describe the training receivers better."""
+BETTER = 0.995
+"""Share to which further effects must lower the mean square error of receivers held out."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +150,8 @@ def choose(t: Training) -> Choice:
     material = t.surface.material
     start = Solution(t.start(material), np.zeros((0, 0)), [])
     trials = [Choice(effects, material, start) for effects in t.candidates]
-    if len(t.split.held) < (LEAST_HELD_OUT if len(trials) > 1 else 1):
+    least_held = 2 if len(trials) > 1 else 1  # to choose effects by: one alone likes what others do not
+    if len(t.split.held) < least_held:
         return _choose_of_few(t, trials)
     best, least = None, np.inf
     for trial in trials:  # each holds the one before it: what is no better with some is not tried with more
@@ -206,7 +199,10 @@ def _choose_of_few(t: Training, trials: list[Choice]) -> Choice:
     wrong, also = (t.unexplained(model).rows for model in models)
     counted = t.without({k: np.intersect1d(rows, also[k]) for k, rows in wrong.items() if k in also})
     losses = [counted.loss(model, list(t.observations)) for model in models]
-    fewer = losses[0] < MUCH_BETTER * losses[1]
+    much_better = (
+        0.8  # share to which single bounces must lower the error that mirrors and further bounces leave
+    )
+    fewer = losses[0] < much_better * losses[1]
     t.note(_name(single.effects), fewer, losses[0])
     t.note(_name(room.effects), not fewer, losses[1])
     return single if fewer else room
@@ -226,7 +222,8 @@ def merged(t: Training, best: Choice, least: float) -> Choice:
     # Few receivers held out say little, fewer materials that describe the others better say much.
     same = len(t.split.kept) <= MOST_TO_CHOOSE  # receivers of both fits
     simpler = same and trial.solution.losses[-1:] < best.solution.losses[-1:]
-    keep = loss < least or (simpler and loss < NOT_MUCH_WORSE * least)
+    not_much_worse = 1.25
+    keep = loss < least or (simpler and loss < not_much_worse * least)
     t.note(f"{best.material.max() + 1} materials as {trial.material.max() + 1}", keep, loss)
     return trial if keep else best
 
@@ -247,9 +244,9 @@ def cross_validate(t: Training, choice: Choice) -> tuple[bool, ErrorModel | None
     tried = (False, True) if free else (choice.effects.residual,)
     power: dict[bool, list[np.ndarray]] = {residual: [] for residual in tried}
     order: list[int] = []
-    gaps = []
+    gaps, most_to_judge = [], 200  # receivers that a residual is learned from: more make it no worse
     for held in _folds(t):
-        kept = evenly(np.setdiff1d(np.arange(len(places)), held), MOST_TO_JUDGE)
+        kept = evenly(np.setdiff1d(np.arange(len(places)), held), most_to_judge)
         own = choice if held is t.split.held else t.refined(choice, kept, SHORT_STEPS)
         order += held.tolist()
         gaps += [np.linalg.norm(places[kept] - places[r], axis=1).min() for r in held]
@@ -263,7 +260,8 @@ def cross_validate(t: Training, choice: Choice) -> tuple[bool, ErrorModel | None
         )
         for residual, own in power.items()
     }
-    keep = loss[True] < CLEARLY_WORSE * loss[False] if free else choice.effects.residual
+    clearly_worse = 1.05  # one that is learned from all receivers gains more
+    keep = loss[True] < clearly_worse * loss[False] if free else choice.effects.residual
     for residual, error in loss.items():
         t.note("residual" if residual else "no residual", residual == keep, error)
     if not all(

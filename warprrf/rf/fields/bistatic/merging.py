@@ -38,8 +38,6 @@ class Merging:
 
 BY_SHAPE = Merging(appearance_cost=1.0, join=15.0, move=30.0)
 """For groups that only shapes tell apart: place and extent say less of a material than colour, a thing's parts more."""
-MOST_APPEARANCE = 9.0
-"""Largest squared difference of looks that counts: those that differ more tell no more."""
 
 
 def merge(
@@ -98,7 +96,8 @@ def _mean_appearance(
 
 def _appearance_cost(appearance: np.ndarray, typical: np.ndarray, o: Merging) -> np.ndarray:
     gap = ((appearance[:, None] - typical[None]) ** 2).sum(axis=2)
-    return o.appearance_cost * np.minimum(np.nan_to_num(gap, nan=MOST_APPEARANCE), MOST_APPEARANCE)
+    most = 9.0  # looks that differ more tell no more
+    return o.appearance_cost * np.minimum(np.nan_to_num(gap, nan=most), most)
 
 
 def _costs(problem: Problem, p: Parameters, unit_of: np.ndarray, owner: np.ndarray) -> np.ndarray:

@@ -51,14 +51,10 @@ NOISE_DB = 3.0
 together (one misplaced edge), which a larger value stands for."""
 READINGS_SHAPE = (60, 120)
 """Rows and columns of the rays around a receiver of whom no spectrum is known, and of its field's spectra."""
-PIXELS_PER_LAG = 4
-"""Directions of an array's spectrum that a fit takes, per pair of elements that tells something of its own."""
 READING_ERROR_DB = 1.0
 """Standard deviation of what a field cannot explain of a reading without noise [dB]."""
-TOTAL_ERROR_DB = 0.5
-"""The same of all power of a place: errors of single directions average out."""
-HUBER_DB, WIDE_HUBER_DB = 3.0, 10.0  # see :class:`Observation`
-TAP_STEPS = 4.0  # that delays are told apart in, per tap
+HUBER_DB = 3.0  # see :class:`Observation`
+TAP_STEPS = 4.0  # that delays are told apart, and a clock is tried in, per tap
 
 
 def huber(error: np.ndarray, threshold: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -542,10 +538,13 @@ class _Tables(Kind):
         sight, steady = _shares(bare)
         bias, fading = fading_db(one.samples, steady)
         above = NEPER * np.log1p(one.power[rows] / floor * 10.0 ** (-bias / 10.0))
-        unexplained = TOTAL_ERROR_DB if one.total else READING_ERROR_DB
+        unexplained = (
+            0.5 if one.total else READING_ERROR_DB
+        )  # of all power errors of single directions average out
         trust = NOISE_DB / np.hypot(np.hypot(unexplained, np.asarray(one.std_db)[rows]), fading)
         target = Target(above, trust, one.power[rows] <= floors)
-        huber_db = HUBER_DB if one.samples is None and not one.total else WIDE_HUBER_DB
+        wide_db = 10.0  # of what fades or is all power; see :class:`Observation`
+        huber_db = HUBER_DB if one.samples is None and not one.total else wide_db
         return replace(bare, target=target, sight=None if one.total else sight, huber_db=huber_db)
 
 
@@ -570,7 +569,7 @@ class _Arrays(Kind):
         measured = ArrayImage.of(view, one.array, one.directions.reshape(-1, 3), one.length_std_m)
         power = one.power[place.rows[0]].ravel()
         known = np.flatnonzero(np.isfinite(power))
-        most = PIXELS_PER_LAG * measured.steered.shape[1]
+        most = 4 * measured.steered.shape[1]  # for each pair of elements that tells something of its own
         if len(known) > most:
             known = known[np.round(np.linspace(0, len(known) - 1, most)).astype(int)]
         unit = 1.0

@@ -8,8 +8,8 @@ from typing import Any, Protocol, runtime_checkable
 from warprrf.checks import check_count, check_seed, checked
 from warprrf.rf.tracing.model import LOBES, SETS, Effects, Parameters
 
-SUB_PIXELS, QUICK_SUB_PIXELS = 3, 1
-"""Square roots of the rays per pixel."""
+SUB_PIXELS = 3
+"""Square root of the rays per pixel."""
 
 
 @runtime_checkable
@@ -89,4 +89,4 @@ class FitOptions:
     @property
     def rays(self) -> int:
         """Square root of the rays per pixel."""
-        return self.sub_pixels or (QUICK_SUB_PIXELS if self.quick else SUB_PIXELS)
+        return self.sub_pixels or (1 if self.quick else SUB_PIXELS)

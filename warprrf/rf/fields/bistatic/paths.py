@@ -14,9 +14,6 @@ from warprrf.rf.spectra.spectrum import angles_from_directions, strongest_rays
 from warprrf.rf.tracing.render import PathGains
 from warprrf.rf.tracing.tracer import View
 
-PATH_SHARE = 1.0 / 200.0
-"""A ray's part of the power that scattering brings to a pixel, at 64 rays a pixel and a beam of 3."""
-
 
 def paths_of(
     gains: PathGains, image: np.ndarray, floor: float, air: Air | None, max_paths: int | None
@@ -81,7 +78,8 @@ def strongest(gains: PathGains, image: np.ndarray, beam_sigma_rad: float) -> tup
         beams = power[:, None, None] * view.beams
         which = beams.argmax(axis=0)
         diffuse = np.maximum(image - beams.sum(axis=0), 0.0)
-        direct = np.take_along_axis(beams, which[None], axis=0)[0] > PATH_SHARE * diffuse
+        of_a_ray = 1.0 / 200.0  # of what scattering brings to a pixel, at 64 rays a pixel and a beam of 3
+        direct = np.take_along_axis(beams, which[None], axis=0)[0] > of_a_ray * diffuse
         outward = np.where(direct[..., None], view.outward[which], outward)
         length = np.where(direct, view.paths.delay_m[which], length)
     length = np.where(np.isfinite(length), length, np.nan)

@@ -24,9 +24,6 @@ from warprrf.rf.tracing.tracer import View
 
 SIDE_LOBES_DB = 3.0
 """Standard deviation of the level of an antenna's side lobes, which few measure."""
-HANGING_DB = 1.0  # that this moves a chain's gain by and is worth a warning
-DARK = 0.01  # share of line of sight below which a place is blocked
-LEFT_OUT_DB = 0.5  # of them is too little for a warning
 
 
 def left_out(t: Training, model: Model) -> dict[str, Any]:
@@ -58,9 +55,9 @@ def left_out(t: Training, model: Model) -> dict[str, Any]:
 
 
 def _is_dark(view: View) -> bool:
-    """Whether less than :data:`DARK` of line of sight passes what is in its way."""
+    """Whether less than a hundredth of line of sight passes what is in its way."""
     p = view.paths
-    return bool((p.share[p.in_sight] ** 2).sum() < DARK)
+    return bool((p.share[p.in_sight] ** 2).sum() < 0.01)
 
 
 def side_lobes(t: Training, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
@@ -163,7 +160,8 @@ def warn(data: Sequence[Measured], report: dict[str, Any]) -> None:
 
 
 def _warn_of_side_lobes(chains: dict[str, dict[str, float]]) -> None:
-    hanging = {name: one for name, one in chains.items() if one["side_lobe_std_db"] > HANGING_DB}
+    much_db = 1.0
+    hanging = {name: one for name, one in chains.items() if one["side_lobe_std_db"] > much_db}
     if hanging:
         listed = ", ".join(
             f"{name!r} ({100 * one['side_lobe_share']:.0f} % of its readings, {one['side_lobe_std_db']:.1f} dB)"
@@ -178,8 +176,9 @@ def _warn_of_side_lobes(chains: dict[str, dict[str, float]]) -> None:
 
 
 def _warn_of_left_out(missed: dict[str, Any]) -> None:
+    little_db = max(missed["error_db"], 0.5)
     for name in ("diffraction", "transmission"):
-        large = [db for db in missed[name] if db > max(missed["error_db"], LEFT_OUT_DB)]
+        large = [db for db in missed[name] if db > little_db]
         if large:
             warnings.warn(
                 f"{name} is not modelled, but would add {np.median(large):.1f} dB to all power of {len(large)} of "

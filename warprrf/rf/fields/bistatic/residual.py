@@ -26,14 +26,6 @@ from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import SPECULAR
 
-DEVIATIONS = ((0.5, 0.5), (1.0, 2.0))
-"""A priori of the gains of elements and of cells from 1 [nepers]: for single bounces, and for light that is sent on."""
-LARGEST = 4.0  # gain [nepers]
-LONGEST = 3.0  # step of a gain, in standard deviations
-STEPS, QUICK_STEPS = (4, 12), (2, 8)
-"""Gauss-Newton steps and of conjugate gradients in each; the few of a quick fit find three quarters of what is to be found."""
-AT_ONCE = 64  # receivers that go through a measurement together
-
 
 @dataclass(frozen=True)
 class Shares:
@@ -93,15 +85,16 @@ def fit_residual(
     Args:
         shares: one for each training receiver.
         surface: whose cells they are.
-        quick: with few steps.
+        quick: with few steps, which find three quarters of what is to be found.
         noise_db: standard deviation of a reading's error.
     """
-    rounds, conjugate = QUICK_STEPS if quick else STEPS
+    rounds, conjugate = (2, 8) if quick else (4, 12)  # Gauss-Newton steps, and of conjugate gradients in each
+    at_once = 64  # receivers that go through a measurement together
     power = vstack([s.power for s in shares], format="csr")
     own_rows = [slice(*own) for own in pairwise(np.cumsum([0, *(len(s.rest) for s in shares)]))]
     # Receivers that are measured alike go through the measurement together.
     alike = [list(own) for _, own in groupby(shares, key=lambda s: s.measured.alike)]
-    batches = [own[k : k + AT_ONCE] for own in alike for k in range(0, len(own), AT_ONCE)]
+    batches = [own[k : k + at_once] for own in alike for k in range(0, len(own), at_once)]
     bins = np.cumsum([0, *(len(b) * b[0].power.shape[0] for b in batches)])
     rows = np.cumsum([0, *(len(b) * len(b[0].rest) for b in batches)])
 
@@ -121,14 +114,16 @@ def fit_residual(
         return np.asarray(power.T @ back)
 
     # Unknowns have unit variance a priori: elements and cells of single bounces, then of light that is sent on.
+    deviations = ((0.5, 0.5), (1.0, 2.0))  # of elements and of cells of each from a gain of 1 [nepers]
     cell = np.arange(surface.cells)
     member = csr_matrix((np.ones(len(cell)), (cell, surface.cell_element)))
     gains = block_diag(
-        [hstack([element * member, own * identity(len(cell))]) for element, own in DEVIATIONS], format="csr"
+        [hstack([element * member, own * identity(len(cell))]) for element, own in deviations], format="csr"
     )
+    largest, longest = 4.0, 3.0  # gain [nepers], and step of one in standard deviations
     unknown = np.zeros(gains.shape[1])
     for _ in range(rounds):
-        gain = np.exp(np.clip(gains @ unknown, -LARGEST, LARGEST))
+        gain = np.exp(np.clip(gains @ unknown, -largest, largest))
         pull, weight = spread(gain, quick=False), np.empty(rows[-1])
         for s, own in zip(shares, own_rows, strict=True):
             total = np.maximum(pull[own], 0.0) + s.rest
@@ -144,5 +139,5 @@ def fit_residual(
         gradient = gains.T @ (gain * gather(pull)) + unknown
         system = LinearOperator((len(unknown),) * 2, matvec=curvature, dtype=np.float64)
         step = cg(system, -gradient, rtol=0.0, atol=1e-6, maxiter=conjugate)[0]
-        unknown += np.clip(step, -LONGEST, LONGEST)
-    return np.clip(gains @ unknown, -LARGEST, LARGEST).reshape(2, -1)
+        unknown += np.clip(step, -longest, longest)
+    return np.clip(gains @ unknown, -largest, largest).reshape(2, -1)

@@ -30,7 +30,6 @@ SHARED = (1.0, 0.3, 1.0)
 OWN = (0.5, 0.3, 0.3)
 """Standard deviations of a material's gain, and of a surface's own over it [nepers]: for single bounces, for light that
 is sent on (a mean over many surfaces, so it is known better), for mirrors."""
-LEAST_DB = 1e-3  # per neper: readings that change less tell nothing
 
 
 @dataclass(frozen=True)
@@ -123,7 +122,8 @@ class Sensitivity:
             return summed, csr_matrix(summed / NOISE_DB**2)
         gain = turned_gain(pointings.antenna, pointings.angles, pixel_directions(SHAPE).reshape(-1, 3))
         slope = NEPER * (gain @ table) / (gain @ total + self.floor)[:, None]
-        return summed, csr_matrix(np.where(slope > LEAST_DB, (slope / READING_ERROR_DB) ** 2, 0.0))
+        least_db = 1e-3  # per neper: readings that change less tell nothing
+        return summed, csr_matrix(np.where(slope > least_db, (slope / READING_ERROR_DB) ** 2, 0.0))
 
     def precision(
         self, places: np.ndarray, pointings: Pointings | None = None, progress: Progress | None = None

@@ -48,28 +48,17 @@ from warprrf.rf.tracing.render import materials_of
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import Tracer, View, view_of
 
-HELD_OUT, MOST_HELD_OUT, LEAST_RECEIVERS = 0.25, 30, 4
-"""Share of receivers that are held out, how many at most, and of how many at least."""
+HELD_OUT, LEAST_RECEIVERS = 0.25, 4
+"""Share of receivers that are held out, and of how many at least."""
 FEW = 20
 """Receivers up to which errors are learned from every one, held out in turn."""
 MOST_TO_CHOOSE = 24
 """Receivers that fits which only decide about something learn from."""
 MERGES = 3  # rounds of deciding what is of one material, and fitting
-UNEXPLAINED = 5.0  # standard deviations beyond which a reading of a table is taken to be wrong
-CLEAR_DB = 10.0  # above its floor a reading's decibels err as they are
-NORMAL_MEDIAN = 1.4826  # standard deviation over the median size of normal errors
-READINGS, LEAST_READINGS = 12_000, 200
-"""Readings that parameters are fitted to, spread over the training receivers, and of each at least."""
 MOST_READINGS = 20_000
 """More do not tell the few parameters of materials better: they are those of some of the receivers."""
-KNOWN_BETTER = 2.0
-"""By how much more readings count that hold line of sight alone: no material is in them. They tell a chain's gain."""
-BEHIND_WALLS = 0.5
-"""How much directions count that were measured behind slabs: of what comes through these more is left out (light between
-surfaces that passes them on its way), and what a material must make up for there it lacks in the open."""
 MOST_RAYS = 500_000_000
 """Spectra with more rays than this are refused: what rays meet is kept during a fit."""
-RAY_BYTES = 40  # kept of each ray
 MOST_KEPT = 15_000_000
 """Rays up to which records of them are kept, some 200 bytes for each; of more they are traced whenever they are asked for."""
 
@@ -172,11 +161,11 @@ def rays_of(places: Sequence[Place], sub_pixels: int) -> int:
 
 def _check_rays(places: Sequence[Place], sub_pixels: int) -> None:
     """Refuse places whose rays would not fit into memory."""
-    rays = rays_of(places, sub_pixels)
+    rays, ray_bytes = rays_of(places, sub_pixels), 40  # that are kept of each
     if rays > MOST_RAYS:
         raise ValueError(
             f"ds: {len(places)} spectra of {places[0].shape[0]} x {places[0].shape[1]} pixels take {rays:.2g} rays, "
-            f"{rays * RAY_BYTES / 1e9:.0f} GB and more, expected at most {MOST_RAYS:.2g}: give fewer receivers (ds.split, "
+            f"{rays * ray_bytes / 1e9:.0f} GB and more, expected at most {MOST_RAYS:.2g}: give fewer receivers (ds.split, "
             "ds.subset) or sub_pixels=1"
         )
 
@@ -199,11 +188,11 @@ class Split:
     @classmethod
     def of(cls, places: Sequence[Place], quick: bool, rng: np.random.Generator) -> Split:
         """That of ``places``; if ``quick`` none is held out."""
-        count, chain = len(places), [place.chain for place in places]
+        count, chain, most = len(places), [place.chain for place in places], 30
         always, held = [chain.index(name) for name in chains_of(places)], np.zeros(0, int)
         if count >= LEAST_RECEIVERS and not quick:
             order = rng.permutation(count)
-            held = np.sort(order[~np.isin(order, always)][: min(int(count * HELD_OUT), MOST_HELD_OUT)])
+            held = np.sort(order[~np.isin(order, always)][: min(int(count * HELD_OUT), most)])
         return cls(count, held, np.setdiff1d(np.arange(count), held), always)
 
     def few(self, times: int) -> np.ndarray:
@@ -302,14 +291,20 @@ class Training:
     def _part(self, o: Observation, rng: np.random.Generator) -> Observation:
         """Readings of a place that parameters are fitted to, and what they count."""
         trust, db = o.target.trust, o.target.db
+        readings, least = 12_000, 200  # of all places, and of each at least
+        # Line of sight alone holds no material: it tells a chain's gain.
+        known_better = 2.0
+        # Of what comes through slabs more is left out (light between surfaces that passes them on its way), and what a
+        # material must make up for there it lacks in the open.
+        behind_walls = 0.5
         known = np.arange(len(db)) if trust is None else np.flatnonzero(trust)
-        size = min(len(known), max(LEAST_READINGS, READINGS // self.split.count))
+        size = min(len(known), max(least, readings // self.split.count))
         part = o.part(known[np.sort(rng.choice(len(known), size, replace=False))])
         if part.sight is not None:
-            part = replace(part, target=part.target.trusted(1.0 + KNOWN_BETTER * part.sight))
+            part = replace(part, target=part.target.trusted(1.0 + known_better * part.sight))
         straight = o.view.paths.order == 0
         if not self.totals and (straight & (o.view.paths.slabs > 0)).any():
-            part = replace(part, target=part.target.trusted(np.full(len(part.target.db), BEHIND_WALLS)))
+            part = replace(part, target=part.target.trusted(np.full(len(part.target.db), behind_walls)))
         return part
 
     def without_records(self) -> Training:
@@ -431,17 +426,18 @@ class Training:
         """Readings of tables that ``model`` cannot explain."""
         tables = [k for k, o in self.observations.items() if isinstance(o.measured, WeighedPaths)]
         rows, left = dict[int, np.ndarray](), dict[str, list[float]]()
+        most_db = 5.0 * NOISE_DB  # standard deviations beyond which a reading is taken to be wrong
+        clear_db = 10.0  # above its floor a reading's decibels err as they are
+        normal = 1.4826  # standard deviation over the median size of normal errors
         for k, power in zip(tables, self.predicted(model, tables), strict=True):
             o, target = self.observations[k], self.observations[k].target
             if target.trust is not None and target.censored is not None:
                 error = target.error(power)
-                wrong = np.flatnonzero(np.abs(error) > UNEXPLAINED * NOISE_DB)
+                wrong = np.flatnonzero(np.abs(error) > most_db)
                 rows |= {k: wrong} if len(wrong) else {}
-                clear = ~target.censored & (target.db > CLEAR_DB)
+                clear = ~target.censored & (target.db > clear_db)
                 left.setdefault(self.names[o.place.data], []).extend((error / target.trust)[clear])
-        noise = {
-            name: NORMAL_MEDIAN * float(np.median(np.abs(errors))) for name, errors in left.items() if errors
-        }
+        noise = {name: normal * float(np.median(np.abs(errors))) for name, errors in left.items() if errors}
         return Unexplained(rows, noise)
 
     def without(self, wrong: Mapping[int, np.ndarray]) -> Training:
@@ -461,7 +457,7 @@ class Training:
 
 @dataclass(frozen=True)
 class Unexplained:
-    """Readings of tables that a fit misses by more than :data:`UNEXPLAINED` of their standard deviations, ``(N,)`` by place; and
+    """Readings of tables that a fit misses by more than 5 of their standard deviations, ``(N,)`` by place; and
     what it misses the others by, in the median, by table [dB]: their noise."""
 
     rows: dict[int, np.ndarray]
