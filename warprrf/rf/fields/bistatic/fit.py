@@ -22,7 +22,7 @@ from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import Data, Measured
 from warprrf.rf.fields.bistatic.gauss_newton import Solution, gauss_newton
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, read
-from warprrf.rf.fields.bistatic.merging import BY_SHAPE, Merging, merge
+from warprrf.rf.fields.bistatic.merging import merge
 from warprrf.rf.fields.bistatic.needs import RARE, evenly
 from warprrf.rf.fields.bistatic.observations import Place, as_list, frame_of, places_of
 from warprrf.rf.fields.bistatic.options import FitOptions
@@ -34,7 +34,6 @@ from warprrf.rf.fields.bistatic.training import (
     MERGES,
     MOST_KEPT,
     MOST_TO_CHOOSE,
-    Choice,
     Split,
     Training,
     TrainingViews,
@@ -145,11 +144,11 @@ def _learned(
     return t, FitResult(t.surface, model, choice.material, errors, report), zeros
 
 
-def choose(t: Training) -> Choice:
+def choose(t: Training) -> Solution:
     """Effects, and which groups are of one material."""
     material = t.surface.material
-    start = Solution(t.start(material), np.zeros((0, 0)), [])
-    trials = [Choice(effects, material, start) for effects in t.candidates]
+    start = t.start(material)
+    trials = [Solution(effects, material, start, np.zeros((0, 0)), []) for effects in t.candidates]
     least_held = 2 if len(trials) > 1 else 1  # to choose effects by: one alone likes what others do not
     if len(t.split.held) < least_held:
         return _choose_of_few(t, trials)
@@ -158,7 +157,7 @@ def choose(t: Training) -> Choice:
         if best is None:
             trial = t.refined(trial, t.split.few(1), 2 * SHORT_STEPS, rounds=2)
         else:
-            trial = t.refined(replace(trial, solution=best.solution), t.split.few(1), SHORT_STEPS)
+            trial = t.refined(replace(best, effects=trial.effects), t.split.few(1), SHORT_STEPS)
         loss = t.held_loss(trial)
         kept = loss < BETTER * least
         t.note(_name(trial.effects), kept, loss)
@@ -173,7 +172,7 @@ def choose(t: Training) -> Choice:
     return best
 
 
-def _spared(t: Training, best: Choice, least: float) -> tuple[Choice, float]:
+def _spared(t: Training, best: Solution, least: float) -> tuple[Solution, float]:
     """``best`` and its loss without those of :data:`RARE` that readings are predicted better without: a scene may need what is
     not in its readings (a simulation without diffraction), or what its mesh shows wrongly. Places held out are too few to
     say so alone: none of them may be behind a wall."""
@@ -190,7 +189,7 @@ def _spared(t: Training, best: Choice, least: float) -> tuple[Choice, float]:
     return chosen, least if chosen is best else t.held_loss(chosen)
 
 
-def _choose_of_few(t: Training, trials: list[Choice]) -> Choice:
+def _choose_of_few(t: Training, trials: list[Solution]) -> Solution:
     """With too few receivers to hold any out: bounces as rooms have them, unless none fit much better."""
     if len(trials) == 1:
         return t.refined(trials[0], t.split.kept, t.options.iterations, rounds=2)
@@ -208,20 +207,20 @@ def _choose_of_few(t: Training, trials: list[Choice]) -> Choice:
     return single if fewer else room
 
 
-def merged(t: Training, best: Choice, least: float) -> Choice:
+def merged(t: Training, best: Solution, least: float) -> Solution:
     """Materials by what the readings say, if that lowers the error of the places held out."""
-    trial, options = best, BY_SHAPE if t.surface.by_shape else Merging()
+    trial, by_shape = best, t.surface.by_shape
     problem = t.problem(best.effects, best.material, t.split.few(2), best.parameters)
     for _ in range(MERGES):
-        material, start = merge(problem, trial.parameters, t.surface.appearance, t.area, options)
+        material, start = merge(problem, trial.parameters, t.surface.appearance, t.area, by_shape=by_shape)
         # What surfaces get of each other changes little with who is of which material: it is held.
         problem = replace(problem, material=material, known_through=t.known_through(material))
-        trial = Choice(best.effects, material, gauss_newton(problem, start, SHORT_STEPS))
+        trial = gauss_newton(problem, start, SHORT_STEPS)
         t.step()
     loss = t.held_loss(trial)
     # Few receivers held out say little, fewer materials that describe the others better say much.
     same = len(t.split.kept) <= MOST_TO_CHOOSE  # receivers of both fits
-    simpler = same and trial.solution.losses[-1:] < best.solution.losses[-1:]
+    simpler = same and trial.losses[-1:] < best.losses[-1:]
     not_much_worse = 1.25
     keep = loss < least or (simpler and loss < not_much_worse * least)
     t.note(f"{best.material.max() + 1} materials as {trial.material.max() + 1}", keep, loss)
@@ -234,7 +233,7 @@ def _name(effects: Effects) -> str:
     return (known or [str(effects)])[0]
 
 
-def cross_validate(t: Training, choice: Choice) -> tuple[bool, ErrorModel | None]:
+def cross_validate(t: Training, choice: Solution) -> tuple[bool, ErrorModel | None]:
     """Whether the residual is wanted, or does not clearly raise the error of places held out, and the errors that then
     remain: of those held out; where they are few, of all, held out in turn. No errors where no whole spectra were measured."""
     free = isinstance(t.options.effects, str) and choice.effects.residual
@@ -286,7 +285,7 @@ def _folds(t: Training) -> list[np.ndarray]:
     return folds
 
 
-def everyone(t: Training, choice: Choice, residual: bool) -> tuple[Choice, Model]:
+def everyone(t: Training, choice: Solution, residual: bool) -> tuple[Solution, Model]:
     """The choice fitted to all places, and its model with the residual, if wanted."""
     choice = t.refined(choice, t.telling, t.options.iterations)
     model = t.model(choice, residual=residual)

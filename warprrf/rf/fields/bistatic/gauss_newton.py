@@ -121,14 +121,18 @@ class Problem:
 
 @dataclass(frozen=True)
 class Solution:
-    """Result of :func:`gauss_newton`.
+    """What was decided on, and what :func:`gauss_newton` found under it.
 
     Attributes:
-        parameters: the fitted parameters.
+        effects: what is modelled.
+        material: of each group, shape ``(G,)``.
+        parameters: of the materials.
         covariance: of the free ones (Laplace), shape ``(F, F)``; see :class:`Layout`.
         losses: objective after each step, per reading [dB^2].
     """
 
+    effects: Effects
+    material: np.ndarray
     parameters: Parameters
     covariance: np.ndarray
     losses: list[float]
@@ -246,7 +250,8 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
         losses.append(current / weight / count)
         if fall < tolerance and honest and (np.abs(move) < longest).all():
             break
-    return Solution(layout.unpack(vector, start), np.linalg.inv(hessian), losses)
+    found, covariance = layout.unpack(vector, start), np.linalg.inv(hessian)
+    return Solution(problem.effects, problem.material, found, covariance, losses)
 
 
 def _normal_equations(problem: Problem, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.ndarray]:

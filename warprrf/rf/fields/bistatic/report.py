@@ -13,10 +13,10 @@ import numpy as np
 from warprrf.checks import some_of, users_level
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import Measured
-from warprrf.rf.fields.bistatic.gauss_newton import THROUGH_STD, layout_of
+from warprrf.rf.fields.bistatic.gauss_newton import THROUGH_STD, Solution, layout_of
 from warprrf.rf.fields.bistatic.needs import MOST_BLOCKED, RARE, RAYS, evenly, total
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, frame_of, huber, observe
-from warprrf.rf.fields.bistatic.training import Choice, Training, Unexplained
+from warprrf.rf.fields.bistatic.training import Training, Unexplained
 from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.tracing.model import Layout, Model
 from warprrf.rf.tracing.render import path_gains
@@ -60,10 +60,10 @@ def _is_dark(view: View) -> bool:
     return bool((p.share[p.in_sight] ** 2).sum() < 0.01)
 
 
-def side_lobes(t: Training, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
+def side_lobes(t: Training, choice: Solution) -> tuple[np.ndarray, np.ndarray]:
     """Of each chain, shape ``(C,)``: the share of its readings that side lobes of its antennas bring, as it counts in dB; and
     how far :data:`SIDE_LOBES_DB` of their level move its gain [dB], all other parameters with it."""
-    covariance, p = choice.solution.covariance, choice.parameters
+    covariance, p = choice.covariance, choice.parameters
     first = len(covariance) - len(t.chains)
     pull = np.zeros((len(t.chains), len(covariance)))  # of side lobes' level on the parameters
     size, parts = np.zeros(len(t.chains)), dict(t.parts)
@@ -96,7 +96,7 @@ def side_lobes(t: Training, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
     return share, moved
 
 
-def covariance_of(t: Training, choice: Choice) -> np.ndarray:
+def covariance_of(t: Training, choice: Solution) -> np.ndarray:
     """Of what a field keeps: parameters of materials, with what they let through as it is known before where that was not free;
     and the common gain, if that was."""
     through = choice.effects.transmissions > 0
@@ -107,13 +107,12 @@ def covariance_of(t: Training, choice: Choice) -> np.ndarray:
     free = np.ones(whole.size, bool)
     free[whole.let_through(np.arange(whole.groups))] = through
     covariance = np.where(free, 0.0, THROUGH_STD**2) * np.eye(whole.size)
-    covariance[np.ix_(free, free)] = choice.solution.covariance[: layout.size, : layout.size]
+    covariance[np.ix_(free, free)] = choice.covariance[: layout.size, : layout.size]
     return covariance
 
 
-def report_of(t: Training, choice: Choice, wrong: Unexplained, seconds: float) -> dict[str, Any]:
+def report_of(t: Training, choice: Solution, wrong: Unexplained, seconds: float) -> dict[str, Any]:
     """What a fit decided and found, as numbers and text."""
-    found = choice.solution
     report: dict[str, Any] = {
         "receivers": len(t.observations),
         "held_out": len(t.split.held),
@@ -122,16 +121,16 @@ def report_of(t: Training, choice: Choice, wrong: Unexplained, seconds: float) -
         "groups": t.surface.groups,
         "materials": int(choice.material.max()) + 1,
         "elements": len(t.surface.element_area),
-        "steps": len(found.losses),
-        "losses": {"gain": found.losses},
+        "steps": len(choice.losses),
+        "losses": {"gain": choice.losses},
         "choices": t.log,
         "noise_db": wrong.noise_db,
     }
-    deviation = np.sqrt(np.diag(found.covariance))
+    deviation = np.sqrt(np.diag(choice.covariance))
     if t.options.gain_offset:
-        shape, through = found.parameters.log_weight.shape, choice.effects.transmissions > 0
+        shape, through = choice.parameters.log_weight.shape, choice.effects.transmissions > 0
         place = Layout(*shape, through=through).size
-        report["gain_offset_db"] = NEPER * found.parameters.log_gain
+        report["gain_offset_db"] = NEPER * choice.parameters.log_gain
         report["gain_offset_std_db"] = NEPER * float(deviation[place])
     known = NEPER * deviation[len(deviation) - len(t.chains) :]
     report["chains"] = {
@@ -142,7 +141,7 @@ def report_of(t: Training, choice: Choice, wrong: Unexplained, seconds: float) -
             "side_lobe_std_db": float(moved),
         }
         for name, gain, std, share, moved in zip(
-            t.chains, found.parameters.log_gains, known, *side_lobes(t, choice), strict=True
+            t.chains, choice.parameters.log_gains, known, *side_lobes(t, choice), strict=True
         )
     }
     report["unexplained"] = {}

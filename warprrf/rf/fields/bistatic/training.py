@@ -209,20 +209,6 @@ class Split:
         return np.union1d(self.few(2), self.held)
 
 
-@dataclass(frozen=True)
-class Choice:
-    """What was decided on: effects, the material of each group ``(G,)``, and parameters of materials under them."""
-
-    effects: Effects
-    material: np.ndarray
-    solution: Solution
-
-    @property
-    def parameters(self) -> Parameters:
-        """Of the materials."""
-        return self.solution.parameters
-
-
 @dataclass(frozen=True, eq=False)
 class Training:
     """One fit: what it learns from, and how.
@@ -368,20 +354,19 @@ class Training:
             **({"energy": 1.0} if self.totals else {}),
         )  # fmt: skip
 
-    def model(self, choice: Choice, *, residual: bool = False) -> Model:
+    def model(self, choice: Solution, *, residual: bool = False) -> Model:
         """That of groups, without a residual yet."""
         effects = replace(choice.effects, residual=residual)
         none = np.zeros((2, self.surface.cells))
         return Model(effects, choice.parameters.take(choice.material), none, self.transmitter)
 
-    def refined(self, choice: Choice, places: Iterable[int], steps: int, rounds: int = 1) -> Choice:
+    def refined(self, choice: Solution, places: Iterable[int], steps: int, rounds: int = 1) -> Solution:
         """``choice`` with parameters fitted to readings of ``places``; what surfaces get of each other is computed anew in
         each of ``rounds``."""
         rounds, places = rounds if choice.effects.scatterings > 1 else 1, list(places)
         for _ in range(rounds):
             problem = self.problem(choice.effects, choice.material, places, choice.parameters)
-            found = gauss_newton(problem, choice.parameters, max(steps // rounds, int(steps > 0)))
-            choice = replace(choice, solution=found)
+            choice = gauss_newton(problem, choice.parameters, max(steps // rounds, int(steps > 0)))
         self.step()
         return choice
 
@@ -408,14 +393,14 @@ class Training:
         own = [self.observations[int(k)].losses(x).mean() for k, x in zip(places, predicted, strict=True)]
         return float(np.mean(own))
 
-    def held_loss(self, choice: Choice) -> float:
+    def held_loss(self, choice: Solution) -> float:
         """Mean square error at the places held out, without residual [dB^2]: of all readings where they are few, else of
         those chosen."""
         if len(self.split.held) <= LEAST_RECEIVERS:
             return self.loss(self.model(choice), self.split.held)
         return self.part_loss(choice, self.split.held)
 
-    def part_loss(self, choice: Choice, places: np.ndarray) -> float:
+    def part_loss(self, choice: Solution, places: np.ndarray) -> float:
         """The same of the readings chosen of ``places``."""
         problem = self.problem(choice.effects, choice.material, places, choice.parameters)
         p = choice.parameters
