@@ -90,7 +90,7 @@ def problem(scene):
     measured = SpectrumPixels(BeamOperator(SHAPE, np.radians(5.0)))
     observations = [
         observation(view, measured, ds.floor, t.ravel())
-        for view, t in zip(trace(scene, ds).views, target, strict=True)
+        for (_, view), t in zip(trace(scene, ds)[0], target, strict=True)
     ]
     return Problem.of(observations, SINGLE, np.arange(3), Parameters.prior(3))
 

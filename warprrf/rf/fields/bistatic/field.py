@@ -211,10 +211,8 @@ class BistaticField(RadioField):
         ends = ends[np.sort(np.unique(ends, axis=0, return_index=True)[1])]
         receivers = ends[(ends[:, :3] == frame.transmitter).all(axis=1), 3:]
         fitted = replace(
-            cls.prior(found.surface, frame, effects=found.model.effects, sub_pixels=chosen.rays, device=device),
-            parameters=replace(found.model.parameters, log_gains=np.zeros(0)), residual=found.model.residual,
-            material=found.material, errors=found.errors, report=found.report, fitted_on=ends[:, 3:],
-            fitted_under=ends[:, :3],
+            cls.prior(found["surface"], frame, sub_pixels=chosen.rays, device=device),
+            **found, fitted_on=ends[:, 3:], fitted_under=ends[:, :3],
         )  # fmt: skip
         if any(isinstance(one, SpectrumDataset) for one in data):
             return fitted

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -24,7 +24,7 @@ from warprrf.rf.fields.bistatic.gauss_newton import Solution, gauss_newton
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, read
 from warprrf.rf.fields.bistatic.merging import merge
 from warprrf.rf.fields.bistatic.needs import RARE, evenly
-from warprrf.rf.fields.bistatic.observations import Place, as_list, frame_of, places_of
+from warprrf.rf.fields.bistatic.observations import Place, Seen, as_list, frame_of, places_of
 from warprrf.rf.fields.bistatic.options import FitOptions
 from warprrf.rf.fields.bistatic.placing import moved, position_offset, with_zeros
 from warprrf.rf.fields.bistatic.report import covariance_of, left_out, report_of, warn
@@ -36,7 +36,6 @@ from warprrf.rf.fields.bistatic.training import (
     MOST_TO_CHOOSE,
     Split,
     Training,
-    TrainingViews,
     rays_of,
     trace,
 )
@@ -45,22 +44,10 @@ from warprrf.rf.positions import warn_of_unmodelled
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.tracing.model import SETS, Effects, Model
 from warprrf.rf.tracing.render import path_gains
-from warprrf.rf.tracing.surface import Surface
 
 SHORT_STEPS = 10  # of a fit that only decides about something
 BETTER = 0.995
 """Share to which further effects must lower the mean square error of receivers held out."""
-
-
-@dataclass(frozen=True)
-class FitResult:
-    """What a field is made of, and a report."""
-
-    surface: Surface
-    model: Model
-    material: np.ndarray
-    errors: ErrorModel | None
-    report: dict[str, Any]
 
 
 def fit(
@@ -71,8 +58,9 @@ def fit(
     client: Any = None,
     device: DeviceLike = None,
     progress: Progress | None = None,
-) -> FitResult:
-    """Fit a model to what ``ds`` holds; arguments and errors as for :meth:`BistaticField.fit`."""
+) -> dict[str, Any]:
+    """The parts of a bistatic field that a fit to what ``ds`` holds finds, by the names of its attributes; arguments and errors
+    as for :meth:`BistaticField.fit`."""
     data, mesh = as_list(ds), as_mesh(geometry, "geometry")
     for one in data:
         if isinstance(one, SpectrumDataset) and len(one) and not (one.path_gain > one.floor).any():
@@ -88,28 +76,30 @@ def fit(
     look = partial(trace, geometry, sub_pixels=options.rays, client=client, device=device, progress=progress)
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
     with threadpool_limits(1, user_api="blas"):
-        t, found, zeros = _learned(data, places, look, options, progress)
-        offsets = _offsets(t, found)
+        t, model, found, zeros = _learned(data, places, look, options, progress)
+        offsets = _offsets(t, model)
         if offsets:
             data = [moved(one, offsets[k]) if k in offsets else one for k, one in enumerate(t.data)]  # type: ignore[arg-type]
             places = places_of(data, mesh, device)
-            t, found, _ = _learned(data, places, look, options, progress)
-    warn(t.data, found.report)
+            t, model, found, _ = _learned(data, places, look, options, progress)
+    report = found["report"]
+    warn(t.data, report)
     places_moved = {
         t.names[k]: [(place.receiver.tolist(), offset.tolist()) for place, offset in own]
         for k, own in offsets.items()
     }
-    return replace(found, report=found.report | zeros | {"position_offset_m": places_moved})
+    parameters = replace(model.parameters, log_gains=np.zeros(0))  # chains are of the data, not of the field
+    return found | {"parameters": parameters, "report": report | zeros | {"position_offset_m": places_moved}}
 
 
 def _learned(
     data: Sequence[Measured],
     places: Sequence[Place],
-    look: Callable[..., TrainingViews],
+    look: Callable[..., tuple[list[Seen], Effects]],
     options: FitOptions,
     progress: Progress | None,
-) -> tuple[Training, FitResult, dict[str, dict[str, float]]]:
-    """All steps of a fit: what it learned from, what it found, and what :func:`with_zeros` found.
+) -> tuple[Training, Model, dict[str, Any], dict[str, dict[str, float]]]:
+    """All steps of a fit: what it learned from, the model, all else of a field that it found, and what :func:`with_zeros` did.
 
     With many receivers some decide about effects and materials; what the others see is traced with those effects alone.
     """
@@ -118,30 +108,39 @@ def _learned(
     candidates = options.candidates(frame_of(data).frequency_hz)
     sought = candidates[0] if len(candidates) == 1 else None
     decides = options.effects == "auto" and options.relevance is None
-    views = look(data, only=split.deciding, effects=sought, decides=decides)
-    data, zeros = with_zeros(data, views.places, views.views)
-    t = Training.of(views, split, data, options, rng, progress)
-    del views  # and with them records, once the training has none
+    started = time.perf_counter()
+    seen, sought = look(data, only=split.deciding, effects=sought, decides=decides)
+    tracing_s = time.perf_counter() - started
+    data, zeros = with_zeros(data, seen)
+    t = Training.of(seen, sought, split, data, options, rng, progress)
+    del seen  # and with them records, once the training has none
     started = time.perf_counter()
     choice = choose(t)
     others = np.setdiff1d(np.arange(len(places)), list(t.observations))
     if len(others):
         keeps = rays_of(places, options.rays) <= MOST_KEPT
         t = t if keeps else t.without_records()
-        more = look(data, only=others, effects=choice.effects, decides=False, keeps=keeps)
+        again = time.perf_counter()
+        more, _ = look(data, only=others, effects=choice.effects, decides=False, keeps=keeps)
+        tracing_s += time.perf_counter() - again
         t = t.and_at(others, more, rng)
     residual, errors = cross_validate(t, choice)
     choice, model = everyone(t, choice, residual)
-    wrong = t.unexplained(model)
-    if wrong.rows:
-        t = t.without(wrong.rows)
+    wrong, noise_db = t.unexplained(model)
+    if wrong:
+        t = t.without(wrong)
         choice, model = everyone(t, choice, residual)
     if errors is not None:
         errors = replace(errors, covariance=covariance_of(t, choice))
     missed = left_out(t, model)
-    report = report_of(t, choice, wrong, time.perf_counter() - started) | {"left_out": missed}
+    seconds = {"transport_time_s": tracing_s, "fit_time_s": time.perf_counter() - started}
+    report = report_of(t, choice, wrong, noise_db) | seconds | {"left_out": missed}
     t.step(last=True)
-    return t, FitResult(t.surface, model, choice.material, errors, report), zeros
+    found = {
+        "surface": t.surface, "effects": model.effects, "residual": model.residual, "material": choice.material,
+        "errors": errors, "report": report,
+    }  # fmt: skip
+    return t, model, found, zeros
 
 
 def choose(t: Training) -> Solution:
@@ -195,7 +194,7 @@ def _choose_of_few(t: Training, trials: list[Solution]) -> Solution:
         return t.refined(trials[0], t.split.kept, t.options.iterations, rounds=2)
     single, room = (t.refined(trial, t.split.kept, t.options.iterations, rounds=2) for trial in trials[:2])
     models = [t.model(trial) for trial in (single, room)]
-    wrong, also = (t.unexplained(model).rows for model in models)
+    wrong, also = (t.unexplained(model)[0] for model in models)
     counted = t.without({k: np.intersect1d(rows, also[k]) for k, rows in wrong.items() if k in also})
     losses = [counted.loss(model, list(t.observations)) for model in models]
     much_better = (
@@ -299,13 +298,13 @@ def with_residual(t: Training, model: Model, places: Sequence[int] | np.ndarray)
     return replace(model, residual=fit_residual(shares, t.surface, quick=t.options.quick))
 
 
-def _offsets(t: Training, found: FitResult) -> dict[int, list[tuple[Place, np.ndarray]]]:
+def _offsets(t: Training, found: Model) -> dict[int, list[tuple[Place, np.ndarray]]]:
     """By data set of unknown positions its places, and how far each receiver is from where it is said to be [m]."""
     unsure = [
         k for k, o in t.observations.items() if getattr(t.data[o.place.data], "position_std_m", 0.0) > 0
     ]
     offsets: dict[int, list[tuple[Place, np.ndarray]]] = {}
-    for o, model, materials in t.evaluated(found.model, unsure):
+    for o, model, materials in t.evaluated(found, unsure):
         one = t.data[o.place.data]
         gains = path_gains(o.view, model, materials)
         total = np.maximum(read(gains, o.measured), 0.0) / o.floor

@@ -97,6 +97,10 @@ class Place:
         return *ends, self.frequency_hz, self.shape, self.beam_sigma_rad, self.air
 
 
+Seen = tuple[Place, View]
+"""A place, and what is seen there."""
+
+
 def as_list(data: Data) -> list[Measured]:
     """Data sets as a list; of several that have one name each gets a number after it.
 
@@ -613,24 +617,19 @@ def chains_of(places: Sequence[Place]) -> list[str]:
 
 
 def observe(
-    data: Sequence[Measured],
-    places: Sequence[Place],
-    views: Sequence[View],
-    frequency_hz: float,
-    chains: Sequence[str],
+    data: Sequence[Measured], seen: Sequence[Seen], frequency_hz: float, chains: Sequence[str]
 ) -> list[Observation]:
-    """What was read at each of ``places``.
+    """What was read at places.
 
     Args:
         data: all data sets.
-        places: of these.
-        views: what is seen at each place.
+        seen: places of these.
         frequency_hz: carrier that a fit's parameters are of.
         chains: names of all measuring chains of unknown gain.
     """
     kinds, index = kinds_of(data), {name: k for k, name in enumerate(chains)}
     found = []
-    for place, view in zip(places, views, strict=True):
+    for place, view in seen:
         one = kinds[place.data].observe(place, view)
         found.append(
             replace(

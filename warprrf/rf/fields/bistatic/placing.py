@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import Measured
 from warprrf.rf.fields.bistatic.measured import direct_paths
-from warprrf.rf.fields.bistatic.observations import NOISE_DB, TAP_STEPS, Observation, Place
+from warprrf.rf.fields.bistatic.observations import NOISE_DB, TAP_STEPS, Observation, Place, Seen
 from warprrf.rf.spectra.readings import Readings, path_weights
 from warprrf.rf.tracing.model import Parameters
 from warprrf.rf.tracing.records import Materials
@@ -27,10 +27,10 @@ from warprrf.rf.tracing.tracer import SPECULAR, View
 
 
 def with_zeros(
-    data: Sequence[Measured], places: Sequence[Place], views: Sequence[View]
+    data: Sequence[Measured], every: Sequence[Seen]
 ) -> tuple[list[Measured], dict[str, dict[str, float]]]:
     """``data`` with azimuths that count from x and delays from when they were sent, and by data set's name what was added to
-    those of unknown zero: ``azimuth_zero_deg`` and ``clock_offset_s``.
+    those of unknown zero, by what ``every`` place sees: ``azimuth_zero_deg`` and ``clock_offset_s``.
 
     Raises:
         ValueError: where neither line of sight nor a mirror path reaches any place of such a data set.
@@ -38,9 +38,7 @@ def with_zeros(
     found, zeros = list(data), dict[str, dict[str, float]](azimuth_zero_deg={}, clock_offset_s={})
     for k, one in enumerate(data):
         if isinstance(one, Readings) and not one.zero_known:
-            seen = [
-                (p, v) for p, v in zip(places, views, strict=True) if p.data == k and len(v.paths.length_m)
-            ]
+            seen = [(place, view) for place, view in every if place.data == k and len(view.paths.length_m)]
             if not seen:
                 name, what = ("clock_known", "delays") if one.azimuth_known else ("azimuth_known", "azimuth")
                 raise ValueError(
@@ -65,7 +63,7 @@ def from_zero(one: Readings, by: float) -> Readings:
     return one
 
 
-def _zero(one: Readings, seen: Sequence[tuple[Place, View]]) -> float:
+def _zero(one: Readings, seen: Sequence[Seen]) -> float:
     """What to add to azimuths [rad], in (-pi, pi], or to delays [m]; see :func:`from_zero`."""
     paths = [(place.rows, *_strongest(view)) for place, view in seen]
     tried = np.linspace(-np.pi, np.pi, 360, endpoint=False)  # a degree apart

@@ -4,7 +4,7 @@ out; and warnings of these."""
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +16,7 @@ from warprrf.rf.fields.base import Measured
 from warprrf.rf.fields.bistatic.gauss_newton import THROUGH_STD, Solution, layout_of
 from warprrf.rf.fields.bistatic.needs import MOST_BLOCKED, RARE, RAYS, evenly, total
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, frame_of, huber, observe
-from warprrf.rf.fields.bistatic.training import Training, Unexplained
+from warprrf.rf.fields.bistatic.training import Training
 from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.tracing.model import Layout, Model
 from warprrf.rf.tracing.render import path_gains
@@ -74,7 +74,7 @@ def side_lobes(t: Training, choice: Solution) -> tuple[np.ndarray, np.ndarray]:
     bare = [one.without_side_lobes() if isinstance(one, Readings) else one for one in t.data]
     seen = [parts[k] for k in places]
     frequency_hz = frame_of(t.data).frequency_hz
-    lobes = observe(bare, [o.place for o in seen], [o.view for o in seen], frequency_hz, t.chains)
+    lobes = observe(bare, [(o.place, o.view) for o in seen], frequency_hz, t.chains)
     for k, lobe in zip(places, lobes, strict=True):
         parts[k] = replace(lobe.part(np.asarray(parts[k].rows)), ratio=parts[k].ratio)
     whole, main = (
@@ -111,20 +111,20 @@ def covariance_of(t: Training, choice: Solution) -> np.ndarray:
     return covariance
 
 
-def report_of(t: Training, choice: Solution, wrong: Unexplained, seconds: float) -> dict[str, Any]:
-    """What a fit decided and found, as numbers and text."""
+def report_of(
+    t: Training, choice: Solution, wrong: Mapping[int, np.ndarray], noise_db: dict[str, float]
+) -> dict[str, Any]:
+    """What a fit decided and found, as numbers and text, where :meth:`Training.unexplained` found ``wrong`` and ``noise_db``."""
     report: dict[str, Any] = {
         "receivers": len(t.observations),
         "held_out": len(t.split.held),
-        "transport_time_s": t.seconds,
-        "fit_time_s": seconds,
         "groups": t.surface.groups,
         "materials": int(choice.material.max()) + 1,
         "elements": len(t.surface.element_area),
         "steps": len(choice.losses),
         "losses": {"gain": choice.losses},
         "choices": t.log,
-        "noise_db": wrong.noise_db,
+        "noise_db": noise_db,
     }
     deviation = np.sqrt(np.diag(choice.covariance))
     if t.options.gain_offset:
@@ -145,7 +145,7 @@ def report_of(t: Training, choice: Solution, wrong: Unexplained, seconds: float)
         )
     }
     report["unexplained"] = {}
-    for k, rows in wrong.rows.items():
+    for k, rows in wrong.items():
         where = t.observations[k].place
         report["unexplained"].setdefault(t.names[where.data], []).extend(where.rows[rows].tolist())
     return report

@@ -6,7 +6,6 @@ out; a :class:`Training` has the observations of both, and fits and judges model
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -34,6 +33,7 @@ from warprrf.rf.fields.bistatic.observations import (
     NOISE_DB,
     Observation,
     Place,
+    Seen,
     as_list,
     chains_of,
     frame_of,
@@ -63,29 +63,6 @@ MOST_KEPT = 15_000_000
 """Rays up to which records of them are kept, some 200 bytes for each; of more they are traced whenever they are asked for."""
 
 
-@dataclass(frozen=True)
-class TrainingViews:
-    """What is seen of the geometry at the places that were measured, whatever the materials: traced once, used by every
-    fit.
-
-    Attributes:
-        places: receivers under their transmitters.
-        views: one for each place.
-        effects: whose mirrors, slabs and edges were sought.
-        seconds: what it took.
-    """
-
-    places: list[Place] = field(repr=False)
-    views: list[View] = field(repr=False)
-    effects: Effects
-    seconds: float
-
-    @property
-    def tracer(self) -> Tracer:
-        """Surface, transmitter and grid of the first place."""
-        return self.views[0].tracer
-
-
 def trace(
     geometry: GeometryLike,
     ds: Data,
@@ -98,8 +75,9 @@ def trace(
     client: Any = None,
     device: DeviceLike = None,
     progress: Progress | None = None,
-) -> TrainingViews:
-    """What the receivers of ``ds`` see of ``geometry`` (a Reconstruction, Scene, Mesh or Surface).
+) -> tuple[list[Seen], Effects]:
+    """What the receivers of ``ds`` see of ``geometry`` (a Reconstruction, Scene, Mesh or Surface), whatever the materials: traced
+    once, used by every fit; and the effects whose mirrors, slabs and edges were sought.
 
     Args:
         only: indices of the places that are traced, of those that :func:`places_of` lists; all by default.
@@ -117,7 +95,7 @@ def trace(
             mirrors than :data:`MOST_RAYS` and :data:`~warprrf.rf.paths.images.MOST_CHAINS`.
         TypeError: for a geometry without a mesh.
     """
-    started, tell = time.perf_counter(), progress or (lambda *_: None)
+    tell = progress or (lambda *_: None)
     places = places_of(as_list(ds), as_mesh(geometry, "geometry"), device)
     check_count("sub_pixels", sub_pixels, 1, 16)
     _check_rays(places, sub_pixels)
@@ -149,9 +127,7 @@ def trace(
         for r, view in each(partial(view_of, make, wanted, keeps), parts, client):
             views[own[r]] = tracer.adopted(view)
             tell("transport", len(views), len(places))
-    seconds = time.perf_counter() - started
-    every = [views[k] for k in range(len(places))]
-    return TrainingViews(places, every, wanted, seconds)
+    return [(place, views[k]) for k, place in enumerate(places)], wanted
 
 
 def rays_of(places: Sequence[Place], sub_pixels: int) -> int:
@@ -224,7 +200,6 @@ class Training:
         data: the data sets.
         lobes: exponents.
         step: to be called after each fit.
-        seconds: what tracing took.
         log: choices, as they are made.
     """
 
@@ -238,41 +213,37 @@ class Training:
     data: Sequence[Measured]
     lobes: tuple[int, ...]
     step: Callable[..., None]
-    seconds: float = 0.0
     log: list[dict[str, Any]] = field(default_factory=list)
 
     @classmethod
     def of(
         cls,
-        seen: TrainingViews,
+        seen: Sequence[Seen],
+        sought: Effects,
         split: Split,
         data: Sequence[Measured],
         options: FitOptions,
         rng: np.random.Generator,
         progress: Progress | None = None,
     ) -> Training:
-        """What ``data`` holds of the places that decide, where that is ``seen``."""
+        """What ``data`` holds of the places that decide, where that is ``seen`` and effects were ``sought``."""
         frequency_hz = frame_of(data).frequency_hz
-        candidates = _possible(options.candidates(frequency_hz), seen.effects, data)
+        candidates = _possible(options.candidates(frequency_hz), sought, data)
         steps = 4 + len(candidates) + MERGES + (2 * split.count if split.count <= FEW else 3)
         found = cls(
-            options, candidates, seen.tracer.surface, split, {}, {},
-            chains_of(seen.places), data, options.exponents(frequency_hz), _Steps(progress, split.count, steps),
+            options, candidates, seen[0][1].tracer.surface, split, {}, {},
+            chains_of([place for place, _ in seen]), data, options.exponents(frequency_hz), _Steps(progress, split.count, steps),
         )  # fmt: skip
         return found.and_at(split.deciding, seen, rng)
 
-    def and_at(self, places: np.ndarray, seen: TrainingViews, rng: np.random.Generator) -> Training:
+    def and_at(self, places: np.ndarray, seen: Sequence[Seen], rng: np.random.Generator) -> Training:
         """With what was read at ``places`` (P,), where that is ``seen``, and readings of them that parameters are fitted to."""
         frequency_hz = frame_of(self.data).frequency_hz
-        found = observe(self.data, seen.places, seen.views, frequency_hz, self.chains)
+        found = observe(self.data, seen, frequency_hz, self.chains)
         parts = [self._part(o, rng) for o in found]
         own = places.tolist()
-        return replace(
-            self,
-            observations=_with(self.observations, own, found),
-            parts=_with(self.parts, own, parts),
-            seconds=self.seconds + seen.seconds,
-        )
+        observations = _with(self.observations, own, found)
+        return replace(self, observations=observations, parts=_with(self.parts, own, parts))
 
     def _part(self, o: Observation, rng: np.random.Generator) -> Observation:
         """Readings of a place that parameters are fitted to, and what they count."""
@@ -407,8 +378,9 @@ class Training:
         losses = [batch.losses(batch.gain(p, x) * x) for batch, _, x in problem.evaluated(p)]
         return float(np.mean(np.concatenate(losses)))
 
-    def unexplained(self, model: Model) -> Unexplained:
-        """Readings of tables that ``model`` cannot explain."""
+    def unexplained(self, model: Model) -> tuple[dict[int, np.ndarray], dict[str, float]]:
+        """Readings of tables that ``model`` misses by more than 5 of their standard deviations, ``(N,)`` by place; and what it
+        misses the others by, in the median, by table [dB]: their noise."""
         tables = [k for k, o in self.observations.items() if isinstance(o.measured, WeighedPaths)]
         rows, left = dict[int, np.ndarray](), dict[str, list[float]]()
         most_db = 5.0 * NOISE_DB  # standard deviations beyond which a reading is taken to be wrong
@@ -422,8 +394,9 @@ class Training:
                 rows |= {k: wrong} if len(wrong) else {}
                 clear = ~target.censored & (target.db > clear_db)
                 left.setdefault(self.names[o.place.data], []).extend((error / target.trust)[clear])
-        noise = {name: normal * float(np.median(np.abs(errors))) for name, errors in left.items() if errors}
-        return Unexplained(rows, noise)
+        return rows, {
+            name: normal * float(np.median(np.abs(errors))) for name, errors in left.items() if errors
+        }
 
     def without(self, wrong: Mapping[int, np.ndarray]) -> Training:
         """The same in which readings ``wrong``, by place, count no longer."""
@@ -438,15 +411,6 @@ class Training:
     def note(self, what: str, kept: bool, loss: float) -> None:
         """Log a choice."""
         self.log.append({"term": what, "kept": bool(kept), "held_out_rmse_db": float(np.sqrt(loss))})
-
-
-@dataclass(frozen=True)
-class Unexplained:
-    """Readings of tables that a fit misses by more than 5 of their standard deviations, ``(N,)`` by place; and
-    what it misses the others by, in the median, by table [dB]: their noise."""
-
-    rows: dict[int, np.ndarray]
-    noise_db: dict[str, float]
 
 
 @dataclass
