@@ -64,12 +64,12 @@ from warprrf.rf.fields.bistatic.observations import (
 from warprrf.rf.fields.bistatic.options import SUB_PIXELS, FitOptions
 from warprrf.rf.fields.bistatic.paths import paths_of, strongest
 from warprrf.rf.fields.bistatic.suggest import SHAPE as SUGGEST_SHAPE
-from warprrf.rf.fields.bistatic.suggest import Pointings, Sensitivity, Unknowns, suggest
+from warprrf.rf.fields.bistatic.suggest import Sensitivity, Unknowns, suggest
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
 from warprrf.rf.fields.location import Location
 from warprrf.rf.maps.links import LinkOptions
 from warprrf.rf.paths.path_set import Paths
-from warprrf.rf.spectra.antenna import Pattern
+from warprrf.rf.spectra.antenna import Antenna, Pattern
 from warprrf.rf.spectra.beam import BeamOperator, beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import antenna_of, check_turned
@@ -533,17 +533,17 @@ class BistaticField(RadioField):
         given = check_array("candidates", candidates, (None, 3))
         places = self.check_positions(given, name="candidates").receivers
         check_count("n", n, 1, len(places))
-        pointings = None
+        turned = antenna = None
         if (arrival is None) != (receive_pattern is None):
             raise ValueError(
                 "receive_pattern: it goes with arrival, got one of the two; expected both or neither"
             )
         if arrival is not None and receive_pattern is not None:
-            angles = check_turned("arrival", arrival, len(places))
-            pointings = Pointings(angles, antenna_of("receive_pattern", receive_pattern))
-        sensitivity, unknowns = self._sensitivity(self.transmitter)
+            turned = check_turned("arrival", arrival, len(places))
+            antenna = antenna_of("receive_pattern", receive_pattern)
+        sensitivity, unknowns = self._sensitivity(antenna)
         return suggest(
-            sensitivity, unknowns, places, n, measured=self.fitted_on, pointings=pointings, progress=progress
+            sensitivity, unknowns, places, n, measured=self.fitted_on, turned=turned, progress=progress
         )
 
     def locate(
@@ -559,15 +559,15 @@ class BistaticField(RadioField):
     def gain_std_db(self, progress: Progress | None = None) -> np.ndarray:
         """How far the gain of what each element of the surface scatters is known after spectra at ``fitted_on``: standard
         deviation [dB], shape ``(E,)``; see :mod:`warprrf.rf.fields.bistatic.suggest`."""
-        sensitivity, unknowns = self._sensitivity(self.transmitter)
+        sensitivity, unknowns = self._sensitivity()
         variance = unknowns.variance(sensitivity.precision(self.fitted_on, progress=progress))
         return NEPER * np.sqrt(variance[: len(self.surface.element_area)])
 
-    def _sensitivity(self, transmitter: np.ndarray) -> tuple[Sensitivity, Unknowns]:
-        tracer = self.tracer(transmitter)
+    def _sensitivity(self, antenna: Antenna | None = None) -> tuple[Sensitivity, Unknowns]:
+        tracer = self.tracer()
         materials, tracer = self.materials_of(tracer), tracer.on_grid(SUGGEST_SHAPE, 1)
         floor = self.floor * np.prod(self.shape) / np.prod(SUGGEST_SHAPE)
-        return Sensitivity(tracer, self.state, materials, floor), Unknowns.of(tracer, self.material)
+        return Sensitivity(tracer, self.state, materials, floor, antenna), Unknowns.of(tracer, self.material)
 
     def _link_work(self, options: LinkOptions) -> tuple[Work, int]:
         effects, shape = self.effects, options.shape or LINK_SHAPE
