@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from scipy.sparse import block_diag, bsr_matrix, csr_matrix, identity
 
-from warprrf.checks import Expected, check_array, check_arrays, check_count, check_number, check_type, checked
+from warprrf.checks import Expected, check_array, check_arrays, check_number, check_type, checked, whole
 from warprrf.kernels.radio.records import EXCESS_COLUMN, MIRRORED_COLUMN, THROUGH_COLUMN
 from warprrf.rf.em.fresnel import EXCESS, fresnel_curves
 from warprrf.rf.em.materials import NARROWEST_LOBE
@@ -45,19 +46,13 @@ class Effects:
     """
 
     line_of_sight: bool = True
-    mirrors: int = 3
-    scatterings: int = 3
+    mirrors: Annotated[int, whole(0, 3)] = 3
+    scatterings: Annotated[int, whole(0, 3)] = 3
     mirror_scatter: bool = True
     scatter_mirror: bool = True
-    transmissions: int = 3
-    diffractions: int = 1
+    transmissions: Annotated[int, whole(0, MOST_SLABS)] = 3
+    diffractions: Annotated[int, whole(0, 1)] = 1
     residual: bool = True
-
-    def __post_init__(self) -> None:
-        check_count("mirrors", self.mirrors, 0, 3)
-        check_count("scatterings", self.scatterings, 0, 3)
-        check_count("transmissions", self.transmissions, 0, MOST_SLABS)
-        check_count("diffractions", self.diffractions, 0, 1)
 
 
 SETS = {

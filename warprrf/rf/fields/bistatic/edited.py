@@ -8,14 +8,13 @@ reflects 1.2 dB too little head on.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from warprrf.checks import check_type, users_level
+from warprrf.checks import check_type, warn
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.em.materials import ITU_BANDS, Material, is_name_alone, library_material
 from warprrf.rf.fields.bistatic.needs import assumed
@@ -36,14 +35,14 @@ def with_geometry(field: Any, geometry: GeometryLike) -> dict[str, Any]:
     before, after = (np.bincount(s.group, s.mesh.areas, new.groups) for s in (old, new))
     for g, material in enumerate(found, old.groups):
         if material is None:
-            _warn(
-                f"{after[g]:.3g} m^2 are new, of {new.group_names[g]!r}, a material that nobody knows: it is taken for what "
-                "surfaces are before any measurement; name it after one of ITU-R P.2040, or use with_objects(materials=)"
+            warn(
+                f"geometry: {after[g]:.3g} m^2 are new, of {new.group_names[g]!r}, a material that nobody knows: it is taken for "
+                "what surfaces are before any measurement; name it after one of ITU-R P.2040, or use with_objects(materials=)"
             )
     lost_share, lost_m2 = 0.02, 0.01  # of a material's area, whose loss is worth a warning
     for k in np.flatnonzero(before - after > np.maximum(lost_share * before, lost_m2)):
         what = f"of {before[k]:.3g} m^2 of the fitted surface {old.group_names[k]!r}"
-        _warn(f"{what}, {before[k] - after[k]:.3g} m^2 have vanished")
+        warn(f"geometry: {what}, {before[k] - after[k]:.3g} m^2 have vanished")
     return parts
 
 
@@ -139,7 +138,3 @@ def _of_material(material: Material, frequency_hz: float, lobes: tuple[int, ...]
 
 def _some(names: Sequence[str]) -> str:
     return ", ".join(map(repr, names[:20])) + " ..." * (len(names) > 20)
-
-
-def _warn(text: str) -> None:
-    warnings.warn(f"geometry: {text}", UserWarning, stacklevel=users_level())

@@ -19,7 +19,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,14 +27,15 @@ from numpy.typing import ArrayLike
 from warprrf.cache import Cache
 from warprrf.checks import (
     Expected,
+    NotNegative,
     check_array,
     check_arrays,
     check_count,
-    check_number,
     check_type,
     checked,
     index_to,
     one_line,
+    whole,
 )
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
@@ -121,7 +122,7 @@ class BistaticField(RadioField):
     material: np.ndarray = field(repr=False)
     residual: np.ndarray = field(repr=False)
     errors: ErrorModel | None = field(default=None, repr=False)
-    sub_pixels: int = SUB_PIXELS
+    sub_pixels: Annotated[int, whole(1, 16)] = SUB_PIXELS
     air: Air | None = None
     fitted_on: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
     fitted_under: np.ndarray | None = field(default=None, repr=False)
@@ -133,7 +134,6 @@ class BistaticField(RadioField):
     def __post_init__(self) -> None:
         super().__post_init__()
         sizes = {"G": self.surface.groups, "L": len(self.parameters.lobes), "X": self.surface.cells}
-        check_count("sub_pixels", self.sub_pixels, 1, 16)
         check_arrays(vars(self.parameters), PARAMETER_ARRAYS, **sizes)
         check_arrays(vars(self), _ARRAYS, **sizes)
         materials = int(self.material.max()) + 1
@@ -459,7 +459,7 @@ class BistaticField(RadioField):
         directions: ArrayLike,
         transmitter: ArrayLike | None = None,
         *,
-        length_std_m: float = 0.0,
+        length_std_m: NotNegative = 0.0,
     ) -> np.ndarray:
         """Angular spectrum |a^H h|^2 / M^2 of a coherent array at every receiver, in expectation over the phases of what
         is scattered; see :class:`ArraySpectra`.
@@ -477,11 +477,10 @@ class BistaticField(RadioField):
             TypeError, ValueError: as for :meth:`spectrum`, and naming the argument.
         """
         steered = check_steering(array, directions)
-        std = check_number("length_std_m", length_std_m, 0.0)
         ends, found = self.check_positions(receivers, transmitter), []
         for receiver, source in zip(ends.receivers, ends.transmitters, strict=True):
             view = self._view(receiver, source)
-            image = ArrayImage.of(view, array, steered.reshape(-1, 3), std)
+            image = ArrayImage.of(view, array, steered.reshape(-1, 3), length_std_m)
             found.append(np.maximum(read(self.path_gains(view), image), 0.0).reshape(steered.shape[:-1]))
         return np.asarray(ends.shaped(np.stack(found)))
 

@@ -27,7 +27,7 @@ from warprrf.rf.fields.bistatic.needs import RARE, evenly
 from warprrf.rf.fields.bistatic.observations import Place, Seen, as_list, frame_of, places_of
 from warprrf.rf.fields.bistatic.options import FitOptions
 from warprrf.rf.fields.bistatic.placing import moved, position_offset, with_zeros
-from warprrf.rf.fields.bistatic.report import covariance_of, left_out, report_of, warn
+from warprrf.rf.fields.bistatic.report import covariance_of, left_out, report_of, warn_of
 from warprrf.rf.fields.bistatic.residual import fit_residual, shares_of
 from warprrf.rf.fields.bistatic.training import (
     FEW,
@@ -83,7 +83,7 @@ def fit(
             places = places_of(data, mesh, device)
             t, model, found, _ = _learned(data, places, look, options, progress)
     report = found["report"]
-    warn(t.data, report)
+    warn_of(t.data, report)
     places_moved = {
         t.names[k]: [(place.receiver.tolist(), offset.tolist()) for place, offset in own]
         for k, own in offsets.items()

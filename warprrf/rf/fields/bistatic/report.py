@@ -3,14 +3,13 @@ out; and warnings of these."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from warprrf.checks import some_of, users_level
+from warprrf.checks import some_of, warn
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import Measured
 from warprrf.rf.fields.bistatic.gauss_newton import THROUGH_STD, Solution, layout_of
@@ -151,7 +150,7 @@ def report_of(
     return report
 
 
-def warn(data: Sequence[Measured], report: dict[str, Any]) -> None:
+def warn_of(data: Sequence[Measured], report: dict[str, Any]) -> None:
     """Warn of what a report says that nobody should miss."""
     _warn_of_unexplained(data, report["unexplained"])
     _warn_of_side_lobes(report["chains"])
@@ -166,11 +165,9 @@ def _warn_of_side_lobes(chains: dict[str, dict[str, float]]) -> None:
             f"{name!r} ({100 * one['side_lobe_share']:.0f} % of its readings, {one['side_lobe_std_db']:.1f} dB)"
             for name, one in hanging.items()
         )
-        warnings.warn(
+        warn(
             f"ds: gains of chains hang on the level of side lobes, taken to be known to {SIDE_LOBES_DB:g} dB: {listed}; "
-            "measure the pattern beyond its main lobe, or turn the antenna to what it is to see",
-            UserWarning,
-            stacklevel=users_level(),
+            "measure the pattern beyond its main lobe, or turn the antenna to what it is to see"
         )
 
 
@@ -179,12 +176,10 @@ def _warn_of_left_out(missed: dict[str, Any]) -> None:
     for name in ("diffraction", "transmission"):
         large = [db for db in missed[name] if db > little_db]
         if large:
-            warnings.warn(
+            warn(
                 f"{name} is not modelled, but would add {np.median(large):.1f} dB to all power of {len(large)} of "
                 f"{len(missed[name])} blocked receivers, as estimated; where it is in what was read, something else was fitted to "
-                "it: warprrf.relevance tells more",
-                UserWarning,
-                stacklevel=users_level(),
+                "it: warprrf.relevance tells more"
             )
 
 
@@ -192,9 +187,7 @@ def _warn_of_unexplained(data: Sequence[Measured], wrong: dict[str, list[int]]) 
     if wrong:
         count = sum(len(one) for one in data if isinstance(one, Readings))
         listed = "; ".join(f"{len(rows)} of {name!r}, rows {some_of(rows)}" for name, rows in wrong.items())
-        warnings.warn(
+        warn(
             f"ds: {sum(map(len, wrong.values()))} of {count} readings are taken for wrong and left out ({listed}): "
-            'report["unexplained"] lists them',
-            UserWarning,
-            stacklevel=users_level(),
+            'report["unexplained"] lists them'
         )
