@@ -164,16 +164,10 @@ class RayGrid:
             wp.zeros(count, dtype=kind, device=where) for kind in (real, wp.types.vector(3, real), wp.vec3d)
         ]
         each = max(len(hits.face) // max(len(hits.origins), 1), 1)
-        vectors = [
-            wp.array(np.reshape(a, (-1, 3)), dtype=wp.vec3d, device=where) for a in (sources, hits.origins)
-        ]
-        of_rays = (
-            (hits.directions, wp.vec3d), (hits.face, wp.int32), (hits.range_m, wp.float64), (hits.solid_angle, real),
-        )  # fmt: skip
         inputs = [
-            *self.surface.on_device(where, real), wp.array([] if ray is None else ray, dtype=wp.int32, device=where),
-            *vectors, each, *(wp.array(a, dtype=kind, device=where, copy=False) for a, kind in of_rays), NEAREST_M,
-            self.loss_per_m, *found,
+            *self.surface.on_device(where, real), np.zeros(0, np.int32) if ray is None else ray,
+            np.reshape(sources, (-1, 3)), hits.origins, each, hits.directions, hits.face, hits.range_m, hits.solid_angle,
+            NEAREST_M, self.loss_per_m, *found,
         ]  # fmt: skip
         _device.launch(illumination.build(real), count, inputs, device=where)
         return Light(*(a.numpy() for a in found))
