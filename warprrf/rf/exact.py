@@ -50,7 +50,7 @@ from warprrf.rf.spectra.spectrum import (
 )
 from warprrf.rf.tracing.model import SETS, Effects
 from warprrf.rf.tracing.rays import Hits, RayGrid
-from warprrf.rf.tracing.records import Interactions, Records, SlabMaterials
+from warprrf.rf.tracing.records import Interactions, Records, SlabMaterials, one_kind
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import Rays, Tracer
 from warprrf.rows import Rows
@@ -98,6 +98,11 @@ class _Beams:
     length_m: np.ndarray
     sequence: str
     times: int = 1
+
+    @property
+    def seen(self) -> Rays:
+        """What they hit, by their rows."""
+        return Rays(self.hits, np.arange(len(self.ray)))
 
     def take(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Where the rays ``rows`` hit, their directions, and the faces that they meet."""
@@ -220,7 +225,7 @@ class ExactEngine:
         yield rays
         if self.mirrors.walls is None or not self.effects.scatter_mirror:
             return
-        behind = self._tracer.behind(Rays(rays.hits, np.arange(len(rays.ray))), self.effects.transmissions)
+        behind = self._tracer.behind(rays.seen, self.effects.transmissions)
         hits, after = behind.hits, behind.after
         if after is not None and len(behind.ray):
             kind = np.full((1, after.index.shape[1]), SLAB, np.int32)
@@ -234,8 +239,7 @@ class ExactEngine:
 
     def _lit(self, rays: _Beams) -> Iterator[DiffusePaths]:
         """What the transmitter lights where rays hit, and what it lights through slabs."""
-        tracer = self._tracer
-        seen = Rays(rays.hits, np.arange(len(rays.ray)))
+        tracer, seen = self._tracer, rays.seen
         light = tracer.light(seen)
         lit = {"S": tracer.lit(seen, light)}
         if self.mirrors.walls is not None:
@@ -274,8 +278,7 @@ class ExactEngine:
             own, image, mirrors = row[chosen][k], image[k], mirrors.take(k)
             way, plane = point[own] - image, self.surface.plane_normal[patch[chosen, 0][k]]
             before = tracer.specular(mirrors).interactions
-            seen = Rays(rays.hits, np.arange(len(rays.ray)))
-            records = tracer.scattered(seen, ray[own], every * light.strength[k], light.angle[k], before)
+            records = tracer.scattered(rays.seen, ray[own], every * light.strength[k], light.angle[k], before)
             departure = way - 2.0 * (way * plane).sum(axis=1)[:, None] * plane
             yield self._paths(rays, records, np.linalg.norm(way, axis=1), departure, name)
 
@@ -296,12 +299,9 @@ class ExactEngine:
         point, direction, face = rays.take(ray)
         normal = self._toward(face, direction)
         cosine = -(direction * normal).sum(axis=1)
-        mirror, kind = (
-            Interactions.of_mirrors(self.surface.group[face], cosine),
-            np.array([[MIRROR]], np.int32),
-        )
+        mirror = Interactions.of_mirrors(self.surface.group[face], cosine)
         onward = direction + 2.0 * cosine[:, None] * normal
-        records = Records(self._left(rays, ray), ray, mirror.index, mirror.angle, kind)
+        records = Records(self._left(rays, ray), ray, mirror.index, mirror.angle, mirror.kind)
         return self._on(rays, ray, point, normal, onward, records, "M")
 
     def _scattered_on(self, rays: _Beams, depth: int) -> _Beams:
@@ -320,7 +320,7 @@ class ExactEngine:
         angle = np.column_stack([up, cos_out, cos_mirror])[:, None]
         records = Records(
             every * np.pi * self._left(rays, ray), ray, self.surface.group[face][:, None], angle,
-            np.array([[SCATTER]], np.int32),
+            one_kind(SCATTER),
             half_width=self._tracer.grid.half_width,
         )  # fmt: skip
         return replace(self._on(rays, ray, point, normal, onward, records, "S"), times=every * rays.times)

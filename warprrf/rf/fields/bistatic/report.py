@@ -152,14 +152,15 @@ def report_of(
 
 def warn_of(data: Sequence[Measured], report: dict[str, Any]) -> None:
     """Warn of what a report says that nobody should miss."""
-    _warn_of_unexplained(data, report["unexplained"])
-    _warn_of_side_lobes(report["chains"])
-    _warn_of_left_out(report["left_out"])
-
-
-def _warn_of_side_lobes(chains: dict[str, dict[str, float]]) -> None:
+    if wrong := report["unexplained"]:
+        count = sum(len(one) for one in data if isinstance(one, Readings))
+        listed = "; ".join(f"{len(rows)} of {name!r}, rows {some_of(rows)}" for name, rows in wrong.items())
+        warn(
+            f"ds: {sum(map(len, wrong.values()))} of {count} readings are taken for wrong and left out ({listed}): "
+            'report["unexplained"] lists them'
+        )
     much_db = 1.0
-    hanging = {name: one for name, one in chains.items() if one["side_lobe_std_db"] > much_db}
+    hanging = {name: one for name, one in report["chains"].items() if one["side_lobe_std_db"] > much_db}
     if hanging:
         listed = ", ".join(
             f"{name!r} ({100 * one['side_lobe_share']:.0f} % of its readings, {one['side_lobe_std_db']:.1f} dB)"
@@ -169,9 +170,7 @@ def _warn_of_side_lobes(chains: dict[str, dict[str, float]]) -> None:
             f"ds: gains of chains hang on the level of side lobes, taken to be known to {SIDE_LOBES_DB:g} dB: {listed}; "
             "measure the pattern beyond its main lobe, or turn the antenna to what it is to see"
         )
-
-
-def _warn_of_left_out(missed: dict[str, Any]) -> None:
+    missed = report["left_out"]
     little_db = max(missed["error_db"], 0.5)
     for name in ("diffraction", "transmission"):
         large = [db for db in missed[name] if db > little_db]
@@ -181,13 +180,3 @@ def _warn_of_left_out(missed: dict[str, Any]) -> None:
                 f"{len(missed[name])} blocked receivers, as estimated; where it is in what was read, something else was fitted to "
                 "it: warprrf.relevance tells more"
             )
-
-
-def _warn_of_unexplained(data: Sequence[Measured], wrong: dict[str, list[int]]) -> None:
-    if wrong:
-        count = sum(len(one) for one in data if isinstance(one, Readings))
-        listed = "; ".join(f"{len(rows)} of {name!r}, rows {some_of(rows)}" for name, rows in wrong.items())
-        warn(
-            f"ds: {sum(map(len, wrong.values()))} of {count} readings are taken for wrong and left out ({listed}): "
-            'report["unexplained"] lists them'
-        )
