@@ -292,10 +292,8 @@ class Tracer:
 
     def _edges(self, walls: Walls | None) -> EdgeFinder:
         """Paths over edges and a slab, if there are ``walls``, between surfaces as they are taken to be before any measurement."""
-        images, s = (
-            MirrorImages(self.surface.patches, self.transmitter, device=self.grid.device),
-            self.surface,
-        )
+        s = self.surface
+        images = MirrorImages(s.patches, self.transmitter, device=self.grid.device)
         table = s.table(self.frequency_hz)
         return EdgeFinder(images, self.wavelength_m, table, walls=walls, group=s.group)
 

@@ -52,7 +52,7 @@ from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, links, receivers_at
 from warprrf.rf.fields.bistatic.links import SHAPE as LINK_SHAPE
 from warprrf.rf.fields.bistatic.locate import locate
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, read
-from warprrf.rf.fields.bistatic.needs import assumed
+from warprrf.rf.fields.bistatic.needs import assumed, evenly
 from warprrf.rf.fields.bistatic.observations import (
     Observation,
     Place,
@@ -216,8 +216,7 @@ class BistaticField(RadioField):
         )  # fmt: skip
         if any(isinstance(one, SpectrumDataset) for one in data):
             return fitted
-        places = receivers[np.linspace(0, len(receivers) - 1, min(len(receivers), 8)).astype(int)]
-        gains = np.stack([fitted.spectrum(place).path_gain for place in places])
+        gains = np.stack([fitted.spectrum(place).path_gain for place in evenly(receivers, 8)])
         floor = default_floor(gains)
         return replace(
             fitted, floor=floor, range_db=(10.0 * float(np.log10(floor)), float(to_db(gains.max(), floor)))
@@ -232,15 +231,8 @@ class BistaticField(RadioField):
         frame = frame_of(data)
         effects = replace(o.candidates(frame.frequency_hz)[:2][-1], residual=False)
         lobes = o.exponents(frame.frequency_hz)
-        prior = cls.prior(
-            geometry,
-            frame,
-            effects=effects,
-            lobes=lobes,
-            reciprocal=o.reciprocal,
-            sub_pixels=o.rays,
-            device=device,
-        )
+        known: dict[str, Any] = {"reciprocal": o.reciprocal, "sub_pixels": o.rays, "device": device}
+        prior = cls.prior(geometry, frame, effects=effects, lobes=lobes, **known)
         places_of(data, prior.mesh, device)
         own = assumed(prior.surface, prior.frequency_hz)
         parameters = replace(prior.parameters, log_excess=own.log_excess)
@@ -597,10 +589,8 @@ class BistaticField(RadioField):
         slopes = np.float32(self.parameters.gain) * slopes
         power = image.ravel() / self.floor
         if len(self.errors.covariance) > layout.size:  # of a common gain
-            slopes, index = (
-                np.concatenate([slopes, power[None].astype(np.float32)]),
-                np.append(index, layout.size),
-            )
+            slopes = np.concatenate([slopes, power[None].astype(np.float32)])
+            index = np.append(index, layout.size)
         slopes *= (NEPER / (1.0 + power)).astype(np.float32)
         return self.errors.std_db(
             NEPER * np.log1p(power).reshape(image.shape), view.receivers[0], slopes, index

@@ -183,11 +183,8 @@ are under it and what its map gives (P, M) [dB]; of those M the column of each r
 
 def _spectrum(one: SpectrumDataset, maps: dict[bytes, FieldMap], *_: Any) -> Rough:
     own = np.ravel_multi_index(pixel_of(pixel_directions(one.shape), SHAPE), SHAPE).ravel()
-    gain, m, blur = (
-        one.path_gain[0].astype(float).ravel(),
-        maps[one.transmitter.tobytes()],
-        beam_operator(SHAPE, BLUR_RAD),
-    )
+    gain, m = one.path_gain[0].astype(float).ravel(), maps[one.transmitter.tobytes()]
+    blur = beam_operator(SHAPE, BLUR_RAD)
     power, measured = (
         blur(np.bincount(own, value, PIXELS).reshape(SHAPE)).ravel()
         for value in (np.nan_to_num(gain), np.isfinite(gain) * 1.0)
@@ -195,14 +192,8 @@ def _spectrum(one: SpectrumDataset, maps: dict[bytes, FieldMap], *_: Any) -> Rou
     smaller = len(gain) / PIXELS
     kept = np.flatnonzero(measured > 0.9 * smaller)  # elsewhere nothing was measured
     table = m.decibels("blurred", lambda: blur(np.moveaxis(m.image, 0, -1)).reshape(PIXELS, -1).T)
-    return (
-        power[kept],
-        np.full(len(kept), one.floor * smaller),
-        None,
-        [(np.arange(len(kept)), table)],
-        kept[None],
-        np.zeros(1),
-    )
+    floor, parts = np.full(len(kept), one.floor * smaller), [(np.arange(len(kept)), table)]
+    return power[kept], floor, None, parts, kept[None], np.zeros(1)
 
 
 def _array(one: ArraySpectra, maps: dict[bytes, FieldMap], chains: Sequence[str]) -> Rough:
@@ -215,14 +206,8 @@ def _array(one: ArraySpectra, maps: dict[bytes, FieldMap], chains: Sequence[str]
     )
     table = maps[one.transmitters[0].tobytes()].weighed(np.abs(heard) ** 2 * one.array.gain(pixels))
     every, chain = np.arange(len(kept)), np.full(len(kept), len(chains)) if one.relative else None
-    return (
-        one.power[0].ravel()[kept],
-        np.full(len(kept), one.floor),
-        chain,
-        [(every, table)],
-        every[None],
-        np.zeros(1),
-    )
+    floor = np.full(len(kept), one.floor)
+    return one.power[0].ravel()[kept], floor, chain, [(every, table)], every[None], np.zeros(1)
 
 
 def _table(one: Readings, maps: dict[bytes, FieldMap], chains: Sequence[str]) -> Rough:

@@ -152,10 +152,7 @@ def priors(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Residuals of the priors ``(K,)`` and their Jacobian ``(K, F)``: distance to the start, energy kept."""
     own = np.arange(layout.groups)
-    gain_std, chain_std = (
-        1.0,
-        10.0,
-    )  # of the common gain and of a measuring chain's unknown one from one [nepers]
+    gain_std, chain_std = 1.0, 10.0  # of the common gain and a chain's unknown one from one [nepers]
     carrier_std = 1.0  # of the power of the carrier that roughness goes with, from Ament's 2
     residuals, rows = [], []
 
@@ -170,20 +167,14 @@ def priors(
     add((p.log_excess - start.log_excess) / EXCESS_STD, layout.excess(own), 1.0 / EXCESS_STD)
     add((p.log_mirror - start.log_mirror) / MIRROR_STD, layout.mirror(own), 1.0 / MIRROR_STD)
     if layout.through:
-        centre, std = (
-            (start.log_through, np.full(layout.groups, THROUGH_STD))
-            if known_through is None
-            else known_through
-        )
+        of_start = start.log_through, np.full(layout.groups, THROUGH_STD)
+        centre, std = of_start if known_through is None else known_through
         add((p.log_through - centre) / std, layout.let_through(own), 1.0 / std[:, None])
     if layout.gain:
         add(np.array([p.log_gain / gain_std]), np.array([layout.common_gain]), 1.0 / gain_std)
     if layout.roughness:
-        add(
-            np.array([(p.roughness - ROUGHNESS) / carrier_std]),
-            np.array([layout.carrier_power]),
-            1.0 / carrier_std,
-        )
+        from_ament = np.array([(p.roughness - ROUGHNESS) / carrier_std])
+        add(from_ament, np.array([layout.carrier_power]), 1.0 / carrier_std)
     if layout.chains:
         add(p.log_gains / chain_std, layout.first_chain + np.arange(layout.chains), 1.0 / chain_std)
     shares = np.column_stack([p.weight, np.exp(p.log_mirror)])  # S^2 by lobes, and 1 - S^2
@@ -219,10 +210,7 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
         own = (batch.fit_loss(batch.gain(p, power) * power) for batch, _, power in problem.evaluated(p))
         return weight * sum(float(loss.sum()) for loss in own) + float((prior**2).sum())
 
-    longest, tolerance = (
-        1.5,
-        1e-3,
-    )  # change of a logarithm in a step; relative fall of the objective that ends the fit
+    longest, tolerance = 1.5, 1e-3  # change of a logarithm in a step; relative fall that ends the fit
     current = total(vector)
     for _ in range(steps):
         p = layout.unpack(vector, start)

@@ -300,10 +300,7 @@ def locate(
 
 def search(question: Question, maps: dict[bytes, FieldMap]) -> Location:
     """From the lattice's best places to the candidates, and what is known of the likeliest."""
-    given_up, followed = (
-        2.0,
-        1.4,
-    )  # times the least loss: where others leave more they are left, or not followed
+    given_up, followed = 2.0, 1.4  # times the least loss: beyond, others are left, or not followed
     first, most = list[Found](), np.inf
     for start in question.starts(maps):
         first.append(question.descend(start, quick=True, most=most))

@@ -583,19 +583,13 @@ class _Arrays(Kind):
         target, chain = Target(NEPER * np.log1p(power[known] / one.floor)), OWN_GAIN if one.relative else -1
         bare = Observation(place, view, measured.part(known), target, unit * one.floor, chain)
         start = Parameters.prior(view.tracer.surface.groups)
-        materials, single = (
-            Materials(start, view.tracer.slabs, device=view.tracer.grid.device),
-            SETS["single"],
-        )
+        materials = Materials(start, view.tracer.slabs, device=view.tracer.grid.device)
+        single = SETS["single"]
         scattered = columns_of(bare, single, materials).power(start)
         total = scattered + bare.heard(single, materials)
         gain = bare.gain(start, total)
-        std_db = (
-            NEPER
-            * gain
-            * np.sqrt(scattered * np.maximum(2.0 * total - scattered, 0.0))
-            / (1.0 + gain * total)
-        )
+        spread = np.sqrt(scattered * np.maximum(2.0 * total - scattered, 0.0))
+        std_db = NEPER * gain * spread / (1.0 + gain * total)
         return replace(bare, target=target.trusted(NOISE_DB / np.hypot(NOISE_DB, std_db)), robust=True)
 
 
@@ -631,11 +625,8 @@ def observe(
     found = []
     for place, view in seen:
         one = kinds[place.data].observe(place, view)
-        found.append(
-            replace(
-                one, chain=index.get(place.chain, one.chain), ratio=float(place.frequency_hz / frequency_hz)
-            )
-        )
+        chain = index.get(place.chain, one.chain)
+        found.append(replace(one, chain=chain, ratio=float(place.frequency_hz / frequency_hz)))
     return found
 
 

@@ -43,20 +43,16 @@ def paths_of(
     codes = np.zeros(over.shape[:2], np.int8)
     codes[:, 0] = SCATTER
     whole = np.isfinite(over[:, 0]).all(axis=1)
-    power, over, codes = (
-        power[whole] * (power.sum() / max(power[whole].sum(), 1e-300)),
-        over[whole],
-        codes[whole],
-    )
+    power = power[whole] * (power.sum() / max(power[whole].sum(), 1e-300))
     paths = Paths.from_points(
         view.tracer.transmitter,
         view.receivers[0],
-        np.concatenate([vertices, over]),
+        np.concatenate([vertices, over[whole]]),
         np.sqrt(np.concatenate([specular, power])).astype(complex),
         np.concatenate([found.kind[exact], np.full(len(power), "diffuse", dtype="<U7")]),
         view.tracer.frequency_hz,
         excess_m=np.concatenate([found.excess_m[exact], np.zeros(len(power))]),
-        interactions=np.concatenate([found.code[exact], codes]),
+        interactions=np.concatenate([found.code[exact], codes[whole]]),
     )
     order = np.argsort(-np.abs(paths.gain), kind="stable")[:max_paths]
     return replace(paths.select(order), air=air)

@@ -91,10 +91,8 @@ class Sensitivity:
         pixel = np.ravel_multi_index(pixel_of(view.paths.arrival, SHAPE), SHAPE)
         mirror = view.records[SPECULAR].index[:, 0]
         own = mirror >= 0
-        parts, rest = (
-            [(pixel[own], 2 * elements + mirror[own], found.specular[own])],
-            [(pixel[~own], found.specular[~own])],
-        )
+        parts = [(pixel[own], 2 * elements + mirror[own], found.specular[own])]
+        rest = [(pixel[~own], found.specular[~own])]
         for name, power in found.tables.items():
             ray, gain = found.records[name].ray, found.records[name].residual_row
             if gain >= 0:
