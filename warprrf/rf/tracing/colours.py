@@ -138,10 +138,7 @@ def _halved(feature: np.ndarray, size: np.ndarray) -> np.ndarray:
     centre = np.stack([np.average(feature[label == k], axis=0, weights=size[label == k]) for k in (0, 1)])
     gap = np.linalg.norm(centre[1] - centre[0])
     along = (feature - centre[label]) @ (centre[1] - centre[0]) / max(gap, 1e-12)
-    apart, apart_std = (
-        1.2,
-        4.0,
-    )  # least distance of two colours of one sheet, and in standard deviations within each
+    apart, apart_std = 1.2, 4.0  # least distance of colours of one sheet, and in deviations within each
     if gap <= max(apart, apart_std * np.sqrt(np.average(along**2, weights=size))):
         return one
     for k in (0, 1):
@@ -166,10 +163,7 @@ def _alike(colour: np.ndarray, flat: np.ndarray, area: np.ndarray) -> np.ndarray
         area: in all.
     """
     large_m2 = 1.5  # of one colour and one patch: a group of its own
-    alike, rest_alike = (
-        1.0,
-        4.0,
-    )  # distance at which a small piece joins a large one, and those that do not each other
+    alike, rest_alike = 1.0, 4.0  # distance at which small pieces join large ones, and others each other
     large = np.flatnonzero(flat >= large_m2)
     material = np.full(len(colour), -1)
     material[large] = np.arange(len(large))

@@ -399,11 +399,8 @@ class Tracer:
         each = row % len(hits.directions)
         side = s.side_met(hits.face[row], hits.directions[each])
         solid_angle = hits.solid_angle[row % len(hits.solid_angle)]
-        power = (
-            (self.wavelength_m / (4.0 * np.pi)) ** 2
-            * solid_angle
-            * self.grid.transmittance(hits.range_m[row])
-        )
+        friis = (self.wavelength_m / (4.0 * np.pi)) ** 2
+        power = friis * solid_angle * self.grid.transmittance(hits.range_m[row])
         return self._records(rays, row, power, side, np.zeros((len(row), 3)), SOURCE)
 
     def scattered(

@@ -197,9 +197,7 @@ def _choose_of_few(t: Training, trials: list[Solution]) -> Solution:
     wrong, also = (t.unexplained(model)[0] for model in models)
     counted = t.without({k: np.intersect1d(rows, also[k]) for k, rows in wrong.items() if k in also})
     losses = [counted.loss(model, list(t.observations)) for model in models]
-    much_better = (
-        0.8  # share to which single bounces must lower the error that mirrors and further bounces leave
-    )
+    much_better = 0.8  # share to which single bounces must lower the error
     fewer = losses[0] < much_better * losses[1]
     t.note(_name(single.effects), fewer, losses[0])
     t.note(_name(room.effects), not fewer, losses[1])

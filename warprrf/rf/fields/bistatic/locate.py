@@ -183,9 +183,7 @@ class Question:
         points = np.concatenate([here, beside(here[0], step_m)]) if near is None else here
         kinds, further, seen = kinds_of(self.moved(unknown, quick=quick)), {}, dict[Any, Any]()
         turn_rad, clock_m = 0.005, 0.01  # differences of the zeros of azimuths and of clocks
-        smooth = (
-            3  # pixels that slopes of a spectrum are means over: noise of slopes would pass for curvature
-        )
+        smooth = 3  # pixels that a spectrum's slopes are means over: their noise would pass for curvature
         for j, k in enumerate(self.turned):
             by = clock_m if self.data[k].azimuth_known else turn_rad  # type: ignore[union-attr]
             other = unknown + by * (np.arange(len(unknown)) == 3 + j)

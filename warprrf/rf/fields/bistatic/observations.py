@@ -542,9 +542,8 @@ class _Tables(Kind):
         sight, steady = _shares(bare)
         bias, fading = fading_db(one.samples, steady)
         above = NEPER * np.log1p(one.power[rows] / floor * 10.0 ** (-bias / 10.0))
-        unexplained = (
-            0.5 if one.total else READING_ERROR_DB
-        )  # of all power errors of single directions average out
+        # Of all power errors of single directions average out.
+        unexplained = 0.5 if one.total else READING_ERROR_DB
         trust = NOISE_DB / np.hypot(np.hypot(unexplained, np.asarray(one.std_db)[rows]), fading)
         target = Target(above, trust, one.power[rows] <= floors)
         wide_db = 10.0  # of what fades or is all power; see :class:`Observation`
