@@ -50,7 +50,7 @@ from warprrf.rf.spectra.spectrum import (
 )
 from warprrf.rf.tracing.model import SETS, Effects
 from warprrf.rf.tracing.rays import Hits, RayGrid
-from warprrf.rf.tracing.records import Interactions, Records, SlabMaterials
+from warprrf.rf.tracing.records import Interactions, Records, SlabMaterials, one_kind
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import Rays, Tracer
 from warprrf.rows import Rows
@@ -60,14 +60,6 @@ SUB_PIXELS = 8
 
 Error of the total diffuse power at 60 x 120 over 17 places in a furnished room, rms (largest): 4: 0.3 % (0.8 %),
 8: 0.05 % (0.13 %), 16: 0.02 % (0.04 %).
-"""
-SCATTERED_ON = 9
-"""Most rays of a pixel that are scattered on."""
-FIRST_SEARCHED, SEARCHED = 16, 4
-"""Most rays of a pixel that look for light by way of mirrors, each a search: where they hit first, and after that.
-
-With 64 directions per pixel at 60 x 120, single scattering by way of one mirror is the same both ways within 0.015 dB between four
-pairs of places in a furnished room.
 """
 SINGLE = replace(SETS["single"], residual=False)
 """Line of sight, one mirror, scattering once: what has no noise."""
@@ -106,6 +98,11 @@ class _Beams:
     length_m: np.ndarray
     sequence: str
     times: int = 1
+
+    @property
+    def seen(self) -> Rays:
+        """What they hit, by their rows."""
+        return Rays(self.hits, np.arange(len(self.ray)))
 
     def take(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Where the rays ``rows`` hit, their directions, and the faces that they meet."""
@@ -228,7 +225,7 @@ class ExactEngine:
         yield rays
         if self.mirrors.walls is None or not self.effects.scatter_mirror:
             return
-        behind = self._tracer.behind(Rays(rays.hits, np.arange(len(rays.ray))), self.effects.transmissions)
+        behind = self._tracer.behind(rays.seen, self.effects.transmissions)
         hits, after = behind.hits, behind.after
         if after is not None and len(behind.ray):
             kind = np.full((1, after.index.shape[1]), SLAB, np.int32)
@@ -242,8 +239,7 @@ class ExactEngine:
 
     def _lit(self, rays: _Beams) -> Iterator[DiffusePaths]:
         """What the transmitter lights where rays hit, and what it lights through slabs."""
-        tracer = self._tracer
-        seen = Rays(rays.hits, np.arange(len(rays.ray)))
+        tracer, seen = self._tracer, rays.seen
         light = tracer.light(seen)
         lit = {"S": tracer.lit(seen, light)}
         if self.mirrors.walls is not None:
@@ -253,9 +249,14 @@ class ExactEngine:
             yield self._paths(rays, records, np.linalg.norm(out, axis=1), out, name)
 
     def _lit_by_mirrors(self, rays: _Beams) -> Iterator[DiffusePaths]:
-        """What images of the transmitter light where some of the rays hit, and what they light through slabs."""
+        """What images of the transmitter light where some of the rays hit, and what they light through slabs.
+
+        With 64 directions per pixel at 60 x 120, single scattering by way of one mirror is the same both ways within 0.015 dB
+        between four pairs of places in a furnished room.
+        """
         tracer, patches = self._tracer, self.mirrors.patches
-        ray, every = self._some(rays, SEARCHED if rays.sequence else FIRST_SEARCHED)
+        most = 4 if rays.sequence else 16  # each is a search: fewer after they hit first
+        ray, every = self._some(rays, most)
         point, direction, face = rays.take(ray)
         row, patch, met = self.mirrors.images.candidates(point, 1)
         normal = self._toward(face, direction)[row]
@@ -277,8 +278,7 @@ class ExactEngine:
             own, image, mirrors = row[chosen][k], image[k], mirrors.take(k)
             way, plane = point[own] - image, self.surface.plane_normal[patch[chosen, 0][k]]
             before = tracer.specular(mirrors).interactions
-            seen = Rays(rays.hits, np.arange(len(rays.ray)))
-            records = tracer.scattered(seen, ray[own], every * light.strength[k], light.angle[k], before)
+            records = tracer.scattered(rays.seen, ray[own], every * light.strength[k], light.angle[k], before)
             departure = way - 2.0 * (way * plane).sum(axis=1)[:, None] * plane
             yield self._paths(rays, records, np.linalg.norm(way, axis=1), departure, name)
 
@@ -299,17 +299,15 @@ class ExactEngine:
         point, direction, face = rays.take(ray)
         normal = self._toward(face, direction)
         cosine = -(direction * normal).sum(axis=1)
-        mirror, kind = (
-            Interactions.of_mirrors(self.surface.group[face], cosine),
-            np.array([[MIRROR]], np.int32),
-        )
+        mirror = Interactions.of_mirrors(self.surface.group[face], cosine)
         onward = direction + 2.0 * cosine[:, None] * normal
-        records = Records(self._left(rays, ray), ray, mirror.index, mirror.angle, kind)
+        records = Records(self._left(rays, ray), ray, mirror.index, mirror.angle, mirror.kind)
         return self._on(rays, ray, point, normal, onward, records, "M")
 
     def _scattered_on(self, rays: _Beams, depth: int) -> _Beams:
         """Some of the rays scattered where they hit, one direction each, drawn by the cosine."""
-        ray, every = self._some(rays, SCATTERED_ON)
+        most = 9  # of a pixel
+        ray, every = self._some(rays, most)
         point, direction, face = rays.take(ray)
         normal = self._toward(face, direction)
         u, v = np.random.default_rng([self.seed, depth, len(rays.sequence)]).random((2, len(ray)))
@@ -322,7 +320,7 @@ class ExactEngine:
         angle = np.column_stack([up, cos_out, cos_mirror])[:, None]
         records = Records(
             every * np.pi * self._left(rays, ray), ray, self.surface.group[face][:, None], angle,
-            np.array([[SCATTER]], np.int32),
+            one_kind(SCATTER),
             half_width=self._tracer.grid.half_width,
         )  # fmt: skip
         return replace(self._on(rays, ray, point, normal, onward, records, "S"), times=every * rays.times)

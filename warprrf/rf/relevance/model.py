@@ -203,10 +203,8 @@ class FullModel:
         """Changes of the dB image (rms over the sphere) and of the total path gain [dB] of each receiver, ``(R,)``,
         when of the full model only ``kept`` stays."""
         now, then = self._db(self.image(kept)), self._reference
-        return (
-            np.sqrt((self._weight * (now[0] - then[0]) ** 2).sum(axis=(1, 2))),
-            np.abs(now[1] - then[1]),
-        )
+        image_db = np.sqrt((self._weight * (now[0] - then[0]) ** 2).sum(axis=(1, 2)))
+        return image_db, np.abs(now[1] - then[1])
 
     def _db(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return to_db(image, self.floor), to_db(image.sum(axis=(1, 2)), self.floor)

@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import os
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from warprrf.checks import check_array, check_positive, checked, one_line
+from warprrf.checks import check_array, checked, one_line, positive
 from warprrf.device import Progress
 from warprrf.files import read_json, write_json
 from warprrf.geometry.mesh import as_mesh
@@ -221,7 +221,7 @@ class Setting:
 
     transmitter: Any = None
     frequency_hz: float | None = None
-    floor: float | None = None
+    floor: Annotated[float, positive("path gain")] | None = None
     shape: tuple[int, int] = (60, 120)
     beam_sigma_rad: float = BEAM_SIGMA_RAD
     gas_db_per_m: float | None = None
@@ -248,8 +248,6 @@ class Setting:
             )  # fmt: skip
         elif isinstance(geometry, RadioField):
             raise TypeError(f"geometry: got a field of model {geometry.model!r}, expected a bistatic one")
-        if found.floor is not None:
-            check_positive("floor", found.floor, "path gain")
         for name in ("transmitter", "frequency_hz"):
             if getattr(found, name) is None:
                 raise ValueError(f"{name}: got None, expected it for anything but a fitted field")
@@ -261,7 +259,7 @@ def relevance(
     geometry: Any,
     *,
     receivers: Any,
-    tolerance_db: float = 0.1,
+    tolerance_db: Annotated[float, positive("number of decibels")] = 0.1,
     device: Any = None,
     progress: Progress | None = None,
     **setting: Any,
@@ -284,7 +282,6 @@ def relevance(
             receivers on a surface or outside the scene, or a tolerance that is not positive.
         TypeError: for a geometry without a mesh, a field of another model, or an unknown setting.
     """
-    check_positive("tolerance_db", tolerance_db, "number of decibels")
     tick: Progress = progress or (lambda stage, done, total: None)
     model, source = full_model(geometry, receivers, device=device, progress=tick, **setting)
     found = choose(model, source, tolerance_db)

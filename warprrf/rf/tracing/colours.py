@@ -12,20 +12,7 @@ from scipy.spatial.distance import cdist
 from warprrf.geometry.mesh import Mesh, connected_pieces
 from warprrf.geometry.splats.gaussians import Y00, Gaussians
 
-TOLD_APART = 0.02  # faces whose colours differ by less are of one colour: what exporters write by default
-
-# Colours are compared in steps: log chromaticity over CHROMA, log luminance, which is also shade, over LUMINANCE.
-CHROMA = 0.05
-LUMINANCE = 0.3
-CELL_M = 0.4  # colours are averaged over cells of this size
-SHEET_M2 = 0.2  # smaller connected pieces of a patch count as one
-PIECE_M2 = 1.5  # a piece of one colour of a patch this large is a group of its own
 GROUP_M2 = 0.5  # smaller groups, from which nothing is learned, join the one that looks most like them
-APART = 1.2  # least distance of two colours of one sheet,
-APART_STD = 4.0  # and in standard deviations within each
-ALIKE = 1.0  # a small piece this near to a large one's colour joins it
-CURVED = 2.0  # pieces off all patches this near are one
-REST = 4.0  # small pieces that look like no large one are one this near
 
 
 @dataclass(frozen=True)
@@ -53,8 +40,9 @@ class Colours:
     def of_faces(cls, mesh: Mesh) -> Colours | None:
         """Of the mesh's own faces; None where they tell nothing apart."""
         rgb = mesh.face_colours
+        told_apart = 0.02  # colours that differ by less are one: what exporters write by default
         known = np.zeros(0, np.int64) if rgb is None else np.flatnonzero(~np.isnan(rgb).any(axis=1))
-        if rgb is None or len(known) == 0 or np.ptp(rgb[known], axis=0).max() < TOLD_APART:
+        if rgb is None or len(known) == 0 or np.ptp(rgb[known], axis=0).max() < told_apart:
             return None
         return cls(known, mesh.areas[known], rgb[known].astype(np.float64))
 
@@ -78,8 +66,9 @@ def colour_groups(
         The group of each face, shape ``(F,)``; the material that each group is taken for, shape ``(G,)``; and its
         colour in steps, shape ``(G, 4)``.
     """
+    cell_m, curved = 0.4, 2.0  # that colours are averaged over; pieces off all patches this near are one
     sheet = _sheets(mesh, patch)
-    place = np.floor((mesh.triangles.mean(axis=1) - mesh.bounds[0]) / CELL_M).astype(np.int64)
+    place = np.floor((mesh.triangles.mean(axis=1) - mesh.bounds[0]) / cell_m).astype(np.int64)
     unit = np.unique(np.column_stack([sheet, place]), axis=0, return_inverse=True)[1].reshape(-1)
     owner = np.full(int(unit.max()) + 1, -1)
     owner[unit] = sheet
@@ -88,7 +77,7 @@ def colour_groups(
     piece = np.zeros(len(owner), np.int64)
     for s in np.unique(owner):
         own = np.flatnonzero(owner == s)
-        split = _halved(feature[own], size[own]) if s >= 0 else _joined(feature[own], CURVED)
+        split = _halved(feature[own], size[own]) if s >= 0 else _joined(feature[own], curved)
         piece[own] = split + (piece.max() + 1 if s > owner.min() else 0)
     area = np.bincount(piece, size)
     colour = np.stack([np.bincount(piece, size * channel) for channel in feature.T], axis=1) / area[:, None]
@@ -99,8 +88,8 @@ def colour_groups(
 
 def _sheets(mesh: Mesh, patch: np.ndarray) -> np.ndarray:
     """Connected pieces of each patch, shape ``(F,)``, its crumbs together; -1 off all patches."""
-    piece = connected_pieces(mesh, patch)
-    crumb = np.bincount(piece, mesh.areas)[piece] < SHEET_M2
+    piece, crumb_m2 = connected_pieces(mesh, patch), 0.2
+    crumb = np.bincount(piece, mesh.areas)[piece] < crumb_m2
     key = np.where(crumb, patch + int(piece.max()) + 1, piece)
     sheet = np.full(len(patch), -1)
     own = patch >= 0
@@ -122,7 +111,8 @@ def _colours(unit: np.ndarray, owner: np.ndarray, size: np.ndarray, colours: Col
         seen = seen if seen.any() else known
         mean[(owner == s) & ~known] = np.average(mean[seen], axis=0, weights=size[seen])
     luminance = mean.mean(axis=1, keepdims=True)
-    return np.concatenate([(mean - luminance) / CHROMA, luminance / LUMINANCE], axis=1)
+    chroma_step, luminance_step = 0.05, 0.3  # of logarithms; luminance is also shade
+    return np.concatenate([(mean - luminance) / chroma_step, luminance / luminance_step], axis=1)
 
 
 def _halved(feature: np.ndarray, size: np.ndarray) -> np.ndarray:
@@ -148,7 +138,8 @@ def _halved(feature: np.ndarray, size: np.ndarray) -> np.ndarray:
     centre = np.stack([np.average(feature[label == k], axis=0, weights=size[label == k]) for k in (0, 1)])
     gap = np.linalg.norm(centre[1] - centre[0])
     along = (feature - centre[label]) @ (centre[1] - centre[0]) / max(gap, 1e-12)
-    if gap <= max(APART, APART_STD * np.sqrt(np.average(along**2, weights=size))):
+    apart, apart_std = 1.2, 4.0  # least distance of colours of one sheet, and in deviations within each
+    if gap <= max(apart, apart_std * np.sqrt(np.average(along**2, weights=size))):
         return one
     for k in (0, 1):
         own = label == k
@@ -171,15 +162,17 @@ def _alike(colour: np.ndarray, flat: np.ndarray, area: np.ndarray) -> np.ndarray
         flat: area on patches, shape ``(G,)`` [m^2].
         area: in all.
     """
-    large = np.flatnonzero(flat >= PIECE_M2)
+    large_m2 = 1.5  # of one colour and one patch: a group of its own
+    alike, rest_alike = 1.0, 4.0  # distance at which small pieces join large ones, and others each other
+    large = np.flatnonzero(flat >= large_m2)
     material = np.full(len(colour), -1)
     material[large] = np.arange(len(large))
     small = np.flatnonzero(material < 0)
     if len(large) and len(small):
         distance, nearest = cKDTree(colour[large]).query(colour[small])
-        material[small] = np.where(distance < ALIKE, nearest, -1)
+        material[small] = np.where(distance < alike, nearest, -1)
     rest = np.flatnonzero(material < 0)
-    material[rest] = len(large) + _joined(colour[rest], REST)
+    material[rest] = len(large) + _joined(colour[rest], rest_alike)
     while True:  # too small to learn from: join what looks most like it
         material = np.unique(material, return_inverse=True)[1].reshape(-1)
         whole = np.bincount(material, area)

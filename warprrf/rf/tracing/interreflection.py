@@ -18,7 +18,6 @@ from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import Rays, Tracer
 
 RAYS = 128  # from each element, over its hemisphere
-LIFT_M = 0.02  # rays of elements start so far off the surface
 
 
 class Interreflection:
@@ -46,13 +45,14 @@ class Interreflection:
             face = grid.hit(tracer.transmitter).face
             ray = np.flatnonzero(face >= 0)
             known = np.union1d(known, surface.side_met(face[ray], grid.directions[ray]))
+        lift_m = 0.02  # rays start so far off the surface
         shift = np.random.default_rng(0).random((2, len(surface.element_area)))
         scale = np.float32(np.pi / RAYS * (4.0 * np.pi / tracer.wavelength_m) ** 2)
         lit, through, behind = list[Records](), list[Records](), list[Records]()
         rows, columns, values, new = [], [], [], known
         while len(new):
             directions = _hemispheres(normal[new], shift[:, new % shift.shape[1]])
-            hits = grid.hit_along(point[new] + LIFT_M * normal[new], directions, np.ones(len(directions)))
+            hits = grid.hit_along(point[new] + lift_m * normal[new], directions, np.ones(len(directions)))
             hit = np.flatnonzero(hits.face >= 0)
             side, met = np.repeat(new, RAYS), surface.side_met(hits.face[hit], directions[hit])
             rays = Rays(hits, side)

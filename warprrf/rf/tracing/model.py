@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from scipy.sparse import block_diag, bsr_matrix, csr_matrix, identity
 
-from warprrf.checks import Expected, check_array, check_arrays, check_count, check_number, check_type, checked
+from warprrf.checks import Expected, check_array, check_arrays, check_number, check_type, checked, whole
 from warprrf.kernels.radio.records import EXCESS_COLUMN, MIRRORED_COLUMN, THROUGH_COLUMN
-from warprrf.rf.em.fresnel import fresnel_curves
+from warprrf.rf.em.fresnel import EXCESS, fresnel_curves
 from warprrf.rf.em.materials import NARROWEST_LOBE
 from warprrf.rf.paths.slabs import MOST_SLABS
 
@@ -45,19 +46,13 @@ class Effects:
     """
 
     line_of_sight: bool = True
-    mirrors: int = 3
-    scatterings: int = 3
+    mirrors: Annotated[int, whole(0, 3)] = 3
+    scatterings: Annotated[int, whole(0, 3)] = 3
     mirror_scatter: bool = True
     scatter_mirror: bool = True
-    transmissions: int = 3
-    diffractions: int = 1
+    transmissions: Annotated[int, whole(0, MOST_SLABS)] = 3
+    diffractions: Annotated[int, whole(0, 1)] = 1
     residual: bool = True
-
-    def __post_init__(self) -> None:
-        check_count("mirrors", self.mirrors, 0, 3)
-        check_count("scatterings", self.scatterings, 0, 3)
-        check_count("transmissions", self.transmissions, 0, MOST_SLABS)
-        check_count("diffractions", self.diffractions, 0, 1)
 
 
 SETS = {
@@ -70,7 +65,6 @@ SETS = {
 """Sets of effects that a fit tries. None has slabs or edges: ``effects="auto"`` adds them where the scene needs them."""
 
 MOST_NEPERS = 40.0  # of any logarithm: 174 dB from one, where no surface is
-_EXCESS = (0.05, 200.0)  # of epsilon_r - 1: the last reflects like metal
 ROUGHNESS = 2.0
 """Power of the carrier that roughness goes with (Ament 1953)."""
 ARRAYS = {
@@ -135,7 +129,7 @@ class Parameters:
     @property
     def excess(self) -> np.ndarray:
         """epsilon_r - 1, from 0.05 to 200, shape ``(G,)``."""
-        return np.clip(np.exp(self.log_excess), *_EXCESS)
+        return np.clip(np.exp(self.log_excess), *EXCESS)
 
     @property
     def gain(self) -> float:

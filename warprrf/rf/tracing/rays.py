@@ -21,7 +21,6 @@ from warprrf.kernels.radio import illumination
 from warprrf.rf.spectra.spectrum import sub_pixel_directions
 from warprrf.rf.tracing.surface import Surface
 
-LEAST_M = 1e-6  # range of what is hit at the ray's very start
 REALS = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
 """Warp's types of precisions."""
 NEAREST_M = 0.05  # an element at the transmitter spans directions: its distance counts as no less
@@ -131,13 +130,14 @@ class RayGrid:
     ) -> Hits:
         """What rays hit: ``origins`` (O, 3), a whole number of ``directions`` (K, 3) each, or all of them each if they are
         ``shared``."""
+        least_m = 1e-6  # range of what is hit at the ray's very start
         each = len(directions) if shared else len(directions) // max(len(origins), 1)
         hit = self.surface.mesh.cast(
             origins, directions, per_origin=max(each, 1), device=self.device, backend=self._backend(each * len(origins))
         )  # fmt: skip
         return Hits(
             origins, directions, np.asarray(solid_angle, self.dtype), np.asarray(hit.face, np.int32),
-            np.maximum(hit.t, LEAST_M, out=hit.t),
+            np.maximum(hit.t, least_m, out=hit.t),
         )  # fmt: skip
 
     def _backend(self, count: int) -> str:
@@ -164,16 +164,10 @@ class RayGrid:
             wp.zeros(count, dtype=kind, device=where) for kind in (real, wp.types.vector(3, real), wp.vec3d)
         ]
         each = max(len(hits.face) // max(len(hits.origins), 1), 1)
-        vectors = [
-            wp.array(np.reshape(a, (-1, 3)), dtype=wp.vec3d, device=where) for a in (sources, hits.origins)
-        ]
-        of_rays = (
-            (hits.directions, wp.vec3d), (hits.face, wp.int32), (hits.range_m, wp.float64), (hits.solid_angle, real),
-        )  # fmt: skip
         inputs = [
-            *self.surface.on_device(where, real), wp.array([] if ray is None else ray, dtype=wp.int32, device=where),
-            *vectors, each, *(wp.array(a, dtype=kind, device=where, copy=False) for a, kind in of_rays), NEAREST_M,
-            self.loss_per_m, *found,
+            *self.surface.on_device(where, real), np.zeros(0, np.int32) if ray is None else ray,
+            np.reshape(sources, (-1, 3)), hits.origins, each, hits.directions, hits.face, hits.range_m, hits.solid_angle,
+            NEAREST_M, self.loss_per_m, *found,
         ]  # fmt: skip
         _device.launch(illumination.build(real), count, inputs, device=where)
         return Light(*(a.numpy() for a in found))

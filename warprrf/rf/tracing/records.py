@@ -24,9 +24,6 @@ from warprrf.rf.em.fresnel import COSINES, SurfaceTable, fresnel_curves, lobe_no
 from warprrf.rf.tracing.model import Parameters
 from warprrf.rf.tracing.rays import REALS
 
-FINE_COSINES = 4097
-"""Entries of a lobe's table for a truth: interpolation errs by 1e-6 at most up to an exponent of 100."""
-
 
 @dataclass(frozen=True)
 class Interactions:
@@ -163,9 +160,7 @@ class Records:
         material m stand from column ``place[m]`` on: lobe weights, epsilon_r - 1, mirrored share, share let through."""
         if isinstance(materials, SlabMaterials):
             raise TypeError("materials: got slabs, expected half-spaces, which have slopes")
-        self._add(
-            "bin_slopes", materials, bins, [wp.array(place, dtype=wp.int32, device=materials.device)], slopes
-        )
+        self._add("bin_slopes", materials, bins, [place], slopes)
 
     def slopes(self, materials: Materials, place: np.ndarray, count: int) -> np.ndarray:
         """Those of each record, shape ``(N, count)``."""
@@ -180,13 +175,9 @@ class Records:
         groups = np.unique(self.index[own, self.rough])
         place = np.zeros(int(self.index.max(initial=0)) + 1, np.int32)
         place[groups] = np.arange(len(groups))
-        real, lobes = REALS[self.power.dtype], len(materials.parameters.lobes)
-        more = [
-            wp.array(place, dtype=wp.int32, device=materials.device),
-            wp.array(fresnel_curves().moments, dtype=real, device=materials.device),
-        ]
+        lobes = len(materials.parameters.lobes)
         found = np.zeros((bins.count, len(groups) * lobes * kernels.MOMENTS), self.power.dtype)
-        self._add("bin_components", materials, bins, more, found)
+        self._add("bin_components", materials, bins, [place, fresnel_curves().moments], found)
         return groups, found.reshape(bins.count, len(groups), lobes, kernels.MOMENTS)
 
     def _add(self, kernel: str, materials: Materials, bins: Bins, more: list[Any], sums: np.ndarray) -> None:
@@ -195,8 +186,8 @@ class Records:
         real, where = REALS[self.power.dtype], materials.device
         out = wp.array(sums, dtype=real, device=where, copy=False)
         table, m, launch = self._table(materials)
-        ordered = [wp.array(a, dtype=wp.int32, device=where, copy=False) for a in (bins.first, bins.order)]
-        launch(getattr(kernels.build(real), kernel), bins.count, [*ordered, table, m, *more, out])
+        kernel_of = getattr(kernels.build(real), kernel)
+        launch(kernel_of, bins.count, [bins.first, bins.order, table, m, *more, out])
         if out.ptr != sums.ctypes.data:  # it was a copy: of another precision, or on another device
             sums[...] = out.numpy()
 
@@ -286,26 +277,16 @@ class Materials:
         return self._made.get(real, lambda: self._upload(real))
 
     def _upload(self, real: Any) -> Any:
-        p, m, where = self.parameters, kernels.build(real).Materials(), self.device
+        p, rows, where = self.parameters, self.material, self.device
         even, slope = fresnel_curves().even(p.log_excess)
-        rows, count = self.material, len(p.log_excess)
-        values = {
-            "weight": p.weight, "excess": p.excess, "mirror": np.exp(p.log_mirror), "even_slope": slope / even,
-            "radiance": self._radiance, "through": np.exp(p.log_through), "thickness": self.slabs[1],
-        }  # fmt: skip
-        indices = {
-            "row": rows,
-            "side_row": rows[self._side_group],
-            "reciprocal": np.full(count, p.reciprocal),
-        }
-        for name, value in values.items():
-            setattr(m, name, wp.array(np.ascontiguousarray(value), dtype=real, device=where))
-        for name, value in indices.items():
-            setattr(m, name, wp.array(value, dtype=wp.int32, device=where))
-        eta = np.column_stack([self.slabs[0].real, self.slabs[0].imag])
-        m.permittivity = wp.array(eta, dtype=wp.types.vector(2, real), device=where)
-        m.exponent, m.scale = _lobes(p.lobes, (p.reciprocal,) * len(p.lobes), real, where, COSINES)
-        return m
+        eta, thickness = self.slabs
+        exponent, scale = _lobes(p.lobes, (p.reciprocal,) * len(p.lobes), real, where, COSINES)
+        return _device.filled(
+            kernels.build(real).Materials, where, weight=p.weight, excess=p.excess, mirror=np.exp(p.log_mirror),
+            even_slope=slope / even, radiance=self._radiance, through=np.exp(p.log_through), thickness=thickness,
+            permittivity=np.column_stack([eta.real, eta.imag]), row=rows, side_row=rows[self._side_group],
+            reciprocal=np.full(len(p.log_excess), p.reciprocal), exponent=exponent, scale=scale,
+        )  # fmt: skip
 
 
 class SlabMaterials(Materials):
@@ -337,7 +318,8 @@ class SlabMaterials(Materials):
         for name, value in values.items():
             setattr(m, name, wp.array(value, dtype=real, device=where))
         m.reciprocal = wp.array(table.reciprocal, dtype=wp.int32, device=where)
-        m.exponent, m.scale = _lobes(*zip(*lobes, strict=True), real, where, FINE_COSINES)
+        fine = 4097  # entries of a lobe's table: interpolation errs by 1e-6 at most up to an exponent of 100
+        m.exponent, m.scale = _lobes(*zip(*lobes, strict=True), real, where, fine)
         return m
 
 

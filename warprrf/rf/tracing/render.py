@@ -82,12 +82,8 @@ def path_gains(view: View, model: Model, materials: Materials) -> PathGains:
     tables = view.traced(model.effects)
     for name, records in tables.items():
         power = records.powers(materials)
-        factor = (
-            gains[records.residual_row, view.cell[records.ray]]
-            if records.residual_row >= 0
-            else model.parameters.gain
-        )
-        found[name] = power * factor
+        row = records.residual_row
+        found[name] = power * (gains[row, view.cell[records.ray]] if row >= 0 else model.parameters.gain)
     found[SPECULAR] = np.where(view.kept_paths(model.effects), found[SPECULAR], 0.0)
     return PathGains(view, found, tables, model.parameters)
 

@@ -15,14 +15,6 @@ from scipy.spatial import cKDTree
 from warprrf.geometry.mesh import Mesh, components, edge_pairs
 
 SHAPES = 6  # numbers that tell shapes apart
-SMOOTH_RAD = 0.5  # small flat pieces that meet at a smaller angle are a curved one
-SMALL_M2 = 1.5  # a smaller piece may be a facet of such
-CRUMB_M2 = 0.2  # smaller pieces, from which nothing is learned, join the nearest of their part
-THROUGH = 0.5  # a part whose extents are at least this share of the mesh's along all axes is the room's shell
-BODY_M2 = 0.5  # smaller bodies are taken for the material of the larger one that is most like them
-PLACE_M = 1.0  # distance that counts as much as a material's difference,
-EXTENT = 10.0  # and ratio of extents
-THIN_M = 0.03  # smaller extents count as this
 
 
 def shape_groups(mesh: Mesh, patch: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -36,15 +28,17 @@ def shape_groups(mesh: Mesh, patch: np.ndarray) -> tuple[np.ndarray, np.ndarray,
         The group of each face, shape ``(F,)``; the material that each group is taken for, shape ``(G,)``; and its
         shape in steps: height and place of its body, and the body's extents upward, along and across, shape ``(G, 6)``.
     """
+    shell = 0.5  # share of the mesh's extents along all axes that the room's shell has at least
+    body_m2 = 0.5  # smaller bodies are taken for the material of the larger one that is most like them
     pairs = edge_pairs(mesh.welded_faces)
     part = components(len(mesh.faces), pairs)
     group = _without_crumbs(mesh, _pieces(mesh, patch, pairs), part)
     _, first = np.unique(group, return_index=True)
-    through = _extents(mesh, part) >= THROUGH * _extents(mesh, np.zeros(len(part), np.int64))
+    through = _extents(mesh, part) >= shell * _extents(mesh, np.zeros(len(part), np.int64))
     lone = np.asarray(through.all(axis=1))[part[first]]
     body = np.unique(np.where(lone, np.arange(len(first)), len(first) + part[first]), return_inverse=True)[1]
     shape, area = _shape(mesh, body[group]), np.bincount(body[group], mesh.areas)
-    large = np.flatnonzero(area >= min(BODY_M2, float(area.max())))
+    large = np.flatnonzero(area >= min(body_m2, float(area.max())))
     material = cKDTree(shape[large]).query(shape)[1]
     material[large] = np.arange(len(large))
     return group.astype(np.int32), material[body].astype(np.int32), shape[body]
@@ -52,18 +46,21 @@ def shape_groups(mesh: Mesh, patch: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 
 def _pieces(mesh: Mesh, patch: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Connected sheets of the patches, those that are facets of a smooth surface together, shape ``(F,)``."""
+    # Pieces that are small enough to be facets of a curved one are, where they meet at a small angle.
+    small_m2, smooth_rad = 1.5, 0.5
     a, b = pairs.T
     together = (patch[a] == patch[b]) & (patch[a] >= 0)
     sheet = components(len(patch), pairs[together])
-    small = np.bincount(sheet, mesh.areas)[sheet] < SMALL_M2
+    small = np.bincount(sheet, mesh.areas)[sheet] < small_m2
     n = mesh.face_normals
-    bend = np.abs(np.einsum("ni,ni->n", n[a], n[b])) > np.cos(SMOOTH_RAD)
+    bend = np.abs(np.einsum("ni,ni->n", n[a], n[b])) > np.cos(smooth_rad)
     return components(len(patch), pairs[together | (bend & small[a] & small[b])])
 
 
 def _without_crumbs(mesh: Mesh, piece: np.ndarray, part: np.ndarray) -> np.ndarray:
     """Pieces numbered without gaps, crumbs joined to the nearest piece of their part, or to each other, ``(F,)``."""
-    crumb = np.bincount(piece, mesh.areas)[piece] < CRUMB_M2
+    crumb_m2 = 0.2  # from smaller ones nothing is learned
+    crumb = np.bincount(piece, mesh.areas)[piece] < crumb_m2
     whole = np.zeros(int(part.max()) + 1, bool)
     whole[part[~crumb]] = True
     piece = np.where(crumb & ~whole[part], int(piece.max()) + 1 + part, piece)
@@ -99,5 +96,7 @@ def _extents(mesh: Mesh, owner: np.ndarray) -> np.ndarray:
 
 def _shape(mesh: Mesh, owner: np.ndarray) -> np.ndarray:
     """Shape of each of ``owner`` (F,) in steps, ``(N, 6)``; see :func:`shape_groups`."""
-    extents = np.log(np.maximum(_extents(mesh, owner), THIN_M)) / np.log(EXTENT)
-    return np.column_stack([(_moments(mesh, owner)[0] - mesh.center) / PLACE_M, extents])
+    # Distances of 1 m and ratios of extents of 10 count as much as a material's difference.
+    place_m, ratio, thin_m = 1.0, 10.0, 0.03
+    extents = np.log(np.maximum(_extents(mesh, owner), thin_m)) / np.log(ratio)
+    return np.column_stack([(_moments(mesh, owner)[0] - mesh.center) / place_m, extents])

@@ -32,20 +32,14 @@ from warprrf.rf.tracing.colours import Colours, colour_groups
 from warprrf.rf.tracing.shapes import SHAPES, shape_groups
 
 ELEMENT_M = 0.5  # width of an element in a room
-LARGEST_ELEMENT_M = 25.0
 ELEMENTS = 30_000
 """Larger scenes have wider elements, so that there are about so many: light between them takes up to 50 kB each. The
-least width holds up to 7500 m^2 of surfaces (a hall's), the largest up to 19 km^2 (a town's)."""
-LEAST_ELEMENTS = 300
-CELLS = 3  # along an element
+least width holds up to 7500 m^2 of surfaces (a hall's), the largest of 25 m up to 19 km^2 (a town's)."""
 LARGEST_FACE = 1.2  # elements' widths; longer edges are split, so that elements can be small
-MIN_MIRROR = 0.2  # of an element's area in a room: smaller patches reflect too little to search for
 POSITION_ERROR_M = 0.02  # of a reconstructed surface: shadow rays end so far before it
 TRUE_ERROR_M = 1e-4
 LOSSY = 4.0 * (1.0 - 0.06j)
 """Permittivity of walls of unknown material: the loss tangent of plasterboard and wood at 300 GHz (ITU-R P.2040-4, table 3)."""
-ASSUMED_THICKNESS_M = 0.0125  # of walls of unknown thickness: a plasterboard
-MOST_ABSORBED = 30.0  # nepers
 _UNIT = Expected("F 3", -1.001, 1.001)
 ARRAYS = {
     "normal": _UNIT,
@@ -207,7 +201,7 @@ class Surface:
 
         Raises:
             TypeError: if it has no mesh.
-            ValueError: if it is so large that elements would be wider than :data:`LARGEST_ELEMENT_M`.
+            ValueError: if it is so large that elements would be wider than 25 m.
         """
         if isinstance(geometry, Surface):
             return geometry
@@ -232,7 +226,8 @@ class Surface:
             normal, error_m = _on_patches(patches, mesh.face_normals), max(TRUE_ERROR_M, patches.tolerance_m)
         patch, planes = patches.face_patch, (patches.normal, patches.offset)
         if patches.two_sided:
-            least_m2 = MIN_MIRROR * min(element_m, ELEMENT_M) ** 2
+            # Smaller patches than a fifth of an element in a room reflect too little to search for.
+            least_m2 = 0.2 * min(element_m, ELEMENT_M) ** 2
             patch, planes = _mirrors(_apart(patches, alike[group]), least_m2)
         sides = patches.two_sided
         mesh, parent = split_long(mesh, np.flatnonzero(patches.once), LARGEST_FACE * element_m)
@@ -284,12 +279,13 @@ class Surface:
             if name is not None and not known[g]:
                 eta[g], known[g] = itu_permittivity(name, frequency_hz), True
         known_slab = known & ~np.isnan(self.thickness_m)
-        thickness = np.where(np.isnan(self.thickness_m), ASSUMED_THICKNESS_M, self.thickness_m) / wavelength_m
+        plasterboard_m, most_nepers = 0.0125, 30.0
+        thickness = np.where(np.isnan(self.thickness_m), plasterboard_m, self.thickness_m) / wavelength_m
         absorbed = 4.0 * np.pi * np.where(known_slab, 0.0, thickness) * np.sqrt(eta).imag
         return (
             np.where(known_slab, eta, 0.0),
             thickness,
-            np.where(known_slab, 0.0, np.maximum(absorbed, -MOST_ABSORBED)),
+            np.where(known_slab, 0.0, np.maximum(absorbed, -most_nepers)),
         )
 
     def table(self, frequency_hz: float) -> SurfaceTable:
@@ -400,9 +396,9 @@ def objects_of(geometry: GeometryLike, parent: np.ndarray) -> dict[str, Any]:
 def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray, width_m: float) -> dict[str, Any]:
     """Elements and cells of faces, by the names of :class:`Surface`: pieces of one group and patch on a lattice of
     ``width_m``."""
-    centre = mesh.triangles.mean(axis=1)
-    cells = np.floor(CELLS * (centre - mesh.bounds[0]) / width_m).astype(np.int64)
-    key = np.column_stack([group, patch, cells // CELLS])
+    centre, along = mesh.triangles.mean(axis=1), 3  # cells along an element
+    cells = np.floor(along * (centre - mesh.bounds[0]) / width_m).astype(np.int64)
+    key = np.column_stack([group, patch, cells // along])
     element = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
     cell = np.unique(np.column_stack([element, cells]), axis=0, return_inverse=True)[1]
     return {"element": element, "cell": cell.reshape(-1).astype(np.int32)}
@@ -418,14 +414,14 @@ def largest_groups(mesh: Mesh, patch: np.ndarray, group: np.ndarray, patches: in
 
 def element_width(mesh: Mesh) -> float:
     """Width of elements [m]: as many as :data:`ELEMENTS` at most, pieces of small patches apart; :data:`ELEMENT_M`, or less in
-    scenes so small that there would be fewer than :data:`LEAST_ELEMENTS`."""
-    area = float(mesh.areas.sum())
-    width_m = max(min(ELEMENT_M, float(np.sqrt(area / LEAST_ELEMENTS))), float(np.sqrt(area / ELEMENTS)))
-    if width_m > LARGEST_ELEMENT_M:
+    scenes so small that there would be fewer than 300."""
+    area, fewest, widest_m = float(mesh.areas.sum()), 300, 25.0
+    width_m = max(min(ELEMENT_M, float(np.sqrt(area / fewest))), float(np.sqrt(area / ELEMENTS)))
+    if width_m > widest_m:
         size = " x ".join(f"{e:.4g}" for e in np.ptp(mesh.bounds, axis=0))
         raise ValueError(
             f"geometry: its {area:.3g} m^2 of surfaces would be cut into elements of {width_m:.3g} m, expected at most "
-            f"{LARGEST_ELEMENT_M:g} m; its box is {size} m: if that is not in metres but in millimetres, give "
+            f"{widest_m:g} m; its box is {size} m: if that is not in metres but in millimetres, give "
             "Mesh(1e-3 * vertices, faces), else the part of it that was measured"
         )
     return width_m

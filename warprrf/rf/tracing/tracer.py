@@ -37,7 +37,6 @@ from warprrf.rf.tracing.surface import Surface
 
 MIRROR_SLACK_M = 0.1
 """How far beside its faces a patch may still mirror [m]: outlines of a reconstructed mesh are torn."""
-THROUGH_MIRRORS = 3  # rays of a pixel that look for light by way of mirrors
 UNMODELLED = {("MTS", "M"), ("MTS", "T")}
 """Ways of light and of sight that are not traced together."""
 SPECULAR = "specular"
@@ -293,10 +292,8 @@ class Tracer:
 
     def _edges(self, walls: Walls | None) -> EdgeFinder:
         """Paths over edges and a slab, if there are ``walls``, between surfaces as they are taken to be before any measurement."""
-        images, s = (
-            MirrorImages(self.surface.patches, self.transmitter, device=self.grid.device),
-            self.surface,
-        )
+        s = self.surface
+        images = MirrorImages(s.patches, self.transmitter, device=self.grid.device)
         table = s.table(self.frequency_hz)
         return EdgeFinder(images, self.wavelength_m, table, walls=walls, group=s.group)
 
@@ -375,7 +372,8 @@ class Tracer:
     def lit_by_mirrors(self, rays: Rays, most: int = 0) -> Records:
         """What some rays of each pixel see of surfaces that images of the transmitter light; with ``most`` those that they light
         through slabs alone, up to that many."""
-        places = ((np.arange(THROUGH_MIRRORS) + 0.5) * self.grid.per_pixel / THROUGH_MIRRORS).astype(int)
+        most_rays = 3  # of a pixel
+        places = ((np.arange(most_rays) + 0.5) * self.grid.per_pixel / most_rays).astype(int)
         places = np.unique(places)
         times = self.grid.per_pixel / len(places)
         chosen = np.flatnonzero((rays.hits.face >= 0) & np.isin(rays.ray % self.grid.per_pixel, places))
@@ -401,11 +399,8 @@ class Tracer:
         each = row % len(hits.directions)
         side = s.side_met(hits.face[row], hits.directions[each])
         solid_angle = hits.solid_angle[row % len(hits.solid_angle)]
-        power = (
-            (self.wavelength_m / (4.0 * np.pi)) ** 2
-            * solid_angle
-            * self.grid.transmittance(hits.range_m[row])
-        )
+        friis = (self.wavelength_m / (4.0 * np.pi)) ** 2
+        power = friis * solid_angle * self.grid.transmittance(hits.range_m[row])
         return self._records(rays, row, power, side, np.zeros((len(row), 3)), SOURCE)
 
     def scattered(

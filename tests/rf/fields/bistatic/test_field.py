@@ -51,7 +51,7 @@ def test_spectra_that_would_not_fit_into_memory_are_refused(scene, data, monkeyp
     monkeypatch.setattr(training, "MOST_RAYS", 10 * 24 * 48 * 4 - 1)
     with pytest.raises(ValueError, match="ds: 10 spectra of 24 x 48 pixels take 4.6e.04 rays"):
         trace(scene, data, sub_pixels=2)
-    assert len(trace(scene, data.subset(np.arange(9)), sub_pixels=2).views) == 9
+    assert len(trace(scene, data.subset(np.arange(9)), sub_pixels=2)[0]) == 9
 
 
 def test_a_fit_to_many_keeps_no_records_and_is_the_same(scene, data, field, monkeypatch):
@@ -60,8 +60,8 @@ def test_a_fit_to_many_keeps_no_records_and_is_the_same(scene, data, field, monk
     traced = []
     monkeypatch.setattr(fitting, "trace", lambda *a, **o: traced.append(trace(*a, **o)) or traced[-1])
     again = RadioField.fit(scene, data.subset(np.arange(6)))
-    (views,) = traced
-    for view in views.views:
+    ((seen, _),) = traced
+    for _, view in seen:
         assert sum(a.nbytes for a in (view.hits.face, view.hits.range_m, *view.lit)) < 13 * len(
             view.hits.face
         )
@@ -87,10 +87,11 @@ def test_some_of_many_receivers_decide_and_all_are_learned_from(scene, data, fie
         found.append(RadioField.fit(scene, data))
         seen.append(traced)
     kept, again = found
-    for (decide, few), (rest, others) in seen:
-        assert (len(few.views), len(others.views)) == (8, 2)
+    for (decide, (few, _)), (rest, (others, _)) in seen:
+        assert (len(few), len(others)) == (8, 2)
         assert decide["effects"] is None and rest["effects"] == replace(kept.effects, residual=True)
-    assert {SPECULAR} == set(seen[1][1][1].views[0].records) < set(seen[0][1][1].views[0].records)
+    again_traced, kept_traced = (traced[1][1][0][0][1].records for traced in (seen[1], seen[0]))
+    assert {SPECULAR} == set(again_traced) < set(kept_traced)
     assert np.array_equal(kept.residual, again.residual)
     assert kept.report["receivers"] == len(kept.fitted_on) == 10
     alone = RadioField.fit(scene, data.subset(decide["only"]))

@@ -80,7 +80,7 @@ def test_places_where_a_horn_is_turned_alike_share_a_table(field):
     )
     views, data = [field.view(place) for place in places], [horns]
     where = places_of(data, field.mesh, None)
-    shared = [one.measured for one in observe(data, where, views, 1.0, [])]
+    shared = [one.measured for one in observe(data, list(zip(where, views, strict=True)), 1.0, [])]
     assert shared[0].of_bin is shared[1].of_bin and shared[0].alike == shared[1].alike
     own = [
         WeighedPaths.of(

@@ -56,7 +56,7 @@ def test_planted_gains_come_back(field):
         known, gaps = replace(field, residual=found), []
         for receiver, share in zip(RECEIVERS, shares, strict=True):
             image = known.spectrum(receiver).path_gain.ravel() / field.floor
-            gaps.append(NEPER * np.log1p(image) - share.target.db)
+            gaps.append(NEPER * np.log1p(image) - share.observed.target.db)
         assert np.sqrt(np.mean(np.square(gaps))) < 0.1
         power = sum(np.asarray(s.power.sum(axis=0)).ravel()[: field.surface.cells] for s in shares)
         element = field.surface.cell_element

@@ -14,7 +14,7 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.gauss_newton import Problem, gauss_newton
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
-from warprrf.rf.fields.bistatic.merging import Merging, merge
+from warprrf.rf.fields.bistatic.merging import merge
 from warprrf.rf.fields.bistatic.observations import columns_of
 from warprrf.rf.fields.bistatic.training import trace
 from warprrf.rf.spectra.beam import BeamOperator
@@ -90,7 +90,7 @@ def problem(scene):
     measured = SpectrumPixels(BeamOperator(SHAPE, np.radians(5.0)))
     observations = [
         observation(view, measured, ds.floor, t.ravel())
-        for view, t in zip(trace(scene, ds).views, target, strict=True)
+        for (_, view), t in zip(trace(scene, ds)[0], target, strict=True)
     ]
     return Problem.of(observations, SINGLE, np.arange(3), Parameters.prior(3))
 
@@ -99,13 +99,13 @@ def test_spectra_join_groups_of_one_material_and_no_others(problem, scene):
     area = np.bincount(scene.face_material, scene.mesh.areas)
     separate = gauss_newton(problem, Parameters.prior(3), 40)
     alike = np.zeros((3, 4))  # all appear the same
-    material, parameters = merge(problem, separate.parameters, alike, area, Merging())
+    material, parameters = merge(problem, separate.parameters, alike, area)
     assert material[1] == material[2] != material[0]
     assert len(parameters.log_excess) == 2
     # and a group that was put with the wrong material goes over
     mixed = replace(problem, material=np.array([0, 1, 0]))
     again = gauss_newton(mixed, parameters, 40)
-    moved, _ = merge(mixed, again.parameters, alike, area, Merging())
+    moved, _ = merge(mixed, again.parameters, alike, area)
     assert moved[2] == moved[1] != moved[0]
 
 
@@ -116,7 +116,7 @@ def test_looks_that_differ_keep_apart_what_spectra_cannot_tell(problem, scene):
     )  # fmt: skip
     area = np.bincount(scene.face_material, scene.mesh.areas)
     look = np.array([[0.0, 0, 0, 0], [0.1, 0, 0, 0], [9.0, 0, 0, 0]])
-    material, _ = merge(dark, Parameters.prior(3), look, area, Merging())
+    material, _ = merge(dark, Parameters.prior(3), look, area)
     assert material[0] == material[1]  # nothing speaks against it
 
 

@@ -153,11 +153,8 @@ class Batch:
         """Slopes ``table`` (C, N) of ``power`` (N,) where what changes all readings of an observation alike changes nothing."""
         for o, own in zip(self.observations, self.own, strict=True):
             if o.chain == OWN_GAIN:
-                known = (
-                    np.ones(own.stop - own.start)
-                    if o.target.trust is None
-                    else (o.target.trust > 0).astype(float)
-                )
+                trust = np.ones(own.stop - own.start) if o.target.trust is None else o.target.trust
+                known = (trust > 0).astype(float)
                 alike = table[:, own] @ known / max(float(known @ power[own]), 1e-300)
                 table[:, own] -= alike[:, None] * power[own]
         return table

@@ -8,24 +8,19 @@ reflects 1.2 dB too little head on.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from warprrf.checks import check_type, users_level
+from warprrf.checks import check_type, warn
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.em.materials import ITU_BANDS, Material, is_name_alone, library_material
 from warprrf.rf.fields.bistatic.needs import assumed
 from warprrf.rf.tracing.edits import Called, Room, edited
 from warprrf.rf.tracing.model import ARRAYS, MOST_NEPERS, Parameters
 from warprrf.rf.tracing.surface import Surface
-
-LOST = 0.02, 0.01
-"""Share of a material's area, and area [m^2], whose loss is worth a warning."""
-MOST_EXCESS = 1e6  # of epsilon_r - 1, of a conductor
 
 
 def with_geometry(field: Any, geometry: GeometryLike) -> dict[str, Any]:
@@ -40,13 +35,14 @@ def with_geometry(field: Any, geometry: GeometryLike) -> dict[str, Any]:
     before, after = (np.bincount(s.group, s.mesh.areas, new.groups) for s in (old, new))
     for g, material in enumerate(found, old.groups):
         if material is None:
-            _warn(
-                f"{after[g]:.3g} m^2 are new, of {new.group_names[g]!r}, a material that nobody knows: it is taken for what "
-                "surfaces are before any measurement; name it after one of ITU-R P.2040, or use with_objects(materials=)"
+            warn(
+                f"geometry: {after[g]:.3g} m^2 are new, of {new.group_names[g]!r}, a material that nobody knows: it is taken for "
+                "what surfaces are before any measurement; name it after one of ITU-R P.2040, or use with_objects(materials=)"
             )
-    for k in np.flatnonzero(before - after > np.maximum(LOST[0] * before, LOST[1])):
+    lost_share, lost_m2 = 0.02, 0.01  # of a material's area, whose loss is worth a warning
+    for k in np.flatnonzero(before - after > np.maximum(lost_share * before, lost_m2)):
         what = f"of {before[k]:.3g} m^2 of the fitted surface {old.group_names[k]!r}"
-        _warn(f"{what}, {before[k] - after[k]:.3g} m^2 have vanished")
+        warn(f"geometry: {what}, {before[k] - after[k]:.3g} m^2 have vanished")
     return parts
 
 
@@ -134,14 +130,11 @@ def _of_material(material: Material, frequency_hz: float, lobes: tuple[int, ...]
     )
     root = np.sqrt(material.permittivity(frequency_hz))
     reflected = min(abs((1.0 - root) / (1.0 + root)), 1.0 - 1e-6)
-    excess = np.clip(((1.0 + reflected) / (1.0 - reflected)) ** 2 - 1.0, 1e-6, MOST_EXCESS)
+    of_conductor = 1e6
+    excess = np.clip(((1.0 + reflected) / (1.0 - reflected)) ** 2 - 1.0, 1e-6, of_conductor)
     mirrored = np.log(max(1.0 - scattered, np.exp(-MOST_NEPERS)))
     return Parameters(weight, np.log([excess]), np.array([mirrored]), lobes)
 
 
 def _some(names: Sequence[str]) -> str:
     return ", ".join(map(repr, names[:20])) + " ..." * (len(names) > 20)
-
-
-def _warn(text: str) -> None:
-    warnings.warn(f"geometry: {text}", UserWarning, stacklevel=users_level())

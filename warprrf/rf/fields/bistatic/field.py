@@ -19,7 +19,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,14 +27,15 @@ from numpy.typing import ArrayLike
 from warprrf.cache import Cache
 from warprrf.checks import (
     Expected,
+    NotNegative,
     check_array,
     check_arrays,
     check_count,
-    check_number,
     check_type,
     checked,
     index_to,
     one_line,
+    whole,
 )
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
@@ -51,7 +52,7 @@ from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, links, receivers_at
 from warprrf.rf.fields.bistatic.links import SHAPE as LINK_SHAPE
 from warprrf.rf.fields.bistatic.locate import locate
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, read
-from warprrf.rf.fields.bistatic.needs import assumed
+from warprrf.rf.fields.bistatic.needs import assumed, evenly
 from warprrf.rf.fields.bistatic.observations import (
     Observation,
     Place,
@@ -64,12 +65,12 @@ from warprrf.rf.fields.bistatic.observations import (
 from warprrf.rf.fields.bistatic.options import SUB_PIXELS, FitOptions
 from warprrf.rf.fields.bistatic.paths import paths_of, strongest
 from warprrf.rf.fields.bistatic.suggest import SHAPE as SUGGEST_SHAPE
-from warprrf.rf.fields.bistatic.suggest import Pointings, Sensitivity, Unknowns, suggest
+from warprrf.rf.fields.bistatic.suggest import Sensitivity, Unknowns, suggest
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
 from warprrf.rf.fields.location import Location
 from warprrf.rf.maps.links import LinkOptions
 from warprrf.rf.paths.path_set import Paths
-from warprrf.rf.spectra.antenna import Pattern
+from warprrf.rf.spectra.antenna import Antenna, Pattern
 from warprrf.rf.spectra.beam import BeamOperator, beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import antenna_of, check_turned
@@ -121,7 +122,7 @@ class BistaticField(RadioField):
     material: np.ndarray = field(repr=False)
     residual: np.ndarray = field(repr=False)
     errors: ErrorModel | None = field(default=None, repr=False)
-    sub_pixels: int = SUB_PIXELS
+    sub_pixels: Annotated[int, whole(1, 16)] = SUB_PIXELS
     air: Air | None = None
     fitted_on: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
     fitted_under: np.ndarray | None = field(default=None, repr=False)
@@ -133,7 +134,6 @@ class BistaticField(RadioField):
     def __post_init__(self) -> None:
         super().__post_init__()
         sizes = {"G": self.surface.groups, "L": len(self.parameters.lobes), "X": self.surface.cells}
-        check_count("sub_pixels", self.sub_pixels, 1, 16)
         check_arrays(vars(self.parameters), PARAMETER_ARRAYS, **sizes)
         check_arrays(vars(self), _ARRAYS, **sizes)
         materials = int(self.material.max()) + 1
@@ -211,15 +211,12 @@ class BistaticField(RadioField):
         ends = ends[np.sort(np.unique(ends, axis=0, return_index=True)[1])]
         receivers = ends[(ends[:, :3] == frame.transmitter).all(axis=1), 3:]
         fitted = replace(
-            cls.prior(found.surface, frame, effects=found.model.effects, sub_pixels=chosen.rays, device=device),
-            parameters=replace(found.model.parameters, log_gains=np.zeros(0)), residual=found.model.residual,
-            material=found.material, errors=found.errors, report=found.report, fitted_on=ends[:, 3:],
-            fitted_under=ends[:, :3],
+            cls.prior(found["surface"], frame, sub_pixels=chosen.rays, device=device),
+            **found, fitted_on=ends[:, 3:], fitted_under=ends[:, :3],
         )  # fmt: skip
         if any(isinstance(one, SpectrumDataset) for one in data):
             return fitted
-        places = receivers[np.linspace(0, len(receivers) - 1, min(len(receivers), 8)).astype(int)]
-        gains = np.stack([fitted.spectrum(place).path_gain for place in places])
+        gains = np.stack([fitted.spectrum(place).path_gain for place in evenly(receivers, 8)])
         floor = default_floor(gains)
         return replace(
             fitted, floor=floor, range_db=(10.0 * float(np.log10(floor)), float(to_db(gains.max(), floor)))
@@ -234,15 +231,8 @@ class BistaticField(RadioField):
         frame = frame_of(data)
         effects = replace(o.candidates(frame.frequency_hz)[:2][-1], residual=False)
         lobes = o.exponents(frame.frequency_hz)
-        prior = cls.prior(
-            geometry,
-            frame,
-            effects=effects,
-            lobes=lobes,
-            reciprocal=o.reciprocal,
-            sub_pixels=o.rays,
-            device=device,
-        )
+        known: dict[str, Any] = {"reciprocal": o.reciprocal, "sub_pixels": o.rays, "device": device}
+        prior = cls.prior(geometry, frame, effects=effects, lobes=lobes, **known)
         places_of(data, prior.mesh, device)
         own = assumed(prior.surface, prior.frequency_hz)
         parameters = replace(prior.parameters, log_excess=own.log_excess)
@@ -461,7 +451,7 @@ class BistaticField(RadioField):
         directions: ArrayLike,
         transmitter: ArrayLike | None = None,
         *,
-        length_std_m: float = 0.0,
+        length_std_m: NotNegative = 0.0,
     ) -> np.ndarray:
         """Angular spectrum |a^H h|^2 / M^2 of a coherent array at every receiver, in expectation over the phases of what
         is scattered; see :class:`ArraySpectra`.
@@ -479,11 +469,10 @@ class BistaticField(RadioField):
             TypeError, ValueError: as for :meth:`spectrum`, and naming the argument.
         """
         steered = check_steering(array, directions)
-        std = check_number("length_std_m", length_std_m, 0.0)
         ends, found = self.check_positions(receivers, transmitter), []
         for receiver, source in zip(ends.receivers, ends.transmitters, strict=True):
             view = self._view(receiver, source)
-            image = ArrayImage.of(view, array, steered.reshape(-1, 3), std)
+            image = ArrayImage.of(view, array, steered.reshape(-1, 3), length_std_m)
             found.append(np.maximum(read(self.path_gains(view), image), 0.0).reshape(steered.shape[:-1]))
         return np.asarray(ends.shaped(np.stack(found)))
 
@@ -535,17 +524,17 @@ class BistaticField(RadioField):
         given = check_array("candidates", candidates, (None, 3))
         places = self.check_positions(given, name="candidates").receivers
         check_count("n", n, 1, len(places))
-        pointings = None
+        turned = antenna = None
         if (arrival is None) != (receive_pattern is None):
             raise ValueError(
                 "receive_pattern: it goes with arrival, got one of the two; expected both or neither"
             )
         if arrival is not None and receive_pattern is not None:
-            angles = check_turned("arrival", arrival, len(places))
-            pointings = Pointings(angles, antenna_of("receive_pattern", receive_pattern))
-        sensitivity, unknowns = self._sensitivity(self.transmitter)
+            turned = check_turned("arrival", arrival, len(places))
+            antenna = antenna_of("receive_pattern", receive_pattern)
+        sensitivity, unknowns = self._sensitivity(antenna)
         return suggest(
-            sensitivity, unknowns, places, n, measured=self.fitted_on, pointings=pointings, progress=progress
+            sensitivity, unknowns, places, n, measured=self.fitted_on, turned=turned, progress=progress
         )
 
     def locate(
@@ -561,15 +550,15 @@ class BistaticField(RadioField):
     def gain_std_db(self, progress: Progress | None = None) -> np.ndarray:
         """How far the gain of what each element of the surface scatters is known after spectra at ``fitted_on``: standard
         deviation [dB], shape ``(E,)``; see :mod:`warprrf.rf.fields.bistatic.suggest`."""
-        sensitivity, unknowns = self._sensitivity(self.transmitter)
+        sensitivity, unknowns = self._sensitivity()
         variance = unknowns.variance(sensitivity.precision(self.fitted_on, progress=progress))
         return NEPER * np.sqrt(variance[: len(self.surface.element_area)])
 
-    def _sensitivity(self, transmitter: np.ndarray) -> tuple[Sensitivity, Unknowns]:
-        tracer = self.tracer(transmitter)
+    def _sensitivity(self, antenna: Antenna | None = None) -> tuple[Sensitivity, Unknowns]:
+        tracer = self.tracer()
         materials, tracer = self.materials_of(tracer), tracer.on_grid(SUGGEST_SHAPE, 1)
         floor = self.floor * np.prod(self.shape) / np.prod(SUGGEST_SHAPE)
-        return Sensitivity(tracer, self.state, materials, floor), Unknowns.of(tracer, self.material)
+        return Sensitivity(tracer, self.state, materials, floor, antenna), Unknowns.of(tracer, self.material)
 
     def _link_work(self, options: LinkOptions) -> tuple[Work, int]:
         effects, shape = self.effects, options.shape or LINK_SHAPE
@@ -600,10 +589,8 @@ class BistaticField(RadioField):
         slopes = np.float32(self.parameters.gain) * slopes
         power = image.ravel() / self.floor
         if len(self.errors.covariance) > layout.size:  # of a common gain
-            slopes, index = (
-                np.concatenate([slopes, power[None].astype(np.float32)]),
-                np.append(index, layout.size),
-            )
+            slopes = np.concatenate([slopes, power[None].astype(np.float32)])
+            index = np.append(index, layout.size)
         slopes *= (NEPER / (1.0 + power)).astype(np.float32)
         return self.errors.std_db(
             NEPER * np.log1p(power).reshape(image.shape), view.receivers[0], slopes, index

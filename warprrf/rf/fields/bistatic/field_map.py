@@ -37,11 +37,6 @@ SPACING_M = 0.5
 PIXELS = SHAPE[0] * SHAPE[1]
 BLUR_RAD = np.radians(7.0)
 """Of the beam through which spectra are compared: sharp peaks become wide valleys. Half the spacing at 3 m is 5 degrees."""
-TURNS = 120  # azimuths' zeros that are tried
-MOST_DIRECTIONS = 400  # of an array's spectrum
-COARSE_HZ, COARSE_DB = 0.5e9, 30.0  # bandwidth and range of profiles: a tap is 60 cm long
-MOST_POINTINGS = 24  # of antennas, where delays or departures are told apart
-CLEARANCE_M = 0.1  # of its places from surfaces
 VARIABLES = {
     "image": Variable(("receiver", "zenith", "azimuth"), "1"),
     "length": Variable(("receiver", "zenith", "azimuth"), "m"),
@@ -121,12 +116,13 @@ def maps_of(
 
 
 def lattice(mesh: Mesh, transmitter: np.ndarray, device: Any, spacing_m: float = SPACING_M) -> np.ndarray:
-    """Places in the air of ``transmitter`` (3,), ``spacing_m`` apart [m], shape ``(P, 3)``."""
+    """Places in the air of ``transmitter`` (3,), off surfaces, ``spacing_m`` apart [m], shape ``(P, 3)``."""
+    clearance_m = 0.1
     low, high = mesh.bounds
     axes = [np.arange(a + 0.5 * spacing_m, b, spacing_m) for a, b in zip(low, high, strict=True)]
     every = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    far = np.linalg.norm(every - transmitter, axis=1) > CLEARANCE_M
-    return every[far][is_free(mesh, every[far], transmitter, clearance_m=CLEARANCE_M, device=device)]
+    far = np.linalg.norm(every - transmitter, axis=1) > clearance_m
+    return every[far][is_free(mesh, every[far], transmitter, clearance_m=clearance_m, device=device)]
 
 
 def _mapped(bistatic: Any, part: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
@@ -187,11 +183,8 @@ are under it and what its map gives (P, M) [dB]; of those M the column of each r
 
 def _spectrum(one: SpectrumDataset, maps: dict[bytes, FieldMap], *_: Any) -> Rough:
     own = np.ravel_multi_index(pixel_of(pixel_directions(one.shape), SHAPE), SHAPE).ravel()
-    gain, m, blur = (
-        one.path_gain[0].astype(float).ravel(),
-        maps[one.transmitter.tobytes()],
-        beam_operator(SHAPE, BLUR_RAD),
-    )
+    gain, m = one.path_gain[0].astype(float).ravel(), maps[one.transmitter.tobytes()]
+    blur = beam_operator(SHAPE, BLUR_RAD)
     power, measured = (
         blur(np.bincount(own, value, PIXELS).reshape(SHAPE)).ravel()
         for value in (np.nan_to_num(gain), np.isfinite(gain) * 1.0)
@@ -199,34 +192,22 @@ def _spectrum(one: SpectrumDataset, maps: dict[bytes, FieldMap], *_: Any) -> Rou
     smaller = len(gain) / PIXELS
     kept = np.flatnonzero(measured > 0.9 * smaller)  # elsewhere nothing was measured
     table = m.decibels("blurred", lambda: blur(np.moveaxis(m.image, 0, -1)).reshape(PIXELS, -1).T)
-    return (
-        power[kept],
-        np.full(len(kept), one.floor * smaller),
-        None,
-        [(np.arange(len(kept)), table)],
-        kept[None],
-        np.zeros(1),
-    )
+    floor, parts = np.full(len(kept), one.floor * smaller), [(np.arange(len(kept)), table)]
+    return power[kept], floor, None, parts, kept[None], np.zeros(1)
 
 
 def _array(one: ArraySpectra, maps: dict[bytes, FieldMap], chains: Sequence[str]) -> Rough:
     """An array's beams hear powers: how paths' phases add up is left to the exact search."""
     toward, pixels = one.directions.reshape(-1, 3), pixel_directions(SHAPE).reshape(-1, 3)
-    kept = np.flatnonzero(np.isfinite(one.power[0].ravel()))
-    kept = kept[np.unique(np.linspace(0, len(kept) - 1, min(len(kept), MOST_DIRECTIONS)).astype(int))]
+    kept, most = np.flatnonzero(np.isfinite(one.power[0].ravel())), 400  # directions
+    kept = kept[np.unique(np.linspace(0, len(kept) - 1, min(len(kept), most)).astype(int))]
     heard = (
         one.array.response(toward[kept], 1.0).conj() @ one.array.response(pixels, 1.0).T / one.array.elements
     )
     table = maps[one.transmitters[0].tobytes()].weighed(np.abs(heard) ** 2 * one.array.gain(pixels))
     every, chain = np.arange(len(kept)), np.full(len(kept), len(chains)) if one.relative else None
-    return (
-        one.power[0].ravel()[kept],
-        np.full(len(kept), one.floor),
-        chain,
-        [(every, table)],
-        every[None],
-        np.zeros(1),
-    )
+    floor = np.full(len(kept), one.floor)
+    return one.power[0].ravel()[kept], floor, chain, [(every, table)], every[None], np.zeros(1)
 
 
 def _table(one: Readings, maps: dict[bytes, FieldMap], chains: Sequence[str]) -> Rough:
@@ -239,11 +220,12 @@ def _table(one: Readings, maps: dict[bytes, FieldMap], chains: Sequence[str]) ->
         ask["arrival"], columns = np.unique(one.arrival, axis=0, return_inverse=True)
         columns = columns.reshape(1, -1)
     elif one.arrival is not None:
-        turns = 2.0 * np.pi / TURNS * np.arange(TURNS)
+        count = 120  # zeros that are tried, 3 degrees apart: half the width of a pixel
+        turns = 2.0 * np.pi / count * np.arange(count)
         zenith, row = np.unique(one.arrival[:, 0], return_inverse=True)
         turn = np.round(one.arrival[:, 1] / turns[1]).astype(int)
-        columns = TURNS * row.reshape(-1) + (turn + np.arange(TURNS)[:, None]) % TURNS
-        ask["arrival"] = np.column_stack([np.repeat(zenith, TURNS), np.tile(turns, len(zenith))])
+        columns = count * row.reshape(-1) + (turn + np.arange(count)[:, None]) % count
+        ask["arrival"] = np.column_stack([np.repeat(zenith, count), np.tile(turns, len(zenith))])
     count = int(columns.max()) + 1
     ask |= {
         "transmitters": one.transmitters[0],
@@ -260,31 +242,32 @@ def _table(one: Readings, maps: dict[bytes, FieldMap], chains: Sequence[str]) ->
 
 
 def coarse(one: Measured) -> Measured:
-    """Profiles of delay as a sounder of :data:`COARSE_HZ` reads them, half a tap apart, with a Hann window and
-    :data:`COARSE_DB` of range; anything else as it is.
+    """Profiles of delay as a sounder of 0.5 GHz reads them, half a tap of 60 cm apart, with a Hann window and 30 dB of range;
+    anything else as it is.
 
     Taps of gigahertz are shorter than a lattice's spacing: a place's neighbours would be no more like it than any other.
     """
+    coarse_hz, range_db = 0.5e9, 30.0
     if (
         not isinstance(one, Readings)
         or one.delay_s is None
-        or float(one.bandwidth_hz or 0.0) < 2.0 * COARSE_HZ
+        or float(one.bandwidth_hz or 0.0) < 2.0 * coarse_hz
     ):
         return one
     one = one.subset(np.isfinite(one.power))
-    delay, wider = np.asarray(one.delay_s), float(one.bandwidth_hz or 0.0) / COARSE_HZ
+    delay, wider = np.asarray(one.delay_s), float(one.bandwidth_hz or 0.0) / coarse_hz
     power, floor, kept = np.empty(len(one)), np.empty(len(one)), list[np.ndarray]()
     heard = np.where(one.power > one.floor, one.power, 0.0)  # floors would add up to what looks like power
     own = _pointing(one, np.unique(np.asarray(one.chain), return_inverse=True)[1].reshape(-1))
     for rows in (np.flatnonzero(own == k) for k in range(own.max() + 1)):
-        near = tap_share(COARSE_HZ * (delay[rows, None] - delay[rows]), "hann")
+        near = tap_share(coarse_hz * (delay[rows, None] - delay[rows]), "hann")
         near *= wider / near.sum(axis=1, keepdims=True)
         power[rows], floor[rows] = near @ heard[rows], near @ np.asarray(one.floor)[rows]
-        kept.append(rows[np.unique(np.round(2.0 * COARSE_HZ * delay[rows]), return_index=True)[1]])
+        kept.append(rows[np.unique(np.round(2.0 * coarse_hz * delay[rows]), return_index=True)[1]])
     some = np.sort(np.concatenate(kept))
-    least = np.maximum(floor, 10.0 ** (-COARSE_DB / 10.0) * power.max())[some]
+    least = np.maximum(floor, 10.0 ** (-range_db / 10.0) * power.max())[some]
     told: dict[str, Any] = {"power": np.maximum(power[some], least), "floor": least}
-    return replace(one.subset(some), **told, bandwidth_hz=COARSE_HZ, window="hann")
+    return replace(one.subset(some), **told, bandwidth_hz=coarse_hz, window="hann")
 
 
 def _pointing(one: Readings, *more: np.ndarray) -> np.ndarray:
@@ -296,8 +279,8 @@ def _pointing(one: Readings, *more: np.ndarray) -> np.ndarray:
 def _profiles(one: Readings, maps: dict[bytes, FieldMap], chains: Sequence[str]) -> Rough:
     """Readings by departure, or by delay, those of some of the pointings."""
     one = one.subset(np.isfinite(one.power))
-    pointing = _pointing(one)
-    few = np.isin(pointing, np.linspace(0, pointing.max(), MOST_POINTINGS).astype(int))
+    pointing, most = _pointing(one), 24  # each is a table of its own
+    few = np.isin(pointing, np.linspace(0, pointing.max(), most).astype(int))
     one, pointing = one.subset(few), pointing[few]
     used = [maps[source.tobytes()] for source in np.unique(one.transmitters, axis=0)]
     toward, step = pixel_directions(SHAPE).reshape(-1, 3), 0.25 * SPACING_M

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -22,22 +22,20 @@ from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import Data, Measured
 from warprrf.rf.fields.bistatic.gauss_newton import Solution, gauss_newton
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, read
-from warprrf.rf.fields.bistatic.merging import BY_SHAPE, Merging, merge
+from warprrf.rf.fields.bistatic.merging import merge
 from warprrf.rf.fields.bistatic.needs import RARE, evenly
-from warprrf.rf.fields.bistatic.observations import Place, as_list, frame_of, places_of
+from warprrf.rf.fields.bistatic.observations import Place, Seen, as_list, frame_of, places_of
 from warprrf.rf.fields.bistatic.options import FitOptions
 from warprrf.rf.fields.bistatic.placing import moved, position_offset, with_zeros
-from warprrf.rf.fields.bistatic.report import covariance_of, left_out, report_of, warn
+from warprrf.rf.fields.bistatic.report import covariance_of, left_out, report_of, warn_of
 from warprrf.rf.fields.bistatic.residual import fit_residual, shares_of
 from warprrf.rf.fields.bistatic.training import (
     FEW,
     MERGES,
     MOST_KEPT,
     MOST_TO_CHOOSE,
-    Choice,
     Split,
     Training,
-    TrainingViews,
     rays_of,
     trace,
 )
@@ -46,30 +44,10 @@ from warprrf.rf.positions import warn_of_unmodelled
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.tracing.model import SETS, Effects, Model
 from warprrf.rf.tracing.render import path_gains
-from warprrf.rf.tracing.surface import Surface
 
-LEAST_HELD_OUT = 2
-"""Receivers held out below which they choose no effects: one alone likes what others do not."""
-MOST_TO_JUDGE = 200
-"""Receivers that the residual is learned from to judge it: more make it no worse."""
 SHORT_STEPS = 10  # of a fit that only decides about something
-BETTER, MUCH_BETTER = 0.995, 0.8
-"""Share to which further effects must lower the mean square error of receivers held out; to which single bounces must lower
-it where receivers are too few to hold any out."""
-CLEARLY_WORSE, NOT_MUCH_WORSE = 1.05, 1.25
-"""Share to which the residual may raise it (one that is learned from all receivers gains more), and to which fewer materials
-may that describe the training receivers better."""
-
-
-@dataclass(frozen=True)
-class FitResult:
-    """What a field is made of, and a report."""
-
-    surface: Surface
-    model: Model
-    material: np.ndarray
-    errors: ErrorModel | None
-    report: dict[str, Any]
+BETTER = 0.995
+"""Share to which further effects must lower the mean square error of receivers held out."""
 
 
 def fit(
@@ -80,8 +58,9 @@ def fit(
     client: Any = None,
     device: DeviceLike = None,
     progress: Progress | None = None,
-) -> FitResult:
-    """Fit a model to what ``ds`` holds; arguments and errors as for :meth:`BistaticField.fit`."""
+) -> dict[str, Any]:
+    """The parts of a bistatic field that a fit to what ``ds`` holds finds, by the names of its attributes; arguments and errors
+    as for :meth:`BistaticField.fit`."""
     data, mesh = as_list(ds), as_mesh(geometry, "geometry")
     for one in data:
         if isinstance(one, SpectrumDataset) and len(one) and not (one.path_gain > one.floor).any():
@@ -97,28 +76,30 @@ def fit(
     look = partial(trace, geometry, sub_pixels=options.rays, client=client, device=device, progress=progress)
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
     with threadpool_limits(1, user_api="blas"):
-        t, found, zeros = _learned(data, places, look, options, progress)
-        offsets = _offsets(t, found)
+        t, model, found, zeros = _learned(data, places, look, options, progress)
+        offsets = _offsets(t, model)
         if offsets:
             data = [moved(one, offsets[k]) if k in offsets else one for k, one in enumerate(t.data)]  # type: ignore[arg-type]
             places = places_of(data, mesh, device)
-            t, found, _ = _learned(data, places, look, options, progress)
-    warn(t.data, found.report)
+            t, model, found, _ = _learned(data, places, look, options, progress)
+    report = found["report"]
+    warn_of(t.data, report)
     places_moved = {
         t.names[k]: [(place.receiver.tolist(), offset.tolist()) for place, offset in own]
         for k, own in offsets.items()
     }
-    return replace(found, report=found.report | zeros | {"position_offset_m": places_moved})
+    parameters = replace(model.parameters, log_gains=np.zeros(0))  # chains are of the data, not of the field
+    return found | {"parameters": parameters, "report": report | zeros | {"position_offset_m": places_moved}}
 
 
 def _learned(
     data: Sequence[Measured],
     places: Sequence[Place],
-    look: Callable[..., TrainingViews],
+    look: Callable[..., tuple[list[Seen], Effects]],
     options: FitOptions,
     progress: Progress | None,
-) -> tuple[Training, FitResult, dict[str, dict[str, float]]]:
-    """All steps of a fit: what it learned from, what it found, and what :func:`with_zeros` found.
+) -> tuple[Training, Model, dict[str, Any], dict[str, dict[str, float]]]:
+    """All steps of a fit: what it learned from, the model, all else of a field that it found, and what :func:`with_zeros` did.
 
     With many receivers some decide about effects and materials; what the others see is traced with those effects alone.
     """
@@ -127,45 +108,55 @@ def _learned(
     candidates = options.candidates(frame_of(data).frequency_hz)
     sought = candidates[0] if len(candidates) == 1 else None
     decides = options.effects == "auto" and options.relevance is None
-    views = look(data, only=split.deciding, effects=sought, decides=decides)
-    data, zeros = with_zeros(data, views.places, views.views)
-    t = Training.of(views, split, data, options, rng, progress)
-    del views  # and with them records, once the training has none
+    started = time.perf_counter()
+    seen, sought = look(data, only=split.deciding, effects=sought, decides=decides)
+    tracing_s = time.perf_counter() - started
+    data, zeros = with_zeros(data, seen)
+    t = Training.of(seen, sought, split, data, options, rng, progress)
+    del seen  # and with them records, once the training has none
     started = time.perf_counter()
     choice = choose(t)
     others = np.setdiff1d(np.arange(len(places)), list(t.observations))
     if len(others):
         keeps = rays_of(places, options.rays) <= MOST_KEPT
         t = t if keeps else t.without_records()
-        more = look(data, only=others, effects=choice.effects, decides=False, keeps=keeps)
+        again = time.perf_counter()
+        more, _ = look(data, only=others, effects=choice.effects, decides=False, keeps=keeps)
+        tracing_s += time.perf_counter() - again
         t = t.and_at(others, more, rng)
     residual, errors = cross_validate(t, choice)
     choice, model = everyone(t, choice, residual)
-    wrong = t.unexplained(model)
-    if wrong.rows:
-        t = t.without(wrong.rows)
+    wrong, noise_db = t.unexplained(model)
+    if wrong:
+        t = t.without(wrong)
         choice, model = everyone(t, choice, residual)
     if errors is not None:
         errors = replace(errors, covariance=covariance_of(t, choice))
     missed = left_out(t, model)
-    report = report_of(t, choice, wrong, time.perf_counter() - started) | {"left_out": missed}
+    seconds = {"transport_time_s": tracing_s, "fit_time_s": time.perf_counter() - started}
+    report = report_of(t, choice, wrong, noise_db) | seconds | {"left_out": missed}
     t.step(last=True)
-    return t, FitResult(t.surface, model, choice.material, errors, report), zeros
+    found = {
+        "surface": t.surface, "effects": model.effects, "residual": model.residual, "material": choice.material,
+        "errors": errors, "report": report,
+    }  # fmt: skip
+    return t, model, found, zeros
 
 
-def choose(t: Training) -> Choice:
+def choose(t: Training) -> Solution:
     """Effects, and which groups are of one material."""
     material = t.surface.material
-    start = Solution(t.start(material), np.zeros((0, 0)), [])
-    trials = [Choice(effects, material, start) for effects in t.candidates]
-    if len(t.split.held) < (LEAST_HELD_OUT if len(trials) > 1 else 1):
+    start = t.start(material)
+    trials = [Solution(effects, material, start, np.zeros((0, 0)), []) for effects in t.candidates]
+    least_held = 2 if len(trials) > 1 else 1  # to choose effects by: one alone likes what others do not
+    if len(t.split.held) < least_held:
         return _choose_of_few(t, trials)
     best, least = None, np.inf
     for trial in trials:  # each holds the one before it: what is no better with some is not tried with more
         if best is None:
             trial = t.refined(trial, t.split.few(1), 2 * SHORT_STEPS, rounds=2)
         else:
-            trial = t.refined(replace(trial, solution=best.solution), t.split.few(1), SHORT_STEPS)
+            trial = t.refined(replace(best, effects=trial.effects), t.split.few(1), SHORT_STEPS)
         loss = t.held_loss(trial)
         kept = loss < BETTER * least
         t.note(_name(trial.effects), kept, loss)
@@ -180,7 +171,7 @@ def choose(t: Training) -> Choice:
     return best
 
 
-def _spared(t: Training, best: Choice, least: float) -> tuple[Choice, float]:
+def _spared(t: Training, best: Solution, least: float) -> tuple[Solution, float]:
     """``best`` and its loss without those of :data:`RARE` that readings are predicted better without: a scene may need what is
     not in its readings (a simulation without diffraction), or what its mesh shows wrongly. Places held out are too few to
     say so alone: none of them may be behind a wall."""
@@ -197,36 +188,38 @@ def _spared(t: Training, best: Choice, least: float) -> tuple[Choice, float]:
     return chosen, least if chosen is best else t.held_loss(chosen)
 
 
-def _choose_of_few(t: Training, trials: list[Choice]) -> Choice:
+def _choose_of_few(t: Training, trials: list[Solution]) -> Solution:
     """With too few receivers to hold any out: bounces as rooms have them, unless none fit much better."""
     if len(trials) == 1:
         return t.refined(trials[0], t.split.kept, t.options.iterations, rounds=2)
     single, room = (t.refined(trial, t.split.kept, t.options.iterations, rounds=2) for trial in trials[:2])
     models = [t.model(trial) for trial in (single, room)]
-    wrong, also = (t.unexplained(model).rows for model in models)
+    wrong, also = (t.unexplained(model)[0] for model in models)
     counted = t.without({k: np.intersect1d(rows, also[k]) for k, rows in wrong.items() if k in also})
     losses = [counted.loss(model, list(t.observations)) for model in models]
-    fewer = losses[0] < MUCH_BETTER * losses[1]
+    much_better = 0.8  # share to which single bounces must lower the error
+    fewer = losses[0] < much_better * losses[1]
     t.note(_name(single.effects), fewer, losses[0])
     t.note(_name(room.effects), not fewer, losses[1])
     return single if fewer else room
 
 
-def merged(t: Training, best: Choice, least: float) -> Choice:
+def merged(t: Training, best: Solution, least: float) -> Solution:
     """Materials by what the readings say, if that lowers the error of the places held out."""
-    trial, options = best, BY_SHAPE if t.surface.by_shape else Merging()
+    trial, by_shape = best, t.surface.by_shape
     problem = t.problem(best.effects, best.material, t.split.few(2), best.parameters)
     for _ in range(MERGES):
-        material, start = merge(problem, trial.parameters, t.surface.appearance, t.area, options)
+        material, start = merge(problem, trial.parameters, t.surface.appearance, t.area, by_shape=by_shape)
         # What surfaces get of each other changes little with who is of which material: it is held.
         problem = replace(problem, material=material, known_through=t.known_through(material))
-        trial = Choice(best.effects, material, gauss_newton(problem, start, SHORT_STEPS))
+        trial = gauss_newton(problem, start, SHORT_STEPS)
         t.step()
     loss = t.held_loss(trial)
     # Few receivers held out say little, fewer materials that describe the others better say much.
     same = len(t.split.kept) <= MOST_TO_CHOOSE  # receivers of both fits
-    simpler = same and trial.solution.losses[-1:] < best.solution.losses[-1:]
-    keep = loss < least or (simpler and loss < NOT_MUCH_WORSE * least)
+    simpler = same and trial.losses[-1:] < best.losses[-1:]
+    not_much_worse = 1.25
+    keep = loss < least or (simpler and loss < not_much_worse * least)
     t.note(f"{best.material.max() + 1} materials as {trial.material.max() + 1}", keep, loss)
     return trial if keep else best
 
@@ -237,7 +230,7 @@ def _name(effects: Effects) -> str:
     return (known or [str(effects)])[0]
 
 
-def cross_validate(t: Training, choice: Choice) -> tuple[bool, ErrorModel | None]:
+def cross_validate(t: Training, choice: Solution) -> tuple[bool, ErrorModel | None]:
     """Whether the residual is wanted, or does not clearly raise the error of places held out, and the errors that then
     remain: of those held out; where they are few, of all, held out in turn. No errors where no whole spectra were measured."""
     free = isinstance(t.options.effects, str) and choice.effects.residual
@@ -247,9 +240,9 @@ def cross_validate(t: Training, choice: Choice) -> tuple[bool, ErrorModel | None
     tried = (False, True) if free else (choice.effects.residual,)
     power: dict[bool, list[np.ndarray]] = {residual: [] for residual in tried}
     order: list[int] = []
-    gaps = []
+    gaps, most_to_judge = [], 200  # receivers that a residual is learned from: more make it no worse
     for held in _folds(t):
-        kept = evenly(np.setdiff1d(np.arange(len(places)), held), MOST_TO_JUDGE)
+        kept = evenly(np.setdiff1d(np.arange(len(places)), held), most_to_judge)
         own = choice if held is t.split.held else t.refined(choice, kept, SHORT_STEPS)
         order += held.tolist()
         gaps += [np.linalg.norm(places[kept] - places[r], axis=1).min() for r in held]
@@ -263,7 +256,8 @@ def cross_validate(t: Training, choice: Choice) -> tuple[bool, ErrorModel | None
         )
         for residual, own in power.items()
     }
-    keep = loss[True] < CLEARLY_WORSE * loss[False] if free else choice.effects.residual
+    clearly_worse = 1.05  # one that is learned from all receivers gains more
+    keep = loss[True] < clearly_worse * loss[False] if free else choice.effects.residual
     for residual, error in loss.items():
         t.note("residual" if residual else "no residual", residual == keep, error)
     if not all(
@@ -288,7 +282,7 @@ def _folds(t: Training) -> list[np.ndarray]:
     return folds
 
 
-def everyone(t: Training, choice: Choice, residual: bool) -> tuple[Choice, Model]:
+def everyone(t: Training, choice: Solution, residual: bool) -> tuple[Solution, Model]:
     """The choice fitted to all places, and its model with the residual, if wanted."""
     choice = t.refined(choice, t.telling, t.options.iterations)
     model = t.model(choice, residual=residual)
@@ -302,13 +296,13 @@ def with_residual(t: Training, model: Model, places: Sequence[int] | np.ndarray)
     return replace(model, residual=fit_residual(shares, t.surface, quick=t.options.quick))
 
 
-def _offsets(t: Training, found: FitResult) -> dict[int, list[tuple[Place, np.ndarray]]]:
+def _offsets(t: Training, found: Model) -> dict[int, list[tuple[Place, np.ndarray]]]:
     """By data set of unknown positions its places, and how far each receiver is from where it is said to be [m]."""
     unsure = [
         k for k, o in t.observations.items() if getattr(t.data[o.place.data], "position_std_m", 0.0) > 0
     ]
     offsets: dict[int, list[tuple[Place, np.ndarray]]] = {}
-    for o, model, materials in t.evaluated(found.model, unsure):
+    for o, model, materials in t.evaluated(found, unsure):
         one = t.data[o.place.data]
         gains = path_gains(o.view, model, materials)
         total = np.maximum(read(gains, o.measured), 0.0) / o.floor

@@ -29,15 +29,6 @@ WEIGHT_STD, EXCESS_STD, MIRROR_STD = 2.0, 0.8, 1.5
 THROUGH_STD, KNOWN_THROUGH_STD = 1.5, 0.02
 """Those of the share let through from what it is before any measurement: where that is assumed, and of a slab of known thickness
 and permittivity. The latter is small because hundreds of pixels hold one path and err together."""
-ENERGY_STD = 0.25
-"""That of scattered and mirrored shares from a sum of one."""
-GAIN_STD, CHAIN_STD = 1.0, 10.0
-"""Those of the common gain and of a measuring chain's unknown gain from one [nepers]."""
-CARRIER_STD = 1.0
-"""That of the power of the carrier that roughness goes with, from Ament's 2."""
-LONGEST = 1.5  # change of a logarithm in one step
-SINGLE_SUM = 1024  # readings that are summed in single precision
-TOLERANCE = 1e-3  # relative fall of the objective that ends a fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +42,7 @@ class Problem:
         material: of each group, shape ``(G,)``.
         chains: measuring chains whose gain is unknown.
         gain_offset: whether a gain common to all paths is free.
-        energy: deviation of scattered and mirrored shares from a sum of one.
+        energy: standard deviation a priori of scattered and mirrored shares from a sum of one.
         known_through: ln of the share that materials let through before any measurement, and its deviation, shape ``(2, M)``; None
             for that of the start.
     """
@@ -62,7 +53,7 @@ class Problem:
     material: np.ndarray
     chains: int = 0
     gain_offset: bool = False
-    energy: float = ENERGY_STD
+    energy: float = 0.25
     known_through: np.ndarray | None = None
 
     @classmethod
@@ -130,14 +121,18 @@ class Problem:
 
 @dataclass(frozen=True)
 class Solution:
-    """Result of :func:`gauss_newton`.
+    """What was decided on, and what :func:`gauss_newton` found under it.
 
     Attributes:
-        parameters: the fitted parameters.
+        effects: what is modelled.
+        material: of each group, shape ``(G,)``.
+        parameters: of the materials.
         covariance: of the free ones (Laplace), shape ``(F, F)``; see :class:`Layout`.
         losses: objective after each step, per reading [dB^2].
     """
 
+    effects: Effects
+    material: np.ndarray
     parameters: Parameters
     covariance: np.ndarray
     losses: list[float]
@@ -157,6 +152,8 @@ def priors(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Residuals of the priors ``(K,)`` and their Jacobian ``(K, F)``: distance to the start, energy kept."""
     own = np.arange(layout.groups)
+    gain_std, chain_std = 1.0, 10.0  # of the common gain and a chain's unknown one from one [nepers]
+    carrier_std = 1.0  # of the power of the carrier that roughness goes with, from Ament's 2
     residuals, rows = [], []
 
     def add(values: np.ndarray, places: np.ndarray, slope: np.ndarray | float) -> None:
@@ -170,22 +167,16 @@ def priors(
     add((p.log_excess - start.log_excess) / EXCESS_STD, layout.excess(own), 1.0 / EXCESS_STD)
     add((p.log_mirror - start.log_mirror) / MIRROR_STD, layout.mirror(own), 1.0 / MIRROR_STD)
     if layout.through:
-        centre, std = (
-            (start.log_through, np.full(layout.groups, THROUGH_STD))
-            if known_through is None
-            else known_through
-        )
+        of_start = start.log_through, np.full(layout.groups, THROUGH_STD)
+        centre, std = of_start if known_through is None else known_through
         add((p.log_through - centre) / std, layout.let_through(own), 1.0 / std[:, None])
     if layout.gain:
-        add(np.array([p.log_gain / GAIN_STD]), np.array([layout.common_gain]), 1.0 / GAIN_STD)
+        add(np.array([p.log_gain / gain_std]), np.array([layout.common_gain]), 1.0 / gain_std)
     if layout.roughness:
-        add(
-            np.array([(p.roughness - ROUGHNESS) / CARRIER_STD]),
-            np.array([layout.carrier_power]),
-            1.0 / CARRIER_STD,
-        )
+        from_ament = np.array([(p.roughness - ROUGHNESS) / carrier_std])
+        add(from_ament, np.array([layout.carrier_power]), 1.0 / carrier_std)
     if layout.chains:
-        add(p.log_gains / CHAIN_STD, layout.first_chain + np.arange(layout.chains), 1.0 / CHAIN_STD)
+        add(p.log_gains / chain_std, layout.first_chain + np.arange(layout.chains), 1.0 / chain_std)
     shares = np.column_stack([p.weight, np.exp(p.log_mirror)])  # S^2 by lobes, and 1 - S^2
     places = np.column_stack([layout.weight(own), layout.mirror(own)])
     add((shares.sum(axis=1) - 1.0) / energy, places, shares / energy)
@@ -219,6 +210,7 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
         own = (batch.fit_loss(batch.gain(p, power) * power) for batch, _, power in problem.evaluated(p))
         return weight * sum(float(loss.sum()) for loss in own) + float((prior**2).sum())
 
+    longest, tolerance = 1.5, 1e-3  # change of a logarithm in a step; relative fall that ends the fit
     current = total(vector)
     for _ in range(steps):
         p = layout.unpack(vector, start)
@@ -229,7 +221,7 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
         improved = False
         for _ in range(8):
             move = solve(hessian + damping * np.diag(np.diag(hessian)), -gradient, assume_a="pos")
-            move = np.clip(move, -LONGEST, LONGEST)
+            move = np.clip(move, -longest, longest)
             value = total(vector + move)
             improved = value < current
             if improved:
@@ -244,20 +236,22 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
         vector, current = vector + move, value
         damping = max(damping * 0.3, 1e-6) if honest else damping * 3.0
         losses.append(current / weight / count)
-        if fall < TOLERANCE and honest and (np.abs(move) < LONGEST).all():
+        if fall < tolerance and honest and (np.abs(move) < longest).all():
             break
-    return Solution(layout.unpack(vector, start), np.linalg.inv(hessian), losses)
+    found, covariance = layout.unpack(vector, start), np.linalg.inv(hessian)
+    return Solution(problem.effects, problem.material, found, covariance, losses)
 
 
 def _normal_equations(problem: Problem, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Newton matrix and gradient of the data term."""
     hessian, gradient = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
+    some = 1024  # readings that are summed in single precision
     for batch, (error, table, index) in zip(problem.batches, problem.linearised(p, layout), strict=True):
         root = np.sqrt(huber(error, batch.huber_db)[1]) / NOISE_DB
         table *= root.astype(np.float32)
         square = np.zeros((len(index), len(index)))
-        for first in range(0, table.shape[1], SINGLE_SUM):  # their upper triangles
-            square += ssyrk(1.0, table[:, first : first + SINGLE_SUM].T, trans=1) if len(index) else 0.0
+        for first in range(0, table.shape[1], some):  # their upper triangles
+            square += ssyrk(1.0, table[:, first : first + some].T, trans=1) if len(index) else 0.0
         hessian[np.ix_(index, index)] += square
         gradient[index] += table @ (root * error).astype(np.float32)
     return np.triu(hessian) + np.triu(hessian, 1).T, gradient

@@ -34,32 +34,6 @@ from warprrf.rf.spectra.spectrum import Spectrum, pixel_solid_angles
 from warprrf.rf.tracing.render import PathGains, path_gains
 from warprrf.rf.tracing.tracer import Tracer
 
-STARTS = 2  # places of the lattice that are searched from; in a lobby the best one is within it of the truth
-STEPS = 4, 3  # most Gauss-Newton steps, first with single mirrors, then with all effects
-LONGER = 1.6
-"""Times a Gauss-Newton step, which goes about half the way where most errors count linearly; twice would be the most."""
-LONGEST_M, SHORTEST_M = 0.35, 3e-3  # steps: none is longer, and shorter ones are the last
-FIRST_DIFFERENCE_M, DIFFERENCE_M = 0.1, 0.04
-"""First and least: half of the last step between. Over shorter ones the noise of few rays looks like slopes."""
-TURN_RAD, CLOCK_M = 0.005, 0.01  # differences of the zeros of azimuths and of clocks
-SUB_PIXELS = (
-    1,
-    2,
-)  # square root of the rays a pixel, first and to the end: the noise of few rays moves the least loss
-SMOOTH = 3  # pixels of a spectrum that slopes are means over, along each axis: noise of slopes would pass for curvature
-HUBER = 1.0  # standard deviations
-LEAST_STD_DB = 2.0
-"""Of a pixel: where an edge stands some centimetres off, pixels that are known to tenths are wrong by ten decibels."""
-BLOCKS = 12
-"""Along each axis of a spectrum, whose errors hang together: what one edge in the wrong place spoils."""
-SPREAD = 4.0
-"""Of a spectrum's covariance: blocks are not all that hangs together. By 20 receivers of a lobby, none of them fitted to or tested:
-half of their squared errors were 4 times what blocks say."""
-GIVEN_UP = 2.0  # times the least loss of an earlier start: others are left where they leave more
-FOLLOWED = 1.4  # times the least loss: candidates are followed below
-SAME_M = 0.1  # candidates nearer than this are one
-SURE, EXPLAINED = 0.95, 4.0  # likelihood and misfit of a place that is known
-
 
 def as_data(field: Any, measured: Any) -> list[Measured]:
     """``measured`` as data sets of one place that nobody knows: receivers stand a metre beside their transmitters.
@@ -112,8 +86,9 @@ class Found:
 
     @property
     def threshold(self) -> float:
-        """Errors above it count linearly. It goes with all of them: far from the place most are large, and all slopes count."""
-        return HUBER * max(1.0, float(np.sqrt(np.mean(self.error**2))))
+        """Errors above it, of one standard deviation at least, count linearly. It goes with all of them: far from the place most
+        are large, and all slopes count."""
+        return max(1.0, float(np.sqrt(np.mean(self.error**2))))
 
     def loss(self, threshold: float) -> float:
         """Sum of squares, those above ``threshold`` counted linearly."""
@@ -125,8 +100,9 @@ class Found:
         return weighed.T @ self.rise, weighed.T @ self.error
 
     def near(self, others: Sequence[Found]) -> bool:
-        """Whether it is the same place as one of ``others``."""
-        return any(np.linalg.norm(self.unknown[:3] - other.unknown[:3]) < SAME_M for other in others)
+        """Whether it is the same place as one of ``others``, to a decimetre."""
+        same_m = 0.1
+        return any(np.linalg.norm(self.unknown[:3] - other.unknown[:3]) < same_m for other in others)
 
 
 class Question:
@@ -170,11 +146,14 @@ class Question:
             return None
         db = NEPER * np.log1p(np.nan_to_num(one.path_gain[0].astype(float)) / one.floor)
         known, area = self.field.errors, pixel_solid_angles(db.shape)[:, None]
-        std = np.maximum(known.table[bins(db)], LEAST_STD_DB) if known else np.full(db.shape, NOISE_DB)
+        # Where an edge stands some centimetres off, pixels that are known to tenths are wrong by ten decibels.
+        least_db = 2.0
+        std = np.maximum(known.table[bins(db)], least_db) if known else np.full(db.shape, NOISE_DB)
         return np.asarray(NOISE_DB / std * np.sqrt(area / area.mean())).ravel()
 
     def starts(self, maps: dict[bytes, FieldMap]) -> np.ndarray:
         """Unknowns at the places of a lattice that suit best and lie apart, shape ``(S, U)``."""
+        most = 2  # in a lobby the best one is within the spacing of the truth
         places = next(iter(maps.values())).places
         cost, gains, turn = np.zeros(len(places)), np.zeros((len(places), len(self.chains))), []
         for k, one in enumerate(self.coarse):
@@ -186,7 +165,7 @@ class Question:
         for p in np.argsort(cost, kind="stable"):
             if all(np.linalg.norm(places[p] - places[q]) > 1.2 * SPACING_M for q in chosen):
                 chosen.append(int(p))
-            if len(chosen) == STARTS:
+            if len(chosen) == most:
                 break
         return every[chosen]
 
@@ -203,8 +182,10 @@ class Question:
         here = unknown[None, :3]
         points = np.concatenate([here, beside(here[0], step_m)]) if near is None else here
         kinds, further, seen = kinds_of(self.moved(unknown, quick=quick)), {}, dict[Any, Any]()
+        turn_rad, clock_m = 0.005, 0.01  # differences of the zeros of azimuths and of clocks
+        smooth = 3  # pixels that a spectrum's slopes are means over: their noise would pass for curvature
         for j, k in enumerate(self.turned):
-            by = CLOCK_M if self.data[k].azimuth_known else TURN_RAD  # type: ignore[union-attr]
+            by = clock_m if self.data[k].azimuth_known else turn_rad  # type: ignore[union-attr]
             other = unknown + by * (np.arange(len(unknown)) == 3 + j)
             further[k] = 3 + j, by, kinds_of(self.moved(other, quick=quick))[k]
         errors, rises = [], []
@@ -234,7 +215,7 @@ class Question:
             if weight is not None:
                 image = rise.reshape(*place.shape, -1)
                 rise = uniform_filter(
-                    image, (SMOOTH, SMOOTH, 1), mode=("nearest", "wrap", "nearest")
+                    image, (smooth, smooth, 1), mode=("nearest", "wrap", "nearest")
                 ).reshape(rise.shape)
             errors.append(error)
             rises.append(rise)
@@ -250,9 +231,8 @@ class Question:
         tracer, model = f.tracer(place.transmitter), f.state
         if quick:
             model = replace(model, effects=replace(model.effects, mirrors=min(model.effects.mirrors, 1)))
-        few = self._tracers.setdefault(
-            (place.seen_from, quick), tracer.on_grid(place.shape, SUB_PIXELS[not quick])
-        )
+        sub_pixels = 1 if quick else 2  # to the end, because the noise of few rays moves the least loss
+        few = self._tracers.setdefault((place.seen_from, quick), tracer.on_grid(place.shape, sub_pixels))
         few.beam_sigma_rad = place.beam_sigma_rad
         return path_gains(few.view(points, model.effects), model, f.materials_of(tracer)).apart
 
@@ -261,23 +241,27 @@ class Question:
     ) -> Found:
         """From ``unknown`` (U,) to where errors are least; given up where after a step they leave more than ``most``. Slopes
         are at first those that were found ``near``, and hold as far about their place as they were taken over."""
-        damping, difference = 1e-3, FIRST_DIFFERENCE_M if quick else 2.0 * DIFFERENCE_M
+        # Half of the last step. Over shorter differences the noise of few rays looks like slopes.
+        least_difference_m, longest_m, shortest_m = 0.04, 0.35, 3e-3 * (3.0 if quick else 1.0)
+        # A Gauss-Newton step goes about half the way where most errors count linearly; twice would be the most.
+        longer, steps = 1.6, 4 if quick else 3
+        damping, difference = 1e-3, 0.1 if quick else 2.0 * least_difference_m
         now = self.errors(unknown, difference, quick=quick, near=near)
-        for _ in range(STEPS[0 if quick else 1]):
+        for _ in range(steps):
             threshold = now.threshold
             curvature, gradient = now.normal(threshold)
             diagonal = np.diag(curvature) + 1e-9 * np.trace(curvature)
-            step = -LONGER * np.linalg.solve(curvature + damping * np.diag(diagonal), gradient)
-            step *= min(1.0, LONGEST_M / max(float(np.linalg.norm(step[:3])), 1e-12))
+            step = -longer * np.linalg.solve(curvature + damping * np.diag(diagonal), gradient)
+            step *= min(1.0, longest_m / max(float(np.linalg.norm(step[:3])), 1e-12))
             while not self.field.mesh.visible(now.unknown[None, :3], (now.unknown + 1.1 * step)[None, :3])[0]:
                 step *= 0.5  # not through walls
             length = float(np.linalg.norm(step[:3]))
-            difference = float(np.clip(0.5 * length, DIFFERENCE_M, difference))
+            difference = float(np.clip(0.5 * length, least_difference_m, difference))
             holds = np.linalg.norm((now.unknown + step - now.sloped)[:3]) < now.step_m
             other = self.errors(now.unknown + step, difference, quick=quick, near=now if holds else None)
             better = other.loss(threshold) < now.loss(threshold)
             now, damping = (other, 0.2 * damping) if better else (now, max(1.0, 4.0 * damping))
-            if length < SHORTEST_M * (3.0 if quick else 1.0) or now.loss(threshold) > most:
+            if length < shortest_m or now.loss(threshold) > most:
                 break
         return now
 
@@ -289,12 +273,16 @@ class Question:
             return np.asarray(inverse * max(1.0, best.loss(threshold) / max(count - len(curvature), 1)))[
                 :3, :3
             ]
-        shape = self.places[0].shape  # blocks of pixels are independent (Liang and Zeger 1986)
-        row, column = np.indices(shape) * BLOCKS // np.array(shape)[:, None, None]
-        block = np.resize(BLOCKS * row + column, count)
+        # Blocks of pixels are independent (Liang and Zeger 1986): what one edge in the wrong place spoils hangs together.
+        shape, blocks = self.places[0].shape, 12  # along each axis
+        # Not all that hangs together: half of the squared errors of 20 receivers of a lobby, none of them fitted to or
+        # tested, were 4 times what blocks say.
+        spread = 4.0
+        row, column = np.indices(shape) * blocks // np.array(shape)[:, None, None]
+        block = np.resize(blocks * row + column, count)
         score = best.rise * (huber(best.error, threshold)[1] * best.error)[:, None]
         sums = np.stack([np.bincount(block, one) for one in score.T], axis=1)
-        return np.asarray(SPREAD * inverse @ (sums.T @ sums) @ inverse)[:3, :3]
+        return np.asarray(spread * inverse @ (sums.T @ sums) @ inverse)[:3, :3]
 
 
 def locate(
@@ -310,15 +298,16 @@ def locate(
 
 def search(question: Question, maps: dict[bytes, FieldMap]) -> Location:
     """From the lattice's best places to the candidates, and what is known of the likeliest."""
+    given_up, followed = 2.0, 1.4  # times the least loss: beyond, others are left, or not followed
     first, most = list[Found](), np.inf
     for start in question.starts(maps):
         first.append(question.descend(start, quick=True, most=most))
-        most = min(most, GIVEN_UP * first[-1].loss(first[-1].threshold))
+        most = min(most, given_up * first[-1].loss(first[-1].threshold))
     threshold = min(one.threshold for one in first)
     first.sort(key=lambda one: one.loss(threshold))
     least, found, rest = first[0].loss(threshold), list[Found](), list[Found]()
     for one in first:
-        if one.loss(threshold) >= FOLLOWED * least:
+        if one.loss(threshold) >= followed * least:
             rest.append(one)
         elif not one.near(first[: first.index(one)]):
             found.append(question.descend(one.unknown, quick=False, near=one if question.alike else None))
@@ -344,6 +333,7 @@ def search(question: Question, maps: dict[bytes, FieldMap]) -> Location:
     )
     likelihood /= likelihood.sum()
     covariance, misfit = question.covariance(best, threshold), float(np.sqrt(spread))
+    sure, explained = bool(likelihood[0] > 0.95), misfit < 4.0
     close = float(np.sqrt(np.trace(covariance))) < SPACING_M
     after: list[Any] = [question.data[k] for k in question.turned]
     zeros = list(zip(after, best.unknown[3:].tolist(), strict=False))
@@ -351,7 +341,7 @@ def search(question: Question, maps: dict[bytes, FieldMap]) -> Location:
     return Location(
         position=best.unknown[:3], covariance=covariance, candidates=np.stack([one.unknown[:3] for one in order]),
         likelihoods=likelihood, misfit=misfit,
-        known=bool(likelihood[0] > SURE and close and misfit < EXPLAINED and not question.narrow),
+        known=sure and close and explained and not question.narrow,
         gains_db=dict(zip(question.chains, gains, strict=True)),
         azimuth_zeros={one.name: by for one, by in zeros if not one.azimuth_known},
         clock_offsets_s={one.name: by / SPEED_OF_LIGHT for one, by in zeros if one.azimuth_known},

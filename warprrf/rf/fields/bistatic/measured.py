@@ -26,9 +26,6 @@ from warprrf.rf.tracing.render import PathGains
 from warprrf.rf.tracing.tracer import SPECULAR, View
 from warprrf.rows import Rows
 
-DEPARTURES = (60, 120)
-"""Rows and columns of the grid of departures that rays are told apart in, where a transmitter's pattern counts."""
-
 
 class Measurement(Protocol):
     """What is read of a receiver's path powers: rays are summed in B bins, and N readings are linear in those."""
@@ -197,7 +194,7 @@ class WeighedPaths:
         out /= np.maximum(length, 1e-9)[:, None]
         key = [ray // grid.sub_pixels**2 if arrival else np.zeros(len(ray), int)]
         if departure:
-            rows, columns = DEPARTURES
+            rows, columns = 60, 120  # of the grid of departures that rays are told apart in
             row = np.arccos(np.clip(out[:, 2], -1.0, 1.0)) / np.pi * rows
             column = (np.arctan2(out[:, 1], out[:, 0]) / (2.0 * np.pi) + 0.5) * columns
             key += [np.floor(row).astype(int), np.floor(column).astype(int)]

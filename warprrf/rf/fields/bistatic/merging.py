@@ -8,7 +8,7 @@ better goes over. Fewer parameters, and purer materials, are learned better from
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,29 +21,8 @@ from warprrf.rf.tracing.records import Materials
 from warprrf.rf.tracing.tracer import SPECULAR
 
 
-@dataclass(frozen=True)
-class Merging:
-    """What it takes to be of one material, in units of the fit's objective.
-
-    Attributes:
-        appearance_cost: of one unit of difference in appearance, squared.
-        join: rise that a material of its own must be worth.
-        move: fall that a group must bring to go over.
-    """
-
-    appearance_cost: float = 3.0
-    join: float = 30.0
-    move: float = 4.0
-
-
-BY_SHAPE = Merging(appearance_cost=1.0, join=15.0, move=30.0)
-"""For groups that only shapes tell apart: place and extent say less of a material than colour, a thing's parts more."""
-MOST_APPEARANCE = 9.0
-"""Largest squared difference of looks that counts: those that differ more tell no more."""
-
-
 def merge(
-    problem: Problem, p: Parameters, appearance: np.ndarray, area: np.ndarray, options: Merging
+    problem: Problem, p: Parameters, appearance: np.ndarray, area: np.ndarray, *, by_shape: bool = False
 ) -> tuple[np.ndarray, Parameters]:
     """Materials of the groups anew, shape ``(G,)``, numbered without gaps, and the parameters of those left.
 
@@ -52,14 +31,18 @@ def merge(
         p: parameters of the materials.
         appearance: of each group, shape ``(G, K)``; see :class:`warprrf.rf.tracing.surface.Surface`.
         area: of each group [m^2].
-        options: what it takes.
+        by_shape: whether only shapes tell groups apart.
     """
-    o, count, material = options, len(p.log_excess), problem.material
+    count, material = len(p.log_excess), problem.material
+    # In units of the objective: a squared difference of 1 in appearance; the rise that a material of its own must be worth;
+    # and the fall that a group must bring to go over. Place and extent say less of a material than colour, a thing's parts
+    # more.
+    appearance_cost, join, move = (1.0, 15.0, 30.0) if by_shape else (3.0, 30.0, 4.0)
     typical = _mean_appearance(appearance, material, area, count)
 
     # whole materials first, small ones before large ones
     cost = _costs(problem, p, material, np.arange(count))
-    cost += _appearance_cost(typical, typical, o)
+    cost += appearance_cost * _gaps(typical, typical)
     np.fill_diagonal(cost, np.inf)
     size = np.bincount(material, area, minlength=count)
     target = np.arange(count)
@@ -68,7 +51,7 @@ def merge(
         if touched[m]:
             continue
         k = int(np.where(target == np.arange(count), cost[m], np.inf).argmin())
-        if cost[m, k] < o.join:
+        if cost[m, k] < join:
             target[m] = k
             touched[k] = True  # what takes others in stays itself this time
     material = target[material]
@@ -76,12 +59,13 @@ def merge(
     # then single groups
     typical = _mean_appearance(appearance, material, area, count)
     alive = np.unique(material)
-    cost = _costs(problem, p, np.arange(len(material)), material) + _appearance_cost(appearance, typical, o)
+    cost = _costs(problem, p, np.arange(len(material)), material)
+    cost += appearance_cost * _gaps(appearance, typical)
     rows = np.arange(len(material))
     change = cost - cost[rows, material][:, None]
     change[:, np.setdiff1d(np.arange(count), alive)] = np.inf
     best = change.argmin(axis=1)
-    moves = change[rows, best] < -o.move
+    moves = change[rows, best] < -move
     material = np.where(moves, best, material)
     left, material = np.unique(material, return_inverse=True)
     return material.reshape(-1), p.take(left)
@@ -96,9 +80,11 @@ def _mean_appearance(
     return np.stack(sums, axis=1) / size[:, None]
 
 
-def _appearance_cost(appearance: np.ndarray, typical: np.ndarray, o: Merging) -> np.ndarray:
+def _gaps(appearance: np.ndarray, typical: np.ndarray) -> np.ndarray:
+    """Squared difference of each appearance from each typical one, shape ``(units, materials)``."""
     gap = ((appearance[:, None] - typical[None]) ** 2).sum(axis=2)
-    return o.appearance_cost * np.minimum(np.nan_to_num(gap, nan=MOST_APPEARANCE), MOST_APPEARANCE)
+    most = 9.0  # looks that differ more tell no more
+    return np.asarray(np.minimum(np.nan_to_num(gap, nan=most), most))
 
 
 def _costs(problem: Problem, p: Parameters, unit_of: np.ndarray, owner: np.ndarray) -> np.ndarray:

@@ -24,8 +24,6 @@ RARE: dict[str, dict[str, Any]] = {"transmission": {"transmissions": 3}, "diffra
 FEW = replace(SETS["single"], mirrors=2, residual=False)
 MOST_BLOCKED = 12
 """Blocked places at which effects are estimated."""
-NEEDED_DB = 0.25
-"""Change of the total gain, rms over those, from which an effect is modelled."""
 RAYS = (20, 40), 2
 """Grid and square root of the rays a pixel."""
 
@@ -40,8 +38,9 @@ def assumed(surface: Surface, frequency_hz: float) -> Parameters:
 
 
 def needed(effects: Effects, surface: Surface, places: Sequence[Place], device: DeviceLike = None) -> Effects:
-    """``effects`` with those of :data:`RARE` that raise the total path gain of blocked places by :data:`NEEDED_DB`, without the
+    """``effects`` with those of :data:`RARE` that raise the total path gain of blocked places by 0.25 dB rms, without the
     others."""
+    needed_db = 0.25
     by_transmitter: dict[tuple[bytes, float], list[Place]] = {}
     for place in places:
         by_transmitter.setdefault((place.transmitter.tobytes(), place.frequency_hz), []).append(place)
@@ -60,7 +59,7 @@ def needed(effects: Effects, surface: Surface, places: Sequence[Place], device: 
             changes[name] += (NEPER * np.log(np.maximum(after, 1e-300) / np.maximum(before, 1e-300))).tolist()
     off: dict[str, Any] = {key: 0 for on in RARE.values() for key in on}
     for name, found in changes.items():
-        if found and np.sqrt(np.mean(np.square(found))) > NEEDED_DB:
+        if found and np.sqrt(np.mean(np.square(found))) > needed_db:
             off |= RARE[name]
     return replace(effects, **off)
 

@@ -51,14 +51,10 @@ NOISE_DB = 3.0
 together (one misplaced edge), which a larger value stands for."""
 READINGS_SHAPE = (60, 120)
 """Rows and columns of the rays around a receiver of whom no spectrum is known, and of its field's spectra."""
-PIXELS_PER_LAG = 4
-"""Directions of an array's spectrum that a fit takes, per pair of elements that tells something of its own."""
 READING_ERROR_DB = 1.0
 """Standard deviation of what a field cannot explain of a reading without noise [dB]."""
-TOTAL_ERROR_DB = 0.5
-"""The same of all power of a place: errors of single directions average out."""
-HUBER_DB, WIDE_HUBER_DB = 3.0, 10.0  # see :class:`Observation`
-TAP_STEPS = 4.0  # that delays are told apart in, per tap
+HUBER_DB = 3.0  # see :class:`Observation`
+TAP_STEPS = 4.0  # that delays are told apart, and a clock is tried in, per tap
 
 
 def huber(error: np.ndarray, threshold: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -99,6 +95,10 @@ class Place:
         """All that the geometry seen there depends on."""
         ends = self.transmitter.tobytes(), self.receiver.tobytes()
         return *ends, self.frequency_hz, self.shape, self.beam_sigma_rad, self.air
+
+
+Seen = tuple[Place, View]
+"""A place, and what is seen there."""
 
 
 def as_list(data: Data) -> list[Measured]:
@@ -542,10 +542,12 @@ class _Tables(Kind):
         sight, steady = _shares(bare)
         bias, fading = fading_db(one.samples, steady)
         above = NEPER * np.log1p(one.power[rows] / floor * 10.0 ** (-bias / 10.0))
-        unexplained = TOTAL_ERROR_DB if one.total else READING_ERROR_DB
+        # Of all power errors of single directions average out.
+        unexplained = 0.5 if one.total else READING_ERROR_DB
         trust = NOISE_DB / np.hypot(np.hypot(unexplained, np.asarray(one.std_db)[rows]), fading)
         target = Target(above, trust, one.power[rows] <= floors)
-        huber_db = HUBER_DB if one.samples is None and not one.total else WIDE_HUBER_DB
+        wide_db = 10.0  # of what fades or is all power; see :class:`Observation`
+        huber_db = HUBER_DB if one.samples is None and not one.total else wide_db
         return replace(bare, target=target, sight=None if one.total else sight, huber_db=huber_db)
 
 
@@ -570,7 +572,7 @@ class _Arrays(Kind):
         measured = ArrayImage.of(view, one.array, one.directions.reshape(-1, 3), one.length_std_m)
         power = one.power[place.rows[0]].ravel()
         known = np.flatnonzero(np.isfinite(power))
-        most = PIXELS_PER_LAG * measured.steered.shape[1]
+        most = 4 * measured.steered.shape[1]  # for each pair of elements that tells something of its own
         if len(known) > most:
             known = known[np.round(np.linspace(0, len(known) - 1, most)).astype(int)]
         unit = 1.0
@@ -580,19 +582,13 @@ class _Arrays(Kind):
         target, chain = Target(NEPER * np.log1p(power[known] / one.floor)), OWN_GAIN if one.relative else -1
         bare = Observation(place, view, measured.part(known), target, unit * one.floor, chain)
         start = Parameters.prior(view.tracer.surface.groups)
-        materials, single = (
-            Materials(start, view.tracer.slabs, device=view.tracer.grid.device),
-            SETS["single"],
-        )
+        materials = Materials(start, view.tracer.slabs, device=view.tracer.grid.device)
+        single = SETS["single"]
         scattered = columns_of(bare, single, materials).power(start)
         total = scattered + bare.heard(single, materials)
         gain = bare.gain(start, total)
-        std_db = (
-            NEPER
-            * gain
-            * np.sqrt(scattered * np.maximum(2.0 * total - scattered, 0.0))
-            / (1.0 + gain * total)
-        )
+        spread = np.sqrt(scattered * np.maximum(2.0 * total - scattered, 0.0))
+        std_db = NEPER * gain * spread / (1.0 + gain * total)
         return replace(bare, target=target.trusted(NOISE_DB / np.hypot(NOISE_DB, std_db)), robust=True)
 
 
@@ -614,30 +610,22 @@ def chains_of(places: Sequence[Place]) -> list[str]:
 
 
 def observe(
-    data: Sequence[Measured],
-    places: Sequence[Place],
-    views: Sequence[View],
-    frequency_hz: float,
-    chains: Sequence[str],
+    data: Sequence[Measured], seen: Sequence[Seen], frequency_hz: float, chains: Sequence[str]
 ) -> list[Observation]:
-    """What was read at each of ``places``.
+    """What was read at places.
 
     Args:
         data: all data sets.
-        places: of these.
-        views: what is seen at each place.
+        seen: places of these.
         frequency_hz: carrier that a fit's parameters are of.
         chains: names of all measuring chains of unknown gain.
     """
     kinds, index = kinds_of(data), {name: k for k, name in enumerate(chains)}
     found = []
-    for place, view in zip(places, views, strict=True):
+    for place, view in seen:
         one = kinds[place.data].observe(place, view)
-        found.append(
-            replace(
-                one, chain=index.get(place.chain, one.chain), ratio=float(place.frequency_hz / frequency_hz)
-            )
-        )
+        chain = index.get(place.chain, one.chain)
+        found.append(replace(one, chain=chain, ratio=float(place.frequency_hz / frequency_hz)))
     return found
 
 

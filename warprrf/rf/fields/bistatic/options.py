@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Annotated, Any, Protocol, runtime_checkable
 
-from warprrf.checks import check_count, check_seed, checked
+from warprrf.checks import Seed, checked, whole
 from warprrf.rf.tracing.model import LOBES, SETS, Effects, Parameters
 
-SUB_PIXELS, QUICK_SUB_PIXELS = 3, 1
-"""Square roots of the rays per pixel."""
+SUB_PIXELS = 3
+"""Square root of the rays per pixel."""
 
 
 @runtime_checkable
@@ -46,22 +46,18 @@ class FitOptions:
     effects: Effects | str = "auto"
     lobes: tuple[int, ...] | None = None
     reciprocal: bool = False
-    sub_pixels: int | None = None
+    sub_pixels: Annotated[int, whole(1, 16)] | None = None
     quick: bool = False
     gain_offset: bool = False
-    iterations: int = 40
+    iterations: Annotated[int, whole(0)] = 40
     relevance: EffectsChoice | None = None
-    seed: int = 0
+    seed: Seed = 0
 
     def __post_init__(self) -> None:
-        check_count("iterations", self.iterations, 0)
-        check_seed(self.seed)
         if isinstance(self.effects, str) and self.effects not in ("auto", *SETS):
             raise ValueError(
                 f"effects: got {self.effects!r}, expected wr.Effects, or one of 'auto', {', '.join(map(repr, SETS))}"
             )
-        if self.sub_pixels is not None:
-            check_count("sub_pixels", self.sub_pixels, 1, 16)
         Parameters.prior(1, LOBES if self.lobes is None else self.lobes)
 
     def candidates(self, frequency_hz: float) -> list[Effects]:
@@ -89,4 +85,4 @@ class FitOptions:
     @property
     def rays(self) -> int:
         """Square root of the rays per pixel."""
-        return self.sub_pixels or (QUICK_SUB_PIXELS if self.quick else SUB_PIXELS)
+        return self.sub_pixels or (1 if self.quick else SUB_PIXELS)

@@ -14,9 +14,6 @@ from warprrf.rf.spectra.spectrum import angles_from_directions, strongest_rays
 from warprrf.rf.tracing.render import PathGains
 from warprrf.rf.tracing.tracer import View
 
-PATH_SHARE = 1.0 / 200.0
-"""A ray's part of the power that scattering brings to a pixel, at 64 rays a pixel and a beam of 3."""
-
 
 def paths_of(
     gains: PathGains, image: np.ndarray, floor: float, air: Air | None, max_paths: int | None
@@ -46,20 +43,16 @@ def paths_of(
     codes = np.zeros(over.shape[:2], np.int8)
     codes[:, 0] = SCATTER
     whole = np.isfinite(over[:, 0]).all(axis=1)
-    power, over, codes = (
-        power[whole] * (power.sum() / max(power[whole].sum(), 1e-300)),
-        over[whole],
-        codes[whole],
-    )
+    power = power[whole] * (power.sum() / max(power[whole].sum(), 1e-300))
     paths = Paths.from_points(
         view.tracer.transmitter,
         view.receivers[0],
-        np.concatenate([vertices, over]),
+        np.concatenate([vertices, over[whole]]),
         np.sqrt(np.concatenate([specular, power])).astype(complex),
         np.concatenate([found.kind[exact], np.full(len(power), "diffuse", dtype="<U7")]),
         view.tracer.frequency_hz,
         excess_m=np.concatenate([found.excess_m[exact], np.zeros(len(power))]),
-        interactions=np.concatenate([found.code[exact], codes]),
+        interactions=np.concatenate([found.code[exact], codes[whole]]),
     )
     order = np.argsort(-np.abs(paths.gain), kind="stable")[:max_paths]
     return replace(paths.select(order), air=air)
@@ -81,7 +74,8 @@ def strongest(gains: PathGains, image: np.ndarray, beam_sigma_rad: float) -> tup
         beams = power[:, None, None] * view.beams
         which = beams.argmax(axis=0)
         diffuse = np.maximum(image - beams.sum(axis=0), 0.0)
-        direct = np.take_along_axis(beams, which[None], axis=0)[0] > PATH_SHARE * diffuse
+        of_a_ray = 1.0 / 200.0  # of what scattering brings to a pixel, at 64 rays a pixel and a beam of 3
+        direct = np.take_along_axis(beams, which[None], axis=0)[0] > of_a_ray * diffuse
         outward = np.where(direct[..., None], view.outward[which], outward)
         length = np.where(direct, view.paths.delay_m[which], length)
     length = np.where(np.isfinite(length), length, np.nan)

@@ -19,23 +19,18 @@ from scipy.optimize import least_squares
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import Measured
 from warprrf.rf.fields.bistatic.measured import direct_paths
-from warprrf.rf.fields.bistatic.observations import NOISE_DB, Observation, Place
+from warprrf.rf.fields.bistatic.observations import NOISE_DB, TAP_STEPS, Observation, Place, Seen
 from warprrf.rf.spectra.readings import Readings, path_weights
 from warprrf.rf.tracing.model import Parameters
 from warprrf.rf.tracing.records import Materials
 from warprrf.rf.tracing.tracer import SPECULAR, View
 
-STRONGEST = 20  # paths that count
-STEPS = 360  # of a turn
-TAP_STEPS = 4.0  # that a clock is tried in, per tap
-MOST_OFFSET = 2.0  # standard deviations, along each axis
-
 
 def with_zeros(
-    data: Sequence[Measured], places: Sequence[Place], views: Sequence[View]
+    data: Sequence[Measured], every: Sequence[Seen]
 ) -> tuple[list[Measured], dict[str, dict[str, float]]]:
     """``data`` with azimuths that count from x and delays from when they were sent, and by data set's name what was added to
-    those of unknown zero: ``azimuth_zero_deg`` and ``clock_offset_s``.
+    those of unknown zero, by what ``every`` place sees: ``azimuth_zero_deg`` and ``clock_offset_s``.
 
     Raises:
         ValueError: where neither line of sight nor a mirror path reaches any place of such a data set.
@@ -43,9 +38,7 @@ def with_zeros(
     found, zeros = list(data), dict[str, dict[str, float]](azimuth_zero_deg={}, clock_offset_s={})
     for k, one in enumerate(data):
         if isinstance(one, Readings) and not one.zero_known:
-            seen = [
-                (p, v) for p, v in zip(places, views, strict=True) if p.data == k and len(v.paths.length_m)
-            ]
+            seen = [(place, view) for place, view in every if place.data == k and len(view.paths.length_m)]
             if not seen:
                 name, what = ("clock_known", "delays") if one.azimuth_known else ("azimuth_known", "azimuth")
                 raise ValueError(
@@ -70,10 +63,10 @@ def from_zero(one: Readings, by: float) -> Readings:
     return one
 
 
-def _zero(one: Readings, seen: Sequence[tuple[Place, View]]) -> float:
+def _zero(one: Readings, seen: Sequence[Seen]) -> float:
     """What to add to azimuths [rad], in (-pi, pi], or to delays [m]; see :func:`from_zero`."""
     paths = [(place.rows, *_strongest(view)) for place, view in seen]
-    tried = np.linspace(-np.pi, np.pi, STEPS, endpoint=False)
+    tried = np.linspace(-np.pi, np.pi, 360, endpoint=False)  # a degree apart
     if one.azimuth_known:
         tried = _clocks(one, paths)
     alike = np.zeros(len(tried))
@@ -105,7 +98,8 @@ def _strongest(view: View) -> tuple[np.ndarray, ...]:
     tracer = view.tracer
     prior = Materials(Parameters.prior(tracer.surface.groups), tracer.slabs, device=tracer.grid.device)
     power = view.records[SPECULAR].powers(prior)
-    kept = np.argsort(-power)[:STRONGEST]
+    most = 20  # count
+    kept = np.argsort(-power)[:most]
     return power[kept], *(values[kept] for values in direct_paths(view))
 
 
@@ -127,6 +121,7 @@ def position_offset(one: Readings, o: Observation, other: np.ndarray, power: np.
         power: of those paths, shape ``(L,)``; both in the units of the target, gain of the chain included.
     """
     place, paths, std = o.place, o.view.paths, one.position_std_m
+    most = 2.0 * std  # along each axis
     s = o.view.tracer.surface
     image = place.receiver + paths.arrival * paths.length_m[:, None]
     turn = np.tile(-np.eye(3), (len(paths), 1, 1))  # from arrival to departure
@@ -145,7 +140,7 @@ def position_offset(one: Readings, o: Observation, other: np.ndarray, power: np.
         return np.concatenate([missed, offset / std])
 
     found = least_squares(
-        error, np.zeros(3), bounds=(-MOST_OFFSET * std, MOST_OFFSET * std), loss="huber", f_scale=o.huber_db / NOISE_DB,
+        error, np.zeros(3), bounds=(-most, most), loss="huber", f_scale=o.huber_db / NOISE_DB,
         x_scale=std, diff_step=1e-3,
     ).x  # fmt: skip
     # A step and a half of it must be free, or the receiver would end in a wall.

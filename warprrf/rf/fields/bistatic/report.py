@@ -3,20 +3,19 @@ out; and warnings of these."""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from warprrf.checks import some_of, users_level
+from warprrf.checks import some_of, warn
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import Measured
-from warprrf.rf.fields.bistatic.gauss_newton import THROUGH_STD, layout_of
+from warprrf.rf.fields.bistatic.gauss_newton import THROUGH_STD, Solution, layout_of
 from warprrf.rf.fields.bistatic.needs import MOST_BLOCKED, RARE, RAYS, evenly, total
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, frame_of, huber, observe
-from warprrf.rf.fields.bistatic.training import Choice, Training, Unexplained
+from warprrf.rf.fields.bistatic.training import Training
 from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.tracing.model import Layout, Model
 from warprrf.rf.tracing.render import path_gains
@@ -24,9 +23,6 @@ from warprrf.rf.tracing.tracer import View
 
 SIDE_LOBES_DB = 3.0
 """Standard deviation of the level of an antenna's side lobes, which few measure."""
-HANGING_DB = 1.0  # that this moves a chain's gain by and is worth a warning
-DARK = 0.01  # share of line of sight below which a place is blocked
-LEFT_OUT_DB = 0.5  # of them is too little for a warning
 
 
 def left_out(t: Training, model: Model) -> dict[str, Any]:
@@ -58,15 +54,15 @@ def left_out(t: Training, model: Model) -> dict[str, Any]:
 
 
 def _is_dark(view: View) -> bool:
-    """Whether less than :data:`DARK` of line of sight passes what is in its way."""
+    """Whether less than a hundredth of line of sight passes what is in its way."""
     p = view.paths
-    return bool((p.share[p.in_sight] ** 2).sum() < DARK)
+    return bool((p.share[p.in_sight] ** 2).sum() < 0.01)
 
 
-def side_lobes(t: Training, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
+def side_lobes(t: Training, choice: Solution) -> tuple[np.ndarray, np.ndarray]:
     """Of each chain, shape ``(C,)``: the share of its readings that side lobes of its antennas bring, as it counts in dB; and
     how far :data:`SIDE_LOBES_DB` of their level move its gain [dB], all other parameters with it."""
-    covariance, p = choice.solution.covariance, choice.parameters
+    covariance, p = choice.covariance, choice.parameters
     first = len(covariance) - len(t.chains)
     pull = np.zeros((len(t.chains), len(covariance)))  # of side lobes' level on the parameters
     size, parts = np.zeros(len(t.chains)), dict(t.parts)
@@ -77,7 +73,7 @@ def side_lobes(t: Training, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
     bare = [one.without_side_lobes() if isinstance(one, Readings) else one for one in t.data]
     seen = [parts[k] for k in places]
     frequency_hz = frame_of(t.data).frequency_hz
-    lobes = observe(bare, [o.place for o in seen], [o.view for o in seen], frequency_hz, t.chains)
+    lobes = observe(bare, [(o.place, o.view) for o in seen], frequency_hz, t.chains)
     for k, lobe in zip(places, lobes, strict=True):
         parts[k] = replace(lobe.part(np.asarray(parts[k].rows)), ratio=parts[k].ratio)
     whole, main = (
@@ -99,7 +95,7 @@ def side_lobes(t: Training, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
     return share, moved
 
 
-def covariance_of(t: Training, choice: Choice) -> np.ndarray:
+def covariance_of(t: Training, choice: Solution) -> np.ndarray:
     """Of what a field keeps: parameters of materials, with what they let through as it is known before where that was not free;
     and the common gain, if that was."""
     through = choice.effects.transmissions > 0
@@ -110,31 +106,30 @@ def covariance_of(t: Training, choice: Choice) -> np.ndarray:
     free = np.ones(whole.size, bool)
     free[whole.let_through(np.arange(whole.groups))] = through
     covariance = np.where(free, 0.0, THROUGH_STD**2) * np.eye(whole.size)
-    covariance[np.ix_(free, free)] = choice.solution.covariance[: layout.size, : layout.size]
+    covariance[np.ix_(free, free)] = choice.covariance[: layout.size, : layout.size]
     return covariance
 
 
-def report_of(t: Training, choice: Choice, wrong: Unexplained, seconds: float) -> dict[str, Any]:
-    """What a fit decided and found, as numbers and text."""
-    found = choice.solution
+def report_of(
+    t: Training, choice: Solution, wrong: Mapping[int, np.ndarray], noise_db: dict[str, float]
+) -> dict[str, Any]:
+    """What a fit decided and found, as numbers and text, where :meth:`Training.unexplained` found ``wrong`` and ``noise_db``."""
     report: dict[str, Any] = {
         "receivers": len(t.observations),
         "held_out": len(t.split.held),
-        "transport_time_s": t.seconds,
-        "fit_time_s": seconds,
         "groups": t.surface.groups,
         "materials": int(choice.material.max()) + 1,
         "elements": len(t.surface.element_area),
-        "steps": len(found.losses),
-        "losses": {"gain": found.losses},
+        "steps": len(choice.losses),
+        "losses": {"gain": choice.losses},
         "choices": t.log,
-        "noise_db": wrong.noise_db,
+        "noise_db": noise_db,
     }
-    deviation = np.sqrt(np.diag(found.covariance))
+    deviation = np.sqrt(np.diag(choice.covariance))
     if t.options.gain_offset:
-        shape, through = found.parameters.log_weight.shape, choice.effects.transmissions > 0
+        shape, through = choice.parameters.log_weight.shape, choice.effects.transmissions > 0
         place = Layout(*shape, through=through).size
-        report["gain_offset_db"] = NEPER * found.parameters.log_gain
+        report["gain_offset_db"] = NEPER * choice.parameters.log_gain
         report["gain_offset_std_db"] = NEPER * float(deviation[place])
     known = NEPER * deviation[len(deviation) - len(t.chains) :]
     report["chains"] = {
@@ -145,58 +140,43 @@ def report_of(t: Training, choice: Choice, wrong: Unexplained, seconds: float) -
             "side_lobe_std_db": float(moved),
         }
         for name, gain, std, share, moved in zip(
-            t.chains, found.parameters.log_gains, known, *side_lobes(t, choice), strict=True
+            t.chains, choice.parameters.log_gains, known, *side_lobes(t, choice), strict=True
         )
     }
     report["unexplained"] = {}
-    for k, rows in wrong.rows.items():
+    for k, rows in wrong.items():
         where = t.observations[k].place
         report["unexplained"].setdefault(t.names[where.data], []).extend(where.rows[rows].tolist())
     return report
 
 
-def warn(data: Sequence[Measured], report: dict[str, Any]) -> None:
+def warn_of(data: Sequence[Measured], report: dict[str, Any]) -> None:
     """Warn of what a report says that nobody should miss."""
-    _warn_of_unexplained(data, report["unexplained"])
-    _warn_of_side_lobes(report["chains"])
-    _warn_of_left_out(report["left_out"])
-
-
-def _warn_of_side_lobes(chains: dict[str, dict[str, float]]) -> None:
-    hanging = {name: one for name, one in chains.items() if one["side_lobe_std_db"] > HANGING_DB}
+    if wrong := report["unexplained"]:
+        count = sum(len(one) for one in data if isinstance(one, Readings))
+        listed = "; ".join(f"{len(rows)} of {name!r}, rows {some_of(rows)}" for name, rows in wrong.items())
+        warn(
+            f"ds: {sum(map(len, wrong.values()))} of {count} readings are taken for wrong and left out ({listed}): "
+            'report["unexplained"] lists them'
+        )
+    much_db = 1.0
+    hanging = {name: one for name, one in report["chains"].items() if one["side_lobe_std_db"] > much_db}
     if hanging:
         listed = ", ".join(
             f"{name!r} ({100 * one['side_lobe_share']:.0f} % of its readings, {one['side_lobe_std_db']:.1f} dB)"
             for name, one in hanging.items()
         )
-        warnings.warn(
+        warn(
             f"ds: gains of chains hang on the level of side lobes, taken to be known to {SIDE_LOBES_DB:g} dB: {listed}; "
-            "measure the pattern beyond its main lobe, or turn the antenna to what it is to see",
-            UserWarning,
-            stacklevel=users_level(),
+            "measure the pattern beyond its main lobe, or turn the antenna to what it is to see"
         )
-
-
-def _warn_of_left_out(missed: dict[str, Any]) -> None:
+    missed = report["left_out"]
+    little_db = max(missed["error_db"], 0.5)
     for name in ("diffraction", "transmission"):
-        large = [db for db in missed[name] if db > max(missed["error_db"], LEFT_OUT_DB)]
+        large = [db for db in missed[name] if db > little_db]
         if large:
-            warnings.warn(
+            warn(
                 f"{name} is not modelled, but would add {np.median(large):.1f} dB to all power of {len(large)} of "
                 f"{len(missed[name])} blocked receivers, as estimated; where it is in what was read, something else was fitted to "
-                "it: warprrf.relevance tells more",
-                UserWarning,
-                stacklevel=users_level(),
+                "it: warprrf.relevance tells more"
             )
-
-
-def _warn_of_unexplained(data: Sequence[Measured], wrong: dict[str, list[int]]) -> None:
-    if wrong:
-        count = sum(len(one) for one in data if isinstance(one, Readings))
-        listed = "; ".join(f"{len(rows)} of {name!r}, rows {some_of(rows)}" for name, rows in wrong.items())
-        warnings.warn(
-            f"ds: {sum(map(len, wrong.values()))} of {count} readings are taken for wrong and left out ({listed}): "
-            'report["unexplained"] lists them',
-            UserWarning,
-            stacklevel=users_level(),
-        )

@@ -18,21 +18,13 @@ import numpy as np
 from scipy.sparse import block_diag, csr_matrix, hstack, identity, vstack
 from scipy.sparse.linalg import LinearOperator, cg
 
-from warprrf.rf.fields.bistatic.measured import Measurement, read
-from warprrf.rf.fields.bistatic.observations import HUBER_DB, NOISE_DB, Observation, Target, huber
+from warprrf.rf.fields.bistatic.measured import read
+from warprrf.rf.fields.bistatic.observations import NOISE_DB, Observation, huber
 from warprrf.rf.tracing.model import Model
 from warprrf.rf.tracing.records import Materials
 from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import SPECULAR
-
-DEVIATIONS = ((0.5, 0.5), (1.0, 2.0))
-"""A priori of the gains of elements and of cells from 1 [nepers]: for single bounces, and for light that is sent on."""
-LARGEST = 4.0  # gain [nepers]
-LONGEST = 3.0  # step of a gain, in standard deviations
-STEPS, QUICK_STEPS = (4, 12), (2, 8)
-"""Gauss-Newton steps and of conjugate gradients in each; the few of a quick fit find three quarters of what is to be found."""
-AT_ONCE = 64  # receivers that go through a measurement together
 
 
 @dataclass(frozen=True)
@@ -41,18 +33,14 @@ class Shares:
     of the floor.
 
     Attributes:
+        observed: what was read there.
         power: of both kinds of light, sparse, shape ``(B, 2 X)``.
         rest: readings of everything else, shape ``(N,)``.
-        measured: how readings come from bins.
-        target: what was read.
-        huber_db: larger errors count linearly [dB].
     """
 
+    observed: Observation
     power: csr_matrix
     rest: np.ndarray
-    measured: Measurement
-    target: Target
-    huber_db: float = HUBER_DB
 
 
 def shares_of(o: Observation, model: Model, materials: Materials) -> Shares:
@@ -79,7 +67,7 @@ def shares_of(o: Observation, model: Model, materials: Materials) -> Shares:
     own = csr_matrix((np.concatenate(powers), places), shape=(count, 2 * cells))
     known = np.asarray(own.sum(axis=1)).reshape(-1, 1)
     rest = np.maximum(read(gains, o.measured) / unit - o.measured.of_bins(known)[:, 0], 0.0)
-    return Shares(own, rest, o.measured, o.target, o.huber_db)
+    return Shares(o, own, rest)
 
 
 def fit_residual(
@@ -93,15 +81,16 @@ def fit_residual(
     Args:
         shares: one for each training receiver.
         surface: whose cells they are.
-        quick: with few steps.
+        quick: with few steps, which find three quarters of what is to be found.
         noise_db: standard deviation of a reading's error.
     """
-    rounds, conjugate = QUICK_STEPS if quick else STEPS
+    rounds, conjugate = (2, 8) if quick else (4, 12)  # Gauss-Newton steps, and of conjugate gradients in each
+    at_once = 64  # receivers that go through a measurement together
     power = vstack([s.power for s in shares], format="csr")
     own_rows = [slice(*own) for own in pairwise(np.cumsum([0, *(len(s.rest) for s in shares)]))]
     # Receivers that are measured alike go through the measurement together.
-    alike = [list(own) for _, own in groupby(shares, key=lambda s: s.measured.alike)]
-    batches = [own[k : k + AT_ONCE] for own in alike for k in range(0, len(own), AT_ONCE)]
+    alike = [list(own) for _, own in groupby(shares, key=lambda s: s.observed.measured.alike)]
+    batches = [own[k : k + at_once] for own in alike for k in range(0, len(own), at_once)]
     bins = np.cumsum([0, *(len(b) * b[0].power.shape[0] for b in batches)])
     rows = np.cumsum([0, *(len(b) * len(b[0].rest) for b in batches)])
 
@@ -110,30 +99,32 @@ def fit_residual(
         found = np.empty(rows[-1])
         for k, batch in enumerate(batches):
             table = power_of[bins[k] : bins[k + 1]].reshape(len(batch), -1).T
-            found[rows[k] : rows[k + 1]] = batch[0].measured.of_bins(table, quick=quick).T.ravel()
+            found[rows[k] : rows[k + 1]] = batch[0].observed.measured.of_bins(table, quick=quick).T.ravel()
         return found
 
     def gather(readings: np.ndarray) -> np.ndarray:
         back = np.empty(bins[-1], np.float32)
         for k, batch in enumerate(batches):
             table = readings[rows[k] : rows[k + 1]].reshape(len(batch), -1).T
-            back[bins[k] : bins[k + 1]] = batch[0].measured.to_bins(table).T.ravel()
+            back[bins[k] : bins[k + 1]] = batch[0].observed.measured.to_bins(table).T.ravel()
         return np.asarray(power.T @ back)
 
     # Unknowns have unit variance a priori: elements and cells of single bounces, then of light that is sent on.
+    deviations = ((0.5, 0.5), (1.0, 2.0))  # of elements and of cells of each from a gain of 1 [nepers]
     cell = np.arange(surface.cells)
     member = csr_matrix((np.ones(len(cell)), (cell, surface.cell_element)))
     gains = block_diag(
-        [hstack([element * member, own * identity(len(cell))]) for element, own in DEVIATIONS], format="csr"
+        [hstack([element * member, own * identity(len(cell))]) for element, own in deviations], format="csr"
     )
+    largest, longest = 4.0, 3.0  # gain [nepers], and step of one in standard deviations
     unknown = np.zeros(gains.shape[1])
     for _ in range(rounds):
-        gain = np.exp(np.clip(gains @ unknown, -LARGEST, LARGEST))
+        gain = np.exp(np.clip(gains @ unknown, -largest, largest))
         pull, weight = spread(gain, quick=False), np.empty(rows[-1])
         for s, own in zip(shares, own_rows, strict=True):
             total = np.maximum(pull[own], 0.0) + s.rest
-            error, slope = s.target.error(total), s.target.slope(total)
-            robust = huber(error, s.huber_db)[1] / noise_db**2
+            error, slope = s.observed.target.error(total), s.observed.target.slope(total)
+            robust = huber(error, s.observed.huber_db)[1] / noise_db**2
             pull[own], weight[own] = slope * robust * error, slope**2 * robust
 
         def curvature(v: np.ndarray, gain: np.ndarray = gain, weight: np.ndarray = weight) -> np.ndarray:
@@ -144,5 +135,5 @@ def fit_residual(
         gradient = gains.T @ (gain * gather(pull)) + unknown
         system = LinearOperator((len(unknown),) * 2, matvec=curvature, dtype=np.float64)
         step = cg(system, -gradient, rtol=0.0, atol=1e-6, maxiter=conjugate)[0]
-        unknown += np.clip(step, -LONGEST, LONGEST)
-    return np.clip(gains @ unknown, -LARGEST, LARGEST).reshape(2, -1)
+        unknown += np.clip(step, -longest, longest)
+    return np.clip(gains @ unknown, -largest, largest).reshape(2, -1)

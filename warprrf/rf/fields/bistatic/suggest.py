@@ -9,12 +9,12 @@ that share a reading are told apart as if the others were known.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from warprrf.device import Progress
+from warprrf.device import Progress, with_progress
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, READING_ERROR_DB
 from warprrf.rf.spectra.antenna import Antenna, turned_gain
@@ -30,15 +30,6 @@ SHARED = (1.0, 0.3, 1.0)
 OWN = (0.5, 0.3, 0.3)
 """Standard deviations of a material's gain, and of a surface's own over it [nepers]: for single bounces, for light that
 is sent on (a mean over many surfaces, so it is known better), for mirrors."""
-LEAST_DB = 1e-3  # per neper: readings that change less tell nothing
-
-
-@dataclass(frozen=True)
-class Pointings:
-    """An antenna turned to ``angles`` (K, 2), zeniths and azimuths [rad]."""
-
-    angles: np.ndarray
-    antenna: Antenna
 
 
 @dataclass(frozen=True)
@@ -82,10 +73,14 @@ class Sensitivity:
         model: of its surfaces.
         materials: those of it under the transmitter.
         floor: path gain of a pixel, and of a reading, below which nothing is told.
+        antenna: what is turned to directions; None for whole spectra.
     """
 
-    def __init__(self, tracer: Tracer, model: Model, materials: Materials, floor: float) -> None:
+    def __init__(
+        self, tracer: Tracer, model: Model, materials: Materials, floor: float, antenna: Antenna | None = None
+    ) -> None:
         self.tracer, self.model, self.materials, self.floor = tracer, model, materials, floor
+        self.antenna = antenna
 
     def powers(self, place: np.ndarray) -> tuple[csr_matrix, np.ndarray]:
         """Power that is due to each gain in each pixel at ``place`` (3,), shape ``(P, U)``, and all power ``(P,)``."""
@@ -96,10 +91,8 @@ class Sensitivity:
         pixel = np.ravel_multi_index(pixel_of(view.paths.arrival, SHAPE), SHAPE)
         mirror = view.records[SPECULAR].index[:, 0]
         own = mirror >= 0
-        parts, rest = (
-            [(pixel[own], 2 * elements + mirror[own], found.specular[own])],
-            [(pixel[~own], found.specular[~own])],
-        )
+        parts = [(pixel[own], 2 * elements + mirror[own], found.specular[own])]
+        rest = [(pixel[~own], found.specular[~own])]
         for name, power in found.tables.items():
             ray, gain = found.records[name].ray, found.records[name].residual_row
             if gain >= 0:
@@ -112,29 +105,30 @@ class Sensitivity:
         known = np.bincount(ray, power, minlength=count)
         return table, np.asarray(table.sum(axis=1)).ravel() + known
 
-    def of(self, place: np.ndarray, pointings: Pointings | None) -> tuple[np.ndarray, csr_matrix]:
+    def of(self, place: np.ndarray, turned: np.ndarray | None) -> tuple[np.ndarray, csr_matrix]:
         """Of a spectrum at ``place``: squared derivatives, summed over its pixels [dB^2/neper^2], shape ``(U,)``. And the
-        precisions at which readings there tell the gains [1/neper^2], shape ``(K, U)``: one row for a whole spectrum."""
+        precisions at which readings there tell the gains [1/neper^2], shape ``(K, U)``: a row for each zenith and azimuth [rad] of
+        ``turned`` (K, 2), or one for a whole spectrum."""
         table, total = self.powers(place)
         square = table.copy()
         square.data = (table.data * np.repeat(NEPER / (total + self.floor), np.diff(table.indptr))) ** 2
         summed = np.asarray(square.sum(axis=0)).ravel()
-        if pointings is None:
+        if self.antenna is None or turned is None:
             return summed, csr_matrix(summed / NOISE_DB**2)
-        gain = turned_gain(pointings.antenna, pointings.angles, pixel_directions(SHAPE).reshape(-1, 3))
+        gain = turned_gain(self.antenna, turned, pixel_directions(SHAPE).reshape(-1, 3))
         slope = NEPER * (gain @ table) / (gain @ total + self.floor)[:, None]
-        return summed, csr_matrix(np.where(slope > LEAST_DB, (slope / READING_ERROR_DB) ** 2, 0.0))
+        least_db = 1e-3  # per neper: readings that change less tell nothing
+        return summed, csr_matrix(np.where(slope > least_db, (slope / READING_ERROR_DB) ** 2, 0.0))
 
     def precision(
-        self, places: np.ndarray, pointings: Pointings | None = None, progress: Progress | None = None
+        self, places: np.ndarray, turned: np.ndarray | None = None, progress: Progress | None = None
     ) -> np.ndarray:
-        """With which readings at all of ``places`` (R, 3) tell the gains [1/neper^2], shape ``(U,)``."""
+        """With which readings at all of ``places`` (R, 3), at each ``turned`` to all of (K, 2), tell the gains [1/neper^2], shape
+        ``(U,)``."""
         surface = self.tracer.surface
         known = np.zeros(2 * len(surface.element_area) + surface.groups)
-        for k, place in enumerate(places):
-            known += np.asarray(self.of(place, pointings)[1].sum(axis=0)).ravel()
-            if progress is not None:
-                progress("suggest", k + 1, len(places))
+        for place in with_progress(places, "suggest", progress):
+            known += np.asarray(self.of(place, turned)[1].sum(axis=0)).ravel()
         return known
 
 
@@ -145,7 +139,7 @@ def suggest(
     n: int,
     *,
     measured: np.ndarray,
-    pointings: Pointings | None = None,
+    turned: np.ndarray | None = None,
     progress: Progress | None = None,
 ) -> np.ndarray:
     """Indices of the ``n`` of ``candidates`` (C, 3) that tell most about spectra at all of them, best first.
@@ -153,27 +147,23 @@ def suggest(
     Args:
         measured: receivers that have been measured before, in every direction in which candidates would be [m], shape
             ``(R, 3)``.
-        pointings: that each candidate would take, C of them; None for whole spectra.
+        turned: zenith and azimuth that the antenna would be turned to at each candidate [rad], shape ``(C, 2)``; None for whole
+            spectra.
         progress: called with the stage ``"suggest"``.
     """
     places, own = np.unique(candidates, axis=0, return_inverse=True)
-    total, square = (
-        len(places) + len(measured),
-        np.zeros(len(unknowns.material)),
-    )  # of predictions' derivatives
-    told: dict[int, csr_matrix] = {}
+    total, told = len(places) + len(measured), dict[int, csr_matrix]()
+    square = np.zeros(len(unknowns.material))  # of predictions' derivatives
     for k, place in enumerate(places):
         mine = np.flatnonzero(own.reshape(-1) == k)
-        turned = None if pointings is None else replace(pointings, angles=pointings.angles[mine])
-        whole, rows = sensitivity.of(place, turned)
+        whole, rows = sensitivity.of(place, None if turned is None else turned[mine])
         square += len(mine) * whole
         told |= {int(c): rows[j if len(rows.indptr) > 2 else 0] for j, c in enumerate(mine)}
         if progress is not None:
             progress("suggest", k + 1, total)
-    if pointings is not None:
-        pointings = replace(pointings, angles=np.unique(pointings.angles, axis=0))
+    every = None if turned is None else np.unique(turned, axis=0)
     after = None if progress is None else lambda stage, done, _: progress(stage, len(places) + done, total)
-    known = sensitivity.precision(measured, pointings, after)
+    known = sensitivity.precision(measured, every, after)
     return _greedy(told, square, unknowns, known, n)
 
 

@@ -6,7 +6,6 @@ out; a :class:`Training` has the observations of both, and fits and judges model
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -34,6 +33,7 @@ from warprrf.rf.fields.bistatic.observations import (
     NOISE_DB,
     Observation,
     Place,
+    Seen,
     as_list,
     chains_of,
     frame_of,
@@ -48,53 +48,19 @@ from warprrf.rf.tracing.render import materials_of
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import Tracer, View, view_of
 
-HELD_OUT, MOST_HELD_OUT, LEAST_RECEIVERS = 0.25, 30, 4
-"""Share of receivers that are held out, how many at most, and of how many at least."""
+HELD_OUT, LEAST_RECEIVERS = 0.25, 4
+"""Share of receivers that are held out, and of how many at least."""
 FEW = 20
 """Receivers up to which errors are learned from every one, held out in turn."""
 MOST_TO_CHOOSE = 24
 """Receivers that fits which only decide about something learn from."""
 MERGES = 3  # rounds of deciding what is of one material, and fitting
-UNEXPLAINED = 5.0  # standard deviations beyond which a reading of a table is taken to be wrong
-CLEAR_DB = 10.0  # above its floor a reading's decibels err as they are
-NORMAL_MEDIAN = 1.4826  # standard deviation over the median size of normal errors
-READINGS, LEAST_READINGS = 12_000, 200
-"""Readings that parameters are fitted to, spread over the training receivers, and of each at least."""
 MOST_READINGS = 20_000
 """More do not tell the few parameters of materials better: they are those of some of the receivers."""
-KNOWN_BETTER = 2.0
-"""By how much more readings count that hold line of sight alone: no material is in them. They tell a chain's gain."""
-BEHIND_WALLS = 0.5
-"""How much directions count that were measured behind slabs: of what comes through these more is left out (light between
-surfaces that passes them on its way), and what a material must make up for there it lacks in the open."""
 MOST_RAYS = 500_000_000
 """Spectra with more rays than this are refused: what rays meet is kept during a fit."""
-RAY_BYTES = 40  # kept of each ray
 MOST_KEPT = 15_000_000
 """Rays up to which records of them are kept, some 200 bytes for each; of more they are traced whenever they are asked for."""
-
-
-@dataclass(frozen=True)
-class TrainingViews:
-    """What is seen of the geometry at the places that were measured, whatever the materials: traced once, used by every
-    fit.
-
-    Attributes:
-        places: receivers under their transmitters.
-        views: one for each place.
-        effects: whose mirrors, slabs and edges were sought.
-        seconds: what it took.
-    """
-
-    places: list[Place] = field(repr=False)
-    views: list[View] = field(repr=False)
-    effects: Effects
-    seconds: float
-
-    @property
-    def tracer(self) -> Tracer:
-        """Surface, transmitter and grid of the first place."""
-        return self.views[0].tracer
 
 
 def trace(
@@ -109,8 +75,9 @@ def trace(
     client: Any = None,
     device: DeviceLike = None,
     progress: Progress | None = None,
-) -> TrainingViews:
-    """What the receivers of ``ds`` see of ``geometry`` (a Reconstruction, Scene, Mesh or Surface).
+) -> tuple[list[Seen], Effects]:
+    """What the receivers of ``ds`` see of ``geometry`` (a Reconstruction, Scene, Mesh or Surface), whatever the materials: traced
+    once, used by every fit; and the effects whose mirrors, slabs and edges were sought.
 
     Args:
         only: indices of the places that are traced, of those that :func:`places_of` lists; all by default.
@@ -128,7 +95,7 @@ def trace(
             mirrors than :data:`MOST_RAYS` and :data:`~warprrf.rf.paths.images.MOST_CHAINS`.
         TypeError: for a geometry without a mesh.
     """
-    started, tell = time.perf_counter(), progress or (lambda *_: None)
+    tell = progress or (lambda *_: None)
     places = places_of(as_list(ds), as_mesh(geometry, "geometry"), device)
     check_count("sub_pixels", sub_pixels, 1, 16)
     _check_rays(places, sub_pixels)
@@ -160,9 +127,7 @@ def trace(
         for r, view in each(partial(view_of, make, wanted, keeps), parts, client):
             views[own[r]] = tracer.adopted(view)
             tell("transport", len(views), len(places))
-    seconds = time.perf_counter() - started
-    every = [views[k] for k in range(len(places))]
-    return TrainingViews(places, every, wanted, seconds)
+    return [(place, views[k]) for k, place in enumerate(places)], wanted
 
 
 def rays_of(places: Sequence[Place], sub_pixels: int) -> int:
@@ -172,11 +137,11 @@ def rays_of(places: Sequence[Place], sub_pixels: int) -> int:
 
 def _check_rays(places: Sequence[Place], sub_pixels: int) -> None:
     """Refuse places whose rays would not fit into memory."""
-    rays = rays_of(places, sub_pixels)
+    rays, ray_bytes = rays_of(places, sub_pixels), 40  # that are kept of each
     if rays > MOST_RAYS:
         raise ValueError(
             f"ds: {len(places)} spectra of {places[0].shape[0]} x {places[0].shape[1]} pixels take {rays:.2g} rays, "
-            f"{rays * RAY_BYTES / 1e9:.0f} GB and more, expected at most {MOST_RAYS:.2g}: give fewer receivers (ds.split, "
+            f"{rays * ray_bytes / 1e9:.0f} GB and more, expected at most {MOST_RAYS:.2g}: give fewer receivers (ds.split, "
             "ds.subset) or sub_pixels=1"
         )
 
@@ -199,11 +164,11 @@ class Split:
     @classmethod
     def of(cls, places: Sequence[Place], quick: bool, rng: np.random.Generator) -> Split:
         """That of ``places``; if ``quick`` none is held out."""
-        count, chain = len(places), [place.chain for place in places]
+        count, chain, most = len(places), [place.chain for place in places], 30
         always, held = [chain.index(name) for name in chains_of(places)], np.zeros(0, int)
         if count >= LEAST_RECEIVERS and not quick:
             order = rng.permutation(count)
-            held = np.sort(order[~np.isin(order, always)][: min(int(count * HELD_OUT), MOST_HELD_OUT)])
+            held = np.sort(order[~np.isin(order, always)][: min(int(count * HELD_OUT), most)])
         return cls(count, held, np.setdiff1d(np.arange(count), held), always)
 
     def few(self, times: int) -> np.ndarray:
@@ -218,20 +183,6 @@ class Split:
         if len(self.held) < LEAST_RECEIVERS:
             return np.arange(self.count)
         return np.union1d(self.few(2), self.held)
-
-
-@dataclass(frozen=True)
-class Choice:
-    """What was decided on: effects, the material of each group ``(G,)``, and parameters of materials under them."""
-
-    effects: Effects
-    material: np.ndarray
-    solution: Solution
-
-    @property
-    def parameters(self) -> Parameters:
-        """Of the materials."""
-        return self.solution.parameters
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +200,6 @@ class Training:
         data: the data sets.
         lobes: exponents.
         step: to be called after each fit.
-        seconds: what tracing took.
         log: choices, as they are made.
     """
 
@@ -263,53 +213,55 @@ class Training:
     data: Sequence[Measured]
     lobes: tuple[int, ...]
     step: Callable[..., None]
-    seconds: float = 0.0
     log: list[dict[str, Any]] = field(default_factory=list)
 
     @classmethod
     def of(
         cls,
-        seen: TrainingViews,
+        seen: Sequence[Seen],
+        sought: Effects,
         split: Split,
         data: Sequence[Measured],
         options: FitOptions,
         rng: np.random.Generator,
         progress: Progress | None = None,
     ) -> Training:
-        """What ``data`` holds of the places that decide, where that is ``seen``."""
+        """What ``data`` holds of the places that decide, where that is ``seen`` and effects were ``sought``."""
         frequency_hz = frame_of(data).frequency_hz
-        candidates = _possible(options.candidates(frequency_hz), seen.effects, data)
+        candidates = _possible(options.candidates(frequency_hz), sought, data)
         steps = 4 + len(candidates) + MERGES + (2 * split.count if split.count <= FEW else 3)
         found = cls(
-            options, candidates, seen.tracer.surface, split, {}, {},
-            chains_of(seen.places), data, options.exponents(frequency_hz), _Steps(progress, split.count, steps),
+            options, candidates, seen[0][1].tracer.surface, split, {}, {},
+            chains_of([place for place, _ in seen]), data, options.exponents(frequency_hz), _Steps(progress, split.count, steps),
         )  # fmt: skip
         return found.and_at(split.deciding, seen, rng)
 
-    def and_at(self, places: np.ndarray, seen: TrainingViews, rng: np.random.Generator) -> Training:
+    def and_at(self, places: np.ndarray, seen: Sequence[Seen], rng: np.random.Generator) -> Training:
         """With what was read at ``places`` (P,), where that is ``seen``, and readings of them that parameters are fitted to."""
         frequency_hz = frame_of(self.data).frequency_hz
-        found = observe(self.data, seen.places, seen.views, frequency_hz, self.chains)
+        found = observe(self.data, seen, frequency_hz, self.chains)
         parts = [self._part(o, rng) for o in found]
         own = places.tolist()
-        return replace(
-            self,
-            observations=_with(self.observations, own, found),
-            parts=_with(self.parts, own, parts),
-            seconds=self.seconds + seen.seconds,
-        )
+        observations = _with(self.observations, own, found)
+        return replace(self, observations=observations, parts=_with(self.parts, own, parts))
 
     def _part(self, o: Observation, rng: np.random.Generator) -> Observation:
         """Readings of a place that parameters are fitted to, and what they count."""
         trust, db = o.target.trust, o.target.db
+        readings, least = 12_000, 200  # of all places, and of each at least
+        # Line of sight alone holds no material: it tells a chain's gain.
+        known_better = 2.0
+        # Of what comes through slabs more is left out (light between surfaces that passes them on its way), and what a
+        # material must make up for there it lacks in the open.
+        behind_walls = 0.5
         known = np.arange(len(db)) if trust is None else np.flatnonzero(trust)
-        size = min(len(known), max(LEAST_READINGS, READINGS // self.split.count))
+        size = min(len(known), max(least, readings // self.split.count))
         part = o.part(known[np.sort(rng.choice(len(known), size, replace=False))])
         if part.sight is not None:
-            part = replace(part, target=part.target.trusted(1.0 + KNOWN_BETTER * part.sight))
+            part = replace(part, target=part.target.trusted(1.0 + known_better * part.sight))
         straight = o.view.paths.order == 0
         if not self.totals and (straight & (o.view.paths.slabs > 0)).any():
-            part = replace(part, target=part.target.trusted(np.full(len(part.target.db), BEHIND_WALLS)))
+            part = replace(part, target=part.target.trusted(np.full(len(part.target.db), behind_walls)))
         return part
 
     def without_records(self) -> Training:
@@ -373,20 +325,19 @@ class Training:
             **({"energy": 1.0} if self.totals else {}),
         )  # fmt: skip
 
-    def model(self, choice: Choice, *, residual: bool = False) -> Model:
+    def model(self, choice: Solution, *, residual: bool = False) -> Model:
         """That of groups, without a residual yet."""
         effects = replace(choice.effects, residual=residual)
         none = np.zeros((2, self.surface.cells))
         return Model(effects, choice.parameters.take(choice.material), none, self.transmitter)
 
-    def refined(self, choice: Choice, places: Iterable[int], steps: int, rounds: int = 1) -> Choice:
+    def refined(self, choice: Solution, places: Iterable[int], steps: int, rounds: int = 1) -> Solution:
         """``choice`` with parameters fitted to readings of ``places``; what surfaces get of each other is computed anew in
         each of ``rounds``."""
         rounds, places = rounds if choice.effects.scatterings > 1 else 1, list(places)
         for _ in range(rounds):
             problem = self.problem(choice.effects, choice.material, places, choice.parameters)
-            found = gauss_newton(problem, choice.parameters, max(steps // rounds, int(steps > 0)))
-            choice = replace(choice, solution=found)
+            choice = gauss_newton(problem, choice.parameters, max(steps // rounds, int(steps > 0)))
         self.step()
         return choice
 
@@ -413,36 +364,39 @@ class Training:
         own = [self.observations[int(k)].losses(x).mean() for k, x in zip(places, predicted, strict=True)]
         return float(np.mean(own))
 
-    def held_loss(self, choice: Choice) -> float:
+    def held_loss(self, choice: Solution) -> float:
         """Mean square error at the places held out, without residual [dB^2]: of all readings where they are few, else of
         those chosen."""
         if len(self.split.held) <= LEAST_RECEIVERS:
             return self.loss(self.model(choice), self.split.held)
         return self.part_loss(choice, self.split.held)
 
-    def part_loss(self, choice: Choice, places: np.ndarray) -> float:
+    def part_loss(self, choice: Solution, places: np.ndarray) -> float:
         """The same of the readings chosen of ``places``."""
         problem = self.problem(choice.effects, choice.material, places, choice.parameters)
         p = choice.parameters
         losses = [batch.losses(batch.gain(p, x) * x) for batch, _, x in problem.evaluated(p)]
         return float(np.mean(np.concatenate(losses)))
 
-    def unexplained(self, model: Model) -> Unexplained:
-        """Readings of tables that ``model`` cannot explain."""
+    def unexplained(self, model: Model) -> tuple[dict[int, np.ndarray], dict[str, float]]:
+        """Readings of tables that ``model`` misses by more than 5 of their standard deviations, ``(N,)`` by place; and what it
+        misses the others by, in the median, by table [dB]: their noise."""
         tables = [k for k, o in self.observations.items() if isinstance(o.measured, WeighedPaths)]
         rows, left = dict[int, np.ndarray](), dict[str, list[float]]()
+        most_db = 5.0 * NOISE_DB  # standard deviations beyond which a reading is taken to be wrong
+        clear_db = 10.0  # above its floor a reading's decibels err as they are
+        normal = 1.4826  # standard deviation over the median size of normal errors
         for k, power in zip(tables, self.predicted(model, tables), strict=True):
             o, target = self.observations[k], self.observations[k].target
             if target.trust is not None and target.censored is not None:
                 error = target.error(power)
-                wrong = np.flatnonzero(np.abs(error) > UNEXPLAINED * NOISE_DB)
+                wrong = np.flatnonzero(np.abs(error) > most_db)
                 rows |= {k: wrong} if len(wrong) else {}
-                clear = ~target.censored & (target.db > CLEAR_DB)
+                clear = ~target.censored & (target.db > clear_db)
                 left.setdefault(self.names[o.place.data], []).extend((error / target.trust)[clear])
-        noise = {
-            name: NORMAL_MEDIAN * float(np.median(np.abs(errors))) for name, errors in left.items() if errors
+        return rows, {
+            name: normal * float(np.median(np.abs(errors))) for name, errors in left.items() if errors
         }
-        return Unexplained(rows, noise)
 
     def without(self, wrong: Mapping[int, np.ndarray]) -> Training:
         """The same in which readings ``wrong``, by place, count no longer."""
@@ -457,15 +411,6 @@ class Training:
     def note(self, what: str, kept: bool, loss: float) -> None:
         """Log a choice."""
         self.log.append({"term": what, "kept": bool(kept), "held_out_rmse_db": float(np.sqrt(loss))})
-
-
-@dataclass(frozen=True)
-class Unexplained:
-    """Readings of tables that a fit misses by more than :data:`UNEXPLAINED` of their standard deviations, ``(N,)`` by place; and
-    what it misses the others by, in the median, by table [dB]: their noise."""
-
-    rows: dict[int, np.ndarray]
-    noise_db: dict[str, float]
 
 
 @dataclass

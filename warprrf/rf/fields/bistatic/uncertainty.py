@@ -20,7 +20,6 @@ from warprrf.checks import Expected, check_arrays, lengths
 
 STEEPNESS_DB = (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, 3.5, 6.0, 10.0, 20.0)  # lower ends of the bins
 LEVEL_DB = (0.0, 0.02, 0.3, 3.0, 12.0, 30.0)
-ENOUGH = 60  # errors in a bin
 LEAST_DB = 0.01
 ARRAYS = {
     "table": Expected(f"{len(LEVEL_DB)} {len(STEEPNESS_DB)}", 0.0, 1e4),
@@ -105,11 +104,11 @@ def learn_errors(
     places = [bins(image) for image in images]
     row, column = (np.concatenate([p[k].ravel() for p in places]) for k in (0, 1))
     error = np.abs(np.concatenate([e.ravel() for e in errors]))
-    table = np.full(shape, np.nan)
+    table, enough = np.full(shape, np.nan), 60  # errors in a bin
     for i in range(shape[0]):
         for j in range(shape[1]):
             own = error[(row == i) & (column == j)]
-            if len(own) >= ENOUGH:
+            if len(own) >= enough:
                 table[i, j] = _scale(own)
     overall = _scale(error)
     for i in range(shape[0]):  # empty bins: as their neighbours of one level, else as all
