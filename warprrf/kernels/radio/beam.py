@@ -22,6 +22,24 @@ def window_width(half: int, columns: int):
     return wp.min(2 * half + 1, columns)
 
 
+@wp.func
+def column_at(start: int, step: int, columns: int):
+    """Column of a window, counted from its first."""
+    column = start + step
+    if column >= columns:
+        column = column - columns
+    return column
+
+
+@wp.func
+def beam_at(c: wp.float64, shift: wp.float64, kappa: wp.float64, chord_limit: wp.float64):
+    """Beam at the squared chord ``c`` over that at ``shift``; nothing beyond the limit."""
+    value = wp.float64(0.0)
+    if c <= chord_limit:
+        value = wp.exp(wp.float64(0.5) * kappa * (shift - c))
+    return value
+
+
 @wp.kernel
 def beam_normaliser(
     offset: int,
@@ -52,12 +70,8 @@ def beam_normaliser(
             start = column_start(cell_column, half, columns)
             row_weight = wp.float64(0.0)
             for step in range(window_width(half, columns)):
-                column = start + step
-                if column >= columns:
-                    column = column - columns
-                c = wp.length_sq(d - pixels[row, column])
-                if c <= chord_limit:
-                    row_weight = row_weight + wp.exp(wp.float64(0.5) * kappa * (shift - c))
+                c = wp.length_sq(d - pixels[row, column_at(start, step, columns)])
+                row_weight = row_weight + beam_at(c, shift, kappa, chord_limit)
             weight = weight + row_weight * solid_angles[row]
     nearest[k] = shift
     total[k] = weight
@@ -89,13 +103,10 @@ def separate_beams(
         if half >= 0:
             start = column_start(cell_column, half, columns)
             for step in range(window_width(half, columns)):
-                column = start + step
-                if column >= columns:
-                    column = column - columns
+                column = column_at(start, step, columns)
                 c = wp.length_sq(d - pixels[row, column])
-                if c <= chord_limit:
-                    value = wp.exp(wp.float64(0.5) * kappa * (nearest[k] - c)) * solid_angles[row]
-                    images[k, row, column] = wp.float32(value / total[k])
+                value = beam_at(c, nearest[k], kappa, chord_limit) * solid_angles[row]
+                images[k, row, column] = wp.float32(value / total[k])
 
 
 @wp.kernel

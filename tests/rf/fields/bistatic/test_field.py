@@ -331,6 +331,13 @@ def test_the_beam_operator_is_the_beam_of_every_pixel():
     np.testing.assert_allclose(some, expected.reshape(-1, 2)[pixels], rtol=1e-5)
 
 
+def test_a_set_keeps_its_name_with_other_mirrors_and_edges(scene, data):
+    with_edges = replace(SETS["single"], mirrors=2, diffractions=1, residual=False)
+    for effects, name in (with_edges, "Effects"), (replace(with_edges, residual=True), "single"):
+        field = RadioField.fit(scene, data.subset(np.arange(8)), effects=effects, sub_pixels=1, iterations=1)
+        assert field.report["choices"][0]["term"].startswith(name)
+
+
 def test_a_quick_fit_tries_nothing_and_is_near(scene, data):
     few, test = data.subset(np.arange(6)), data.subset(np.arange(6, 10))
     quick = RadioField.fit(scene, few, quick=True)

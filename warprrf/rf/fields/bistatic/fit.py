@@ -225,8 +225,10 @@ def merged(t: Training, best: Solution, least: float) -> Solution:
 
 
 def _name(effects: Effects) -> str:
-    """What a choice of effects is called in a report."""
-    known = [name for name, one in SETS.items() if replace(one, mirrors=effects.mirrors) == effects]
+    """What a choice of effects is called in a report: the set that it is, whatever its mirrors and :data:`RARE` effects."""
+    free = ["mirrors", *(key for on in RARE.values() for key in on)]
+    own: dict[str, Any] = {key: getattr(effects, key) for key in free}
+    known = [name for name, one in SETS.items() if replace(one, **own) == effects]
     return (known or [str(effects)])[0]
 
 
