@@ -35,7 +35,7 @@ PACKAGES = (
 )
 
 VERSIONS = {
-    "geometry": 5,
+    "geometry": 6,
     "renderer": 1,
     "metrics": 1,
     "exact": 2,

@@ -33,7 +33,7 @@ SMALL = ReconstructionConfig(
     planes=PlaneConfig(cell_m=0.2),
     gaussians=2500,
     refine=RefineConfig(iterations=12, downscale=4, max_gaussians=3000, checkpoint_every=4),
-    surface=SurfaceConfig(downscale=4, voxel_m=0.1),
+    surface=SurfaceConfig(depth_pixels=20_000, voxel_m=0.1),
 )
 
 

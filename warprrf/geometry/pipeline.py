@@ -56,7 +56,7 @@ from warprrf.geometry.report.sight import how_seen
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.steps import Attempt, Steps
 
-VERSIONS = {**sfm.VERSIONS, "initial": 2, "refined": 2, "depth": 1, "surface": 7}
+VERSIONS = {**sfm.VERSIONS, "initial": 2, "refined": 2, "depth": 2, "surface": 8}
 """Of all steps: counted up by whoever changes what a step computes."""
 
 MUCH_UNKNOWN = 0.25  # share of a surface that is worth a warning
@@ -298,7 +298,7 @@ def _steps(
     if measured:
         inputs.append({name: [file.path, file.unit_m] for name, file in measured.items()})
     else:
-        made_by = [steps.key("refined"), config.stereo, config.segments, config.surface.downscale]
+        made_by = [steps.key("refined"), config.stereo, config.segments, config.surface.depth_pixels]
         rendered = _kept(steps, "depth", depth, made_by)
         inputs.append(steps.key("depth"))
     kept = _kept(steps, "surface", surface, inputs)

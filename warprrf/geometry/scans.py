@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
-from warprrf.checks import check_positive
+from warprrf.checks import check_count, check_positive
 from warprrf.geometry.mesh import Mesh, connected_pieces, edge_pairs, face_neighbours, smoothed_normals
 from warprrf.geometry.planar_patches import PlanarPatches, vertex_noise
 from warprrf.geometry.planes import Plane, PlaneConfig, detect_planes, drawn_by_place
@@ -23,7 +23,7 @@ class SurfaceConfig:
     """How Gaussians become a mesh with planar patches.
 
     Attributes:
-        downscale: depth maps are rendered at the photos' size divided by this.
+        depth_pixels: depth maps have about so many pixels, or their photos' where these have fewer.
         voxel_m: largest side of a voxel of the fusion.
         truncation_voxels: the distance field is truncated at so many voxels.
         max_range_m: depths beyond this are left out.
@@ -31,14 +31,15 @@ class SurfaceConfig:
         patch_distance_m: a face this close to a plane can belong to its patch: a depth map's error.
     """
 
-    downscale: int = 2
+    depth_pixels: int = 320_000
     voxel_m: float = 0.05
-    truncation_voxels: float = 4.0
+    truncation_voxels: float = 3.0
     max_range_m: float = 12.0
     min_component_faces: int = 200
     patch_distance_m: float = 0.06
 
     def __post_init__(self) -> None:
+        check_count("depth_pixels", self.depth_pixels)
         check_positive("voxel_m", self.voxel_m, "length in metres")
 
 

@@ -14,8 +14,8 @@ from warprrf.kernels.photo_consistency import bilinear
 
 wp.set_module_options({"enable_backward": False})
 
-SIDE = 5  # pixels along a window's side
-SAMPLES = wp.constant(SIDE * SIDE)
+SIDE = 5  # samples along a window's side, of which every other one is taken, as on a chess board
+SAMPLES = wp.constant((SIDE * SIDE + 1) // 2)
 UNKNOWN = wp.constant(2.0)  # cost of what no two photos show: that of opposite textures
 BLANK = wp.constant(3.0)  # cost of a window that shows nothing
 SAME = wp.constant(1.0e-3)  # planes whose inverse depths differ by this part of them in a window are one
@@ -30,7 +30,19 @@ WANDER = wp.constant(
 LOST = wp.constant(0.5)  # a pixel of more cost tries any depth, once
 UNLIKE = wp.constant(0.02)  # depths of two photos that differ by this part contradict each other in full
 STEEPEST = wp.constant(6.0)  # tangent of a plane's largest angle to the image
-window = wp.types.vector(length=SIDE * SIDE, dtype=wp.float32)
+window = wp.types.vector(length=SAMPLES, dtype=wp.float32)
+
+
+@wp.func
+def across_of(sample: int) -> int:
+    """Columns from a window's middle to one of its samples."""
+    return STEP * ((2 * sample) % wp.static(SIDE) - wp.static(SIDE // 2))
+
+
+@wp.func
+def down_of(sample: int) -> int:
+    """Rows from a window's middle to one of its samples."""
+    return STEP * ((2 * sample) // wp.static(SIDE) - wp.static(SIDE // 2))
 
 
 @wp.func
@@ -55,8 +67,8 @@ def correlation(
     square = float(0.0)
     product = float(0.0)
     for k in range(SAMPLES):
-        i = float(STEP * (k % wp.static(SIDE) - wp.static(SIDE // 2)))
-        j = float(STEP * (k // wp.static(SIDE) - wp.static(SIDE // 2)))
+        i = float(across_of(k))
+        j = float(down_of(k))
         h = start + across * i + down * j
         if h[2] < 1.0e-6:
             return float(-2.0)
@@ -179,8 +191,8 @@ def match(
     weight = window()
     whole = float(0.0)
     for k in range(SAMPLES):
-        x = wp.clamp(j + STEP * (k % wp.static(SIDE) - wp.static(SIDE // 2)), 0, width - 1)
-        y = wp.clamp(i + STEP * (k // wp.static(SIDE) - wp.static(SIDE // 2)), 0, height - 1)
+        x = wp.clamp(j + across_of(k), 0, width - 1)
+        y = wp.clamp(i + down_of(k), 0, height - 1)
         grey[k] = images[size[0] + y * width + x]
         weight[k] = wp.exp(-wp.abs(grey[k] - middle) / SIMILAR)
         whole = whole + weight[k]

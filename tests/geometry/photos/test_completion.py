@@ -11,7 +11,6 @@ from views import look
 
 import warprrf as wr
 from warprrf.geometry.photos.config import ReconstructionConfig
-from warprrf.geometry.scans import SurfaceConfig
 from warprrf.geometry.splats.gaussians import discs_on_mesh
 
 pytest.importorskip("open3d")
@@ -21,7 +20,7 @@ ROOM = box_mesh([0, 0, 0], [4, 3, 2.5], inward=True)
 MIDDLE = np.array([2.0, 1.5, 1.2])
 ANGLES = np.arange(20) * np.pi / 5  # once round looking down, once looking up
 AROUND = np.column_stack([np.cos(ANGLES), np.sin(ANGLES), np.repeat([-0.8, 0.8], 10)])
-CONFIG = ReconstructionConfig(surface=SurfaceConfig(downscale=1))
+CONFIG = ReconstructionConfig()
 
 
 def without(mesh, *boxes):

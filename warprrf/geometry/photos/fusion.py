@@ -7,6 +7,7 @@ from range images", 1996).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from types import ModuleType
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from warprrf.checks import check_array
-from warprrf.device import DeviceLike, Progress
+from warprrf.device import DeviceLike, Progress, threads
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.completion import complete
 from warprrf.geometry.photos.config import ReconstructionConfig
@@ -40,11 +41,11 @@ from warprrf.geometry.splats.render import render
 VIEWS = 120  # most depth maps that are fused, spread over all cameras
 ALPHA = 0.6  # a depth counts where at least so much light is blocked,
 DEPTH_SPREAD = 0.05  # and where blended depth and dominant Gaussian differ by no more than this part
-VOXEL_PIXELS = 4.0  # widest voxel, in pixels of the depth maps at their median range
+VOXEL_PIXELS = 5.0  # widest voxel, in pixels of the depth maps at their median range
 EDGE_TOLERANCE = 8.0
 """A pixel is left out where inverse depth bends by more than this part of itself, per focal length in pixels: on a plane
 it is linear in the image, in a corner it bends, across an occluding edge it jumps."""
-MIN_VIEWS = 2  # a surface is kept where at least this many depth maps saw it
+MIN_VIEWS = 2  # a surface is kept where at least this many depth maps saw it; with three, holes cost fields more than noise
 TOUCHED = (
     4  # Open3D looks for blocks along every so many-th row and column, and refuses a map that shows none
 )
@@ -53,10 +54,11 @@ BLOCK_VOXELS, BLOCKS = 16, 20_000  # voxels along a block's side; blocks set asi
 
 def depth_views(cameras: Sequence[Camera], config: SurfaceConfig) -> list[Camera]:
     """Cameras of the depth maps: some of ``cameras``, spread over all, with fewer pixels."""
-    return [
-        c.resized(max(1, c.width // config.downscale), max(1, c.height // config.downscale))
-        for c in spread(cameras, VIEWS)
-    ]
+    views = []
+    for camera in spread(cameras, VIEWS):
+        side = min(1.0, (config.depth_pixels / (camera.width * camera.height)) ** 0.5)
+        views.append(camera.resized(max(1, round(side * camera.width)), max(1, round(side * camera.height))))
+    return views
 
 
 def depth_maps(
@@ -98,11 +100,13 @@ def _flat(
     progress: Progress,
 ) -> list[np.ndarray]:
     """``depths`` with the flat segments of their photos on planes."""
+    progress("segments", 0, len(views))
     result = []
-    for k, (depth, view, image) in enumerate(zip(depths, views, photos.images, strict=True)):
-        progress("segments", k, len(views))
-        result.append(with_segments(depth, proved[k], kept_pixels(photos, k, view), image, view))
-    progress("segments", len(views), len(views))
+    with ThreadPoolExecutor(threads()) as pool:
+        kept = [kept_pixels(photos, k, view) for k, view in enumerate(views)]
+        for flat in pool.map(with_segments, depths, proved, kept, photos.images, views):
+            result.append(flat)
+            progress("segments", len(result), len(views))
     return result
 
 
