@@ -9,9 +9,9 @@ from views import pinhole
 from warprrf.geometry import pipeline
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.cells import occupancy
-from warprrf.geometry.photos.fusion import fuse_depth, fuse_maps
+from warprrf.geometry.photos.fusion import depth_views, fuse_depth, fuse_maps
 from warprrf.geometry.planes import Plane, detect_planes, plane_axes
-from warprrf.geometry.scans import find_patches
+from warprrf.geometry.scans import SurfaceConfig, find_patches
 
 CAMERA = pinhole(64, 48, focal=50)
 WALL = 2.0 / CAMERA.directions()[..., 2]  # its range, at z = 2
@@ -132,6 +132,19 @@ def test_faces_of_a_given_plane_do_not_go_to_one_that_is_found_near_it():
     patches = find_patches(mesh, [given])
     assert patches.area == pytest.approx([12, 3])
     assert patches.offset == pytest.approx([-0.015, 0.05])
+
+
+def test_depth_maps_are_as_large_as_small_photos_and_smaller_than_large_ones():
+    given = [pinhole(640, 480, focal=500), pinhole(1600, 1200, focal=1250)]
+    small, large = depth_views(given, SurfaceConfig())
+    assert (small.width, small.height, small.fx) == (640, 480, 500)
+    assert large.width * large.height == pytest.approx(320_000, rel=2e-3)
+    assert (
+        large.fx / large.width == pytest.approx(1250 / 1600) == pytest.approx(0.75 * large.fy / large.height)
+    )
+    assert depth_views(given[:1], SurfaceConfig(depth_pixels=1))[0].width == 1
+    with pytest.raises(ValueError, match="depth_pixels: got 0"):
+        SurfaceConfig(depth_pixels=0)
 
 
 def test_a_depth_map_with_few_known_pixels_does_not_end_the_fusion():
