@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import views
 
+from warprrf.geometry.photos.fusion import _flat
 from warprrf.geometry.photos.segments import UNSURE, with_segments
+from warprrf.geometry.photos.targets import PosedPhotos
 
 pytest.importorskip("skimage")
 LOW, HIGH = np.array([-2.0, -2.0, 0.0]), np.array([2.0, 2.0, 2.5])
@@ -43,6 +45,15 @@ def test_walls_are_whole_and_smooth_where_their_rims_alone_are_known():
     assert RIM.mean() < 0.4
     assert (found > 0).mean() > 0.95
     assert np.median(error[found > 0]) < 0.003 and np.percentile(error[found > 0], 95) < UNSURE
+
+
+def test_each_depth_map_is_cut_by_its_own_photo():
+    grey, told = np.full_like(PHOTO, 0.5), []
+    photos = PosedPhotos([PHOTO, grey], [CAMERA] * 2)
+    first, second = _flat([rough()] * 2, [RIM] * 2, [CAMERA] * 2, photos, lambda *step: told.append(step))
+    assert (first == flat(rough(), RIM)).all() and (second == flat(rough(), RIM, photo=grey)).all()
+    assert (first != second).any()
+    assert told == [("segments", k, 2) for k in range(3)]
 
 
 def test_depths_in_a_strip_fix_no_plane_far_from_it():

@@ -5,10 +5,12 @@ from functools import partial
 import numpy as np
 import pytest
 import views
+import warp as wp
 from scipy import ndimage
 
 from warprrf.geometry.photos import stereo
 from warprrf.geometry.photos.targets import PosedPhotos
+from warprrf.kernels import patch_match
 
 look = partial(views.look, width=160, height=120, f=130.0)
 LOW, HIGH = np.array([-2.0, -2.0, 0.0]), np.array([2.0, 2.0, 2.5])
@@ -30,6 +32,12 @@ def truth(camera):
     pattern = np.sin(x @ waves.T + rng.uniform(0, 6, 12)).sum(axis=-1) / 12
     grey = np.where(x[..., 0] > PLAIN_X - 1e-6, 0.5, 0.5 + 0.5 * pattern)
     return t, np.repeat(grey[..., None], 3, axis=2).astype(np.float32)
+
+
+@wp.kernel
+def places(found: wp.array(dtype=wp.vec2i)):
+    k = wp.tid()
+    found[k] = wp.vec2i(patch_match.across_of(k), patch_match.down_of(k))
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +88,13 @@ def patterned(room):
     shown[:, :8] = shown[:, -8:] = False
     shown[:, :, :8] = shown[:, :, -8:] = False
     return shown
+
+
+def test_a_window_is_a_chess_board_round_its_middle():
+    found = wp.zeros(13, dtype=wp.vec2i, device="cpu")
+    wp.launch(places, dim=13, inputs=[found], device="cpu")
+    board = {(i, j) for i in range(-4, 5, 2) for j in range(-4, 5, 2) if (i + j) % 4 == 0}
+    assert set(map(tuple, found.numpy().tolist())) == board and len(board) == 13
 
 
 def test_photos_mend_wrong_depths(room, spoiled, found):
