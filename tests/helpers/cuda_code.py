@@ -35,7 +35,7 @@ MODULES = sorted(m.name for m in EVERY if not m.ispkg and m.name != FOR_A_CPU_AL
 HOT = {
     "warprrf.kernels.raster.project": ("project(float32)", "chain(float32)"),
     "warprrf.kernels.raster.reference": (
-        "blend(float32, 4)", "blend_adjoint(float32, 4)", "strongest(float32)",
+        "blend(float32, 4)", "blend_adjoint(float32, 4)", "blend_stretches(float32, 4)", "strongest(float32)",
     ),
     "warprrf.kernels.rays.gaussians": ("collect", "collect_adjoint", "transmit", "transmit_adjoint"),
     "warprrf.kernels.rays.mesh": ("cast_rays", "see"),

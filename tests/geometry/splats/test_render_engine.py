@@ -106,6 +106,32 @@ def test_blocks_blend_what_the_reference_does(real, rule, channels, camera, othe
 
 
 @pytest.mark.parametrize("other", OTHERS, ids=["reference", "cuda"])
+@pytest.mark.parametrize(
+    ("real", "rule"), [(wp.float64, "product"), (wp.float64, "exp"), (wp.float32, "product")]
+)
+def test_long_lists_blended_in_stretches_are_what_they_are_in_one(real, rule, other):
+    """Lists of many stretches; some pixels are finished within one, the others see through them all."""
+    rng, n, cam = np.random.default_rng(3), 20_000, CAMERAS["inside"]
+    off = rng.normal(0, 3, (n, 3))
+    opacities = np.where(off[:, 0] < 0, 0.08, 0.004)
+    g = Gaussians(
+        cam.position + off, rng.normal(size=(n, 4)), rng.uniform(0.1, 0.6, (n, 3)), opacities,
+        np.zeros((n, 1, 3)),
+    )  # fmt: skip
+    how = {"channels": 5, "real": real, "blending": Blending(1e-3, transmittance_min=1e-3, rule=rule)}
+    raster = Rasterizer(device="cpu", per_pixel=True, real=real, blending=how["blending"])
+    prepared = raster.prepare(*raster.upload(g), cam)
+    image = raster.blend(prepared, wp.zeros((len(g), 1), dtype=real, device="cpu"))
+    finished = (image.transmittance.numpy() <= 1e-3).mean()
+    assert np.median(np.diff(prepared.starts.numpy())) > 4 * reference.STRETCH
+    assert 0.2 < finished < 0.8
+    expected, found = image_and_gradients(g, cam, **how), image_and_gradients(g, cam, **how, **other)
+    tolerance = 2e-5 if real is wp.float32 else 1e-12
+    for a, b in zip(expected, found, strict=True):
+        assert np.abs(a - b).max() <= tolerance * np.abs(a).max()
+
+
+@pytest.mark.parametrize("other", OTHERS, ids=["reference", "cuda"])
 @pytest.mark.parametrize("top_k", [1, 3, 16])
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 def test_blocks_find_the_strongest_weights_that_the_reference_finds(camera, top_k, other):

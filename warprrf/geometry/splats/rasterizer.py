@@ -346,10 +346,23 @@ class Rasterizer:
         )
         outputs = [image.features, image.alpha, image.depth, image.transmittance, image.dominant, image.peak]
         for first in range(0, channels, projection.CHANNELS):
-            kernel = self.kernels.build_blend(self.real, min(channels - first, projection.CHANNELS))
-            inputs = [*self._scene(prepared), features, first, background, *outputs]
-            self._launch_tiles(kernel, prepared, inputs)
+            width = min(channels - first, projection.CHANNELS)
+            inputs = [*self._scene(prepared), features, first]
+            if self.per_pixel:
+                inputs.append(self._stretches(width, inputs))
+            self._launch_tiles(
+                self.kernels.build_blend(self.real, width), prepared, [*inputs, background, *outputs]
+            )
         return image
+
+    def _stretches(self, width: int, inputs: list[Any]) -> wp.array:
+        """Whole stretches of the lists, each blended by itself."""
+        count, lanes = len(inputs[1]) // reference.STRETCH, reference.LANES
+        dtype = reference.layers_of(self.real, width)
+        found = wp.empty((count, lanes), dtype=dtype, device=self.device)
+        kernel = reference.build_stretches(self.real, width)
+        launch(kernel, count * lanes, [*inputs, found], device=self.device, grain=lanes * GRAIN)
+        return found
 
     def _adjoint(
         self, prepared: Prepared, features: wp.array, image: Image, background: wp.array

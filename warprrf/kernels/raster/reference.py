@@ -3,9 +3,12 @@
 A GPU runs these. On a CPU :mod:`.blocks` computes the same 16 pixels at a time, and tests compare the two. Threads go
 tile by tile; a tile's entries ``ids[starts[tile]:starts[tile + 1]]`` are the Gaussians that it may see, near to far.
 What a GPU waits for is memory: its 16 threads of a tile each fetch one of the 16 rows that all of them walk next
-(:func:`touch`), and what they add to a Gaussian is summed before it leaves the warp (:func:`build_add`).
+(:func:`touch`), and what they add to a Gaussian is summed before it leaves the warp (:func:`build_add`). Nor may a few
+threads walk a long list while the others have finished: the entries of all lists, one after the other, are cut into
+stretches, which are blended side by side (:func:`build_stretches`) and then laid one behind the other.
 """
 
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -15,6 +18,7 @@ from warprrf.kernels.raster.project import OF_FEATURES, OF_OPACITY, OF_WEIGHT, S
 from warprrf.kernels.raster.view import PRODUCT, TILE, Rules, View, pixel_of, pixel_ray
 
 LANES = TILE**2  # threads of a tile, which walk its list together
+STRETCH = 256  # entries; a list shorter than this has no whole stretch
 
 
 @wp.func
@@ -64,12 +68,138 @@ def pair_sums(s: Any, slope: Any, q: Any, y1: Any, y2: Any, h0: Any, h1: Any, h2
 
 
 @once
+def layers_of(real: type, width: int) -> Any:
+    """The struct of what a pixel has met, for ``width`` channels."""
+    values = wp.types.vector(width, real)
+
+    @wp.struct
+    class Layers:
+        color: values
+        transmittance: real
+        total: real  # of the weights
+        depth: real  # of the weights times ranges; ranges are in lengths of the ray
+        best: real  # the largest weight, its range and its Gaussian
+        peak: real
+        owner: int
+
+    return Layers
+
+
+@once
+def layer_functions(real: type, width: int) -> SimpleNamespace:
+    """The walk along a list, and what was met on two parts of it as one, for ``width`` channels."""
+    vec3 = wp.types.vector(3, real)
+    Layers, Splat = layers_of(real, width), splat_of(real)
+    least = 1.0e-30 if real is wp.float32 else 1.0e-250
+
+    @wp.func
+    def nothing():
+        """What a pixel has met before it begins."""
+        met = Layers()
+        met.transmittance = real(1.0)
+        met.owner = -1
+        return met
+
+    @wp.func
+    def walk(
+        met: Layers,
+        begin: int,
+        end: int,
+        lane: int,
+        ray: vec3,
+        splats: wp.array(dtype=Splat),
+        ids: wp.array(dtype=int),
+        rules: Rules,
+        features: wp.array(dtype=real, ndim=2),
+        first: int,
+    ):
+        """``met`` and the entries from ``begin`` to ``end`` behind it, until the pixel is finished."""
+        for j in range(begin, end):
+            if met.transmittance <= real(rules.transmittance_min):
+                break
+            if (j - begin) % wp.static(LANES) == 0:
+                met.transmittance += touch(splats, ids, j + lane, end)
+            k = ids[j]
+            splat = splats[k]
+            g0, g1, g2, n, square = meet(splat, ray, real(wp.static(least)))
+            if g0 > real(0.0) and n < splat.cut * square:
+                inverse = real(1.0) / square
+                alpha = wp.min(splat.opacity * wp.exp(real(-0.5) * n * inverse), real(rules.alpha_max))
+                weight = alpha * met.transmittance
+                met.transmittance = behind(met.transmittance, alpha, rules.rule)
+                t = splat.reach * g0 * inverse
+                for c in range(wp.static(width)):
+                    met.color[c] += features[k, first + c] * weight
+                met.total += weight
+                met.depth += weight * t
+                if weight > met.best:
+                    met.best = weight
+                    met.peak = t
+                    met.owner = k
+        return met
+
+    @wp.func
+    def over(front: Layers, back: Layers):
+        """``front`` with ``back`` seen through it."""
+        through = front.transmittance
+        met = front
+        met.color += through * back.color
+        met.total += through * back.total
+        met.depth += through * back.depth
+        if through * back.best > front.best:
+            met.best = through * back.best
+            met.peak = back.peak
+            met.owner = back.owner
+        met.transmittance = through * back.transmittance
+        return met
+
+    return SimpleNamespace(nothing=nothing, walk=walk, over=over)
+
+
+@once
+def build_stretches(real: type, width: int) -> Any:
+    """The kernel that blends every whole stretch of a list by itself, as :func:`build_blend` makes it."""
+    vec3 = wp.types.vector(3, real)
+    Layers, Splat = layers_of(real, width), splat_of(real)
+    of = layer_functions(real, width)
+    nothing, walk = of.nothing, of.walk
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def blend_stretches(
+        offset: int,
+        splats: wp.array(dtype=Splat),
+        ids: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        view: View,
+        rules: Rules,
+        features: wp.array(dtype=real, ndim=2),
+        first: int,
+        stretches: wp.array(dtype=Layers, ndim=2),
+    ):
+        """``stretches[i, lane]``: what a pixel of a tile meets on entries ``i STRETCH`` to ``(i + 1) STRETCH``, if these
+        are all of one tile."""
+        thread = offset + wp.tid()
+        lane = thread % wp.static(LANES)
+        stretch = thread / wp.static(LANES)
+        begin = stretch * wp.static(STRETCH)
+        end = begin + wp.static(STRETCH)
+        tile = wp.lower_bound(starts, begin + 1) - 1
+        if starts[tile + 1] < end:
+            return
+        tile, x, y = pixel_of(tile * wp.static(LANES) + lane, view)
+        ray = vec3(pixel_ray(view, x, y))
+        stretches[stretch, lane] = walk(nothing(), begin, end, lane, ray, splats, ids, rules, features, first)
+
+    return blend_stretches
+
+
+@once
 def build_blend(real: type, width: int) -> Any:
     """The kernel that blends ``width`` channels (1 to 4) at once, for ``wp.float32`` or ``wp.float64``."""
     vec3 = wp.types.vector(3, real)
-    values = wp.types.vector(width, real)
-    Splat = splat_of(real)
-    least = 1.0e-30 if real is wp.float32 else 1.0e-250
+    Layers, Splat = layers_of(real, width), splat_of(real)
+    of = layer_functions(real, width)
+    nothing, walk, over = of.nothing, of.walk, of.over
 
     @wp.kernel(module="unique", enable_backward=False)
     def blend(
@@ -81,6 +211,7 @@ def build_blend(real: type, width: int) -> Any:
         rules: Rules,
         features: wp.array(dtype=real, ndim=2),
         first: int,
+        stretches: wp.array(dtype=Layers, ndim=2),
         background: wp.array(dtype=real),
         image: wp.array(dtype=real, ndim=3),
         alpha_out: wp.array(dtype=real, ndim=2),
@@ -90,53 +221,40 @@ def build_blend(real: type, width: int) -> Any:
         peak_out: wp.array(dtype=real, ndim=2),
     ):
         """Blend channels from ``first`` front to back: features, sum of weights, mean range (0 where nothing is seen,
-        so that a loss on it stays finite), transmittance left, Gaussian of largest weight and the range of its peak."""
+        so that a loss on it stays finite), transmittance left, Gaussian of largest weight and the range of its peak.
+
+        A whole stretch is taken as it was blended by itself; one in which the pixel is finished is walked once more.
+        """
         thread = offset + wp.tid()
         lane = thread % wp.static(LANES)
         tile, x, y = pixel_of(thread, view)
         if x >= view.width or y >= view.height:
             return
         ray = vec3(pixel_ray(view, x, y))
-        transmittance = real(1.0)
-        color = values()
-        total = real(0.0)
-        depth = real(0.0)
-        best = real(0.0)
-        peak = real(0.0)
-        owner = int(-1)
-        begin = starts[tile]
+        finished = real(rules.transmittance_min)
+        met = nothing()
+        at = int(starts[tile])
         end = starts[tile + 1]
-        for j in range(begin, end):
-            if transmittance <= real(rules.transmittance_min):
-                break
-            if (j - begin) % wp.static(LANES) == 0:
-                transmittance += touch(splats, ids, j + lane, end)
-            k = ids[j]
-            splat = splats[k]
-            g0, g1, g2, n, square = meet(splat, ray, real(wp.static(least)))
-            if g0 > real(0.0) and n < splat.cut * square:
-                inverse = real(1.0) / square
-                alpha = wp.min(splat.opacity * wp.exp(real(-0.5) * n * inverse), real(rules.alpha_max))
-                weight = alpha * transmittance
-                transmittance = behind(transmittance, alpha, rules.rule)
-                t = splat.reach * g0 * inverse
-                for c in range(wp.static(width)):
-                    color[c] += features[k, first + c] * weight
-                total += weight
-                depth += weight * t
-                if weight > best:
-                    best = weight
-                    peak = t
-                    owner = k
+        while at < end and met.transmittance > finished:
+            stretch = at / wp.static(STRETCH)
+            stop = wp.min((stretch + 1) * wp.static(STRETCH), end)
+            known = bool(False)
+            if stop - at == wp.static(STRETCH):
+                known = met.transmittance * stretches[stretch, lane].transmittance > finished
+            if known:
+                met = over(met, stretches[stretch, lane])
+            else:
+                met = walk(met, at, stop, lane, ray, splats, ids, rules, features, first)
+            at = stop
         for c in range(wp.static(width)):
-            image[y, x, first + c] = color[c] + background[first + c] * transmittance
+            image[y, x, first + c] = met.color[c] + background[first + c] * met.transmittance
         if first == 0:
             length = wp.length(ray)
-            alpha_out[y, x] = total
-            depth_out[y, x] = wp.where(total > real(0.0), depth * length / total, real(0.0))
-            left_out[y, x] = transmittance
-            dominant_out[y, x] = owner
-            peak_out[y, x] = peak * length
+            alpha_out[y, x] = met.total
+            depth_out[y, x] = wp.where(met.total > real(0.0), met.depth * length / met.total, real(0.0))
+            left_out[y, x] = met.transmittance
+            dominant_out[y, x] = met.owner
+            peak_out[y, x] = met.peak * length
 
     return blend
 
