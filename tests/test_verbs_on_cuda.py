@@ -30,7 +30,12 @@ def test_every_verb_launches_where_it_is_asked_to(place, device, tmp_path, monke
     for name in calls.public().keys() - set(calls.REFUSED):
         arguments = calls.example(name, there)
         launched.clear()
-        calls.call(name, arguments)
+        try:
+            calls.call(name, arguments)
+        except ImportError as error:
+            if 'pip install "warprrf[' not in str(error):
+                raise
+            continue  # an optional package that this machine with a GPU lacks
         astray = {kernel for where, kernel in launched if where != device} - OF_A_MESH
         assert not astray, f"{name}: launched on the CPU"
         takes_a_device = any(p.name == "device" for p in calls.signature(name))

@@ -69,9 +69,10 @@ def check_array(
         raise ValueError(f"{name}: got shape {array.shape}, expected ({wished})")
     if wanted.kind in "iu" and given.dtype != wanted and not np.array_equal(array, given):
         raise TypeError(f"{name}: got numbers that are not whole or too large, expected {wanted}")
-    if wanted.kind in "fc" and array.size:
+    most = min(LARGEST, float(np.finfo(wanted).max)) if wanted.kind in "fc" else np.inf
+    within = wanted.kind == "f" and array.size > 0 and -most <= array.min() and array.max() <= most  # NaN is not
+    if wanted.kind in "fc" and not within:
         size = np.abs(array)
-        most = min(LARGEST, float(np.finfo(wanted).max))
         bad = ~(size <= most) if finite else (size > most) & (size < np.inf)
         if bad.any():
             number, kinds = int(np.count_nonzero(bad)), "NaN, infinite or " if finite else ""
