@@ -70,8 +70,8 @@ def check_array(
     if wanted.kind in "iu" and given.dtype != wanted and not np.array_equal(array, given):
         raise TypeError(f"{name}: got numbers that are not whole or too large, expected {wanted}")
     most = min(LARGEST, float(np.finfo(wanted).max)) if wanted.kind in "fc" else np.inf
-    within = wanted.kind == "f" and array.size > 0 and -most <= array.min() and array.max() <= most  # NaN is not
-    if wanted.kind in "fc" and not within:
+    usual = wanted.kind == "f" and array.size > 0 and -most <= array.min() and array.max() <= most
+    if wanted.kind in "fc" and not usual:
         size = np.abs(array)
         bad = ~(size <= most) if finite else (size > most) & (size < np.inf)
         if bad.any():
