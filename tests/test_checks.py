@@ -31,6 +31,7 @@ def test_what_an_annotation_allows_comes_as_it_says():
     [
         (r"^places: got shape \(2,\), expected \(any, 3\)$", {"places": [1, 2]}),
         (r"^places: .*NaN", {"places": [[0, 0, np.nan]]}),
+        (r"^step: got an array of object, expected int$", {"step": np.array([object()])}),
         (r"^step: got 5, expected a whole number of 2 to 4$", {"step": 5}),
         (r"^step: got float 2.5, expected int$", {"step": 2.5}),
         (r"^error: got -1, expected a finite number of at least 0$", {"error": -1}),

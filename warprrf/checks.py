@@ -481,6 +481,8 @@ _OTHER = object()  # what does not fit its annotation
 
 def _described(value: object) -> str:
     """A value by its type, and as it is written where that is short."""
+    if isinstance(value, np.ndarray):
+        return f"an array of {value.dtype}"
     written = f" {value!r}" if isinstance(value, (str, bytes, numbers.Number)) else ""
     return type(value).__name__ + (written if len(written) < 60 else "")
 
