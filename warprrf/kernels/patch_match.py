@@ -10,12 +10,13 @@ surface normal diffusion", ICCV 2015. That a plane also costs what it contradict
 
 import warp as wp
 
-from warprrf.kernels.photo_consistency import bilinear
+from warprrf.kernels.raster.blocks import VECTORISED
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False} | VECTORISED)
 
 SIDE = 5  # samples along a window's side, of which every other one is taken, as on a chess board
 SAMPLES = wp.constant((SIDE * SIDE + 1) // 2)
+LANES = 16  # numbers of a window, as a CPU's registers hold them: those after the samples count for nothing
 UNKNOWN = wp.constant(2.0)  # cost of what no two photos show: that of opposite textures
 BLANK = wp.constant(3.0)  # cost of a window that shows nothing
 SAME = wp.constant(1.0e-3)  # planes whose inverse depths differ by this part of them in a window are one
@@ -30,7 +31,7 @@ WANDER = wp.constant(
 LOST = wp.constant(0.5)  # a pixel of more cost tries any depth, once
 UNLIKE = wp.constant(0.02)  # depths of two photos that differ by this part contradict each other in full
 STEEPEST = wp.constant(6.0)  # tangent of a plane's largest angle to the image
-window = wp.types.vector(length=SAMPLES, dtype=wp.float32)
+window = wp.types.vector(length=LANES, dtype=wp.float32)
 
 
 @wp.func
@@ -45,7 +46,49 @@ def down_of(sample: int) -> int:
     return STEP * ((2 * sample) // wp.static(SIDE) - wp.static(SIDE // 2))
 
 
-@wp.func
+_PLACES = [*range(0, SIDE * SIDE, 2), *(0,) * (LANES - SAMPLES)]
+COLUMNS = ", ".join(f"{STEP * (k % SIDE - SIDE // 2)}.0f" for k in _PLACES)
+ROWS = ", ".join(f"{STEP * (k // SIDE - SIDE // 2)}.0f" for k in _PLACES)
+CORRELATION = f"""
+#pragma clang fp reassociate(on) contract(fast)
+    const float b0 = b[0], b1 = b[1], b2 = b[2];
+    const float p0 = plane[0], p1 = plane[1], p2 = plane[2];
+    const float s0 = a.data[0][0] * u + a.data[0][1] * v + a.data[0][2] + b0 * p0;
+    const float s1 = a.data[1][0] * u + a.data[1][1] * v + a.data[1][2] + b1 * p0;
+    const float s2 = a.data[2][0] * u + a.data[2][1] * v + a.data[2][2] + b2 * p0;
+    const float c0 = a.data[0][0] + b0 * p1, c1 = a.data[1][0] + b1 * p1, c2 = a.data[2][0] + b2 * p1;
+    const float d0 = a.data[0][1] + b0 * p2, d1 = a.data[1][1] + b1 * p2, d2 = a.data[2][1] + b2 * p2;
+    const float columns[] = {{ {COLUMNS} }}, rows[] = {{ {ROWS} }};
+    const float right = (float)size[1] - 0.51f, low = (float)size[2] - 0.51f;
+    const float* pixels = images.data + size[0];
+    const int width = size[1];
+    float x[{LANES}], y[{LANES}];
+    int beyond = 0;
+    for (int k = 0; k < {LANES}; ++k) {{
+        const float depth = s2 + c2 * columns[k] + d2 * rows[k];
+        x[k] = (s0 + c0 * columns[k] + d0 * rows[k]) / depth;
+        y[k] = (s1 + c1 * columns[k] + d1 * rows[k]) / depth;
+        beyond |= (depth < 1.0e-6f) | (x[k] < 0.5f) | (y[k] < 0.5f) | (x[k] > right) | (y[k] > low);
+    }}
+    if (beyond) return -2.0f;
+    float total = 0.0f, square = 0.0f, product = 0.0f;
+    for (int k = 0; k < {LANES}; ++k) {{
+        const int j = (int)(x[k] - 0.5f), i = (int)(y[k] - 0.5f);
+        const float fx = x[k] - 0.5f - (float)j, fy = y[k] - 0.5f - (float)i;
+        const int at = i * width + j;
+        const float top = pixels[at] + fx * (pixels[at + 1] - pixels[at]);
+        const float under = pixels[at + width] + fx * (pixels[at + width + 1] - pixels[at + width]);
+        const float value = top + fy * (under - top), w = weight.c[k], g = grey.c[k];
+        total += w * value;
+        square += w * value * value;
+        product += w * value * g;
+    }}
+    const float spread = square - total * total;
+    return spread < {FLAT}f ? 0.0f : (product - total * mean) / sqrtf(spread * variance);
+"""
+
+
+@wp.func_native(CORRELATION)
 def correlation(
     plane: wp.vec3,
     u: float,
@@ -60,31 +103,7 @@ def correlation(
     size: wp.vec3i,
 ) -> float:
     """Weighted normalised cross-correlation of a window and its image in another photo; -2 where that does not show it."""
-    start = a * wp.vec3(u, v, 1.0) + b * plane[0]
-    across = wp.vec3(a[0, 0], a[1, 0], a[2, 0]) + b * plane[1]
-    down = wp.vec3(a[0, 1], a[1, 1], a[2, 1]) + b * plane[2]
-    total = float(0.0)
-    square = float(0.0)
-    product = float(0.0)
-    for k in range(SAMPLES):
-        i = float(across_of(k))
-        j = float(down_of(k))
-        h = start + across * i + down * j
-        if h[2] < 1.0e-6:
-            return float(-2.0)
-        x = h[0] / h[2]
-        y = h[1] / h[2]
-        if x < 0.5 or y < 0.5 or x > float(size[1]) - 0.51 or y > float(size[2]) - 0.51:
-            return float(-2.0)
-        value = bilinear(images, size[0], size[1], x, y)
-        w = weight[k]
-        total = total + w * value
-        square = square + w * value * value
-        product = product + w * value * grey[k]
-    spread = square - total * total
-    if spread < FLAT:
-        return float(0.0)
-    return (product - total * mean) / wp.sqrt(spread * variance)
+    ...
 
 
 @wp.func
