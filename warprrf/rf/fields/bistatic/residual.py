@@ -11,6 +11,7 @@ Both are fitted by Gauss-Newton with conjugate gradients: the Jacobian is the me
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
 
@@ -18,6 +19,7 @@ import numpy as np
 from scipy.sparse import block_diag, csr_matrix, hstack, identity, vstack
 from scipy.sparse.linalg import LinearOperator, cg
 
+from warprrf.device import threads
 from warprrf.rf.fields.bistatic.measured import read
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, Observation, huber
 from warprrf.rf.tracing.model import Model
@@ -85,29 +87,30 @@ def fit_residual(
         noise_db: standard deviation of a reading's error.
     """
     rounds, conjugate = (2, 8) if quick else (4, 12)  # Gauss-Newton steps, and of conjugate gradients in each
-    at_once = 64  # receivers that go through a measurement together
-    power = vstack([s.power for s in shares], format="csr")
+    at_once = 16  # receivers that go through a measurement together
     own_rows = [slice(*own) for own in pairwise(np.cumsum([0, *(len(s.rest) for s in shares)]))]
-    # Receivers that are measured alike go through the measurement together.
+    # Receivers that are measured alike go through the measurement together, batches of them side by side.
     alike = [list(own) for _, own in groupby(shares, key=lambda s: s.observed.measured.alike)]
     batches = [own[k : k + at_once] for own in alike for k in range(0, len(own), at_once)]
-    bins = np.cumsum([0, *(len(b) * b[0].power.shape[0] for b in batches)])
-    rows = np.cumsum([0, *(len(b) * len(b[0].rest) for b in batches)])
+    powers = [vstack([s.power for s in batch], format="csr") for batch in batches]
+    counts = np.cumsum([len(batch) * len(batch[0].rest) for batch in batches])
 
     def spread(values: np.ndarray, quick: bool = True) -> np.ndarray:
-        power_of = power @ values.astype(np.float32)
-        found = np.empty(rows[-1])
-        for k, batch in enumerate(batches):
-            table = power_of[bins[k] : bins[k + 1]].reshape(len(batch), -1).T
-            found[rows[k] : rows[k + 1]] = batch[0].observed.measured.of_bins(table, quick=quick).T.ravel()
-        return found
+        single = values.astype(np.float32)
+
+        def of(batch: list[Shares], power: csr_matrix) -> np.ndarray:
+            table = (power @ single).reshape(len(batch), -1).T
+            return batch[0].observed.measured.of_bins(table, quick=quick).T.ravel()
+
+        return np.concatenate(list(pool.map(of, batches, powers)), dtype=np.float64)
 
     def gather(readings: np.ndarray) -> np.ndarray:
-        back = np.empty(bins[-1], np.float32)
-        for k, batch in enumerate(batches):
-            table = readings[rows[k] : rows[k + 1]].reshape(len(batch), -1).T
-            back[bins[k] : bins[k + 1]] = batch[0].observed.measured.to_bins(table).T.ravel()
-        return np.asarray(power.T @ back)
+        def of(batch: list[Shares], power: csr_matrix, own: np.ndarray) -> np.ndarray:
+            table = own.reshape(len(batch), -1).T
+            return np.asarray(power.T @ batch[0].observed.measured.to_bins(table).T.ravel())
+
+        parts = pool.map(of, batches, powers, np.split(readings, counts[:-1]))
+        return np.sum(list(parts), axis=0)
 
     # Unknowns have unit variance a priori: elements and cells of single bounces, then of light that is sent on.
     deviations = ((0.5, 0.5), (1.0, 2.0))  # of elements and of cells of each from a gain of 1 [nepers]
@@ -118,22 +121,23 @@ def fit_residual(
     )
     largest, longest = 4.0, 3.0  # gain [nepers], and step of one in standard deviations
     unknown = np.zeros(gains.shape[1])
-    for _ in range(rounds):
-        gain = np.exp(np.clip(gains @ unknown, -largest, largest))
-        pull, weight = spread(gain, quick=False), np.empty(rows[-1])
-        for s, own in zip(shares, own_rows, strict=True):
-            total = np.maximum(pull[own], 0.0) + s.rest
-            error, slope = s.observed.target.error(total), s.observed.target.slope(total)
-            robust = huber(error, s.observed.huber_db)[1] / noise_db**2
-            pull[own], weight[own] = slope * robust * error, slope**2 * robust
+    with ThreadPoolExecutor(threads()) as pool:
+        for _ in range(rounds):
+            gain = np.exp(np.clip(gains @ unknown, -largest, largest))
+            pull, weight = spread(gain, quick=False), np.empty(counts[-1])
+            for s, own in zip(shares, own_rows, strict=True):
+                total = np.maximum(pull[own], 0.0) + s.rest
+                error, slope = s.observed.target.error(total), s.observed.target.slope(total)
+                robust = huber(error, s.observed.huber_db)[1] / noise_db**2
+                pull[own], weight[own] = slope * robust * error, slope**2 * robust
 
-        def curvature(v: np.ndarray, gain: np.ndarray = gain, weight: np.ndarray = weight) -> np.ndarray:
-            readings = spread(gain * (gains @ v))
-            readings *= weight
-            return np.asarray(gains.T @ (gain * gather(readings)) + v)
+            def curvature(v: np.ndarray, gain: np.ndarray = gain, weight: np.ndarray = weight) -> np.ndarray:
+                readings = spread(gain * (gains @ v))
+                readings *= weight
+                return np.asarray(gains.T @ (gain * gather(readings)) + v)
 
-        gradient = gains.T @ (gain * gather(pull)) + unknown
-        system = LinearOperator((len(unknown),) * 2, matvec=curvature, dtype=np.float64)
-        step = cg(system, -gradient, rtol=0.0, atol=1e-6, maxiter=conjugate)[0]
-        unknown += np.clip(step, -longest, longest)
+            gradient = gains.T @ (gain * gather(pull)) + unknown
+            system = LinearOperator((len(unknown),) * 2, matvec=curvature, dtype=np.float64)
+            step = cg(system, -gradient, rtol=0.0, atol=1e-6, maxiter=conjugate)[0]
+            unknown += np.clip(step, -longest, longest)
     return np.clip(gains @ unknown, -largest, largest).reshape(2, -1)
