@@ -15,9 +15,13 @@ from warprrf.device import require
 
 FIGURES: tuple[tuple[str, str, str], ...] = (
     ("photo_psnr_db", "held-out photo PSNR of stage 1", "dB"),
-    ("photo_noise_psnr_db", "PSNR between two render seeds of a view (the photos' own noise)", "dB"),
-    ("camera_rms_m", "surveyed-scale camera positions, rms error", "m"),
-    ("mesh_distance_median_m", "mesh to true surface where a photo sees it, median", "m"),
+    ("photo_noise_psnr_db", "PSNR between two renderings of one photo with different noise", "dB"),
+    ("camera_rms_m", "camera positions, rms error", "m"),
+    (
+        "mesh_distance_median_m",
+        "distance of the mesh to the true surface, where a photo sees it: median",
+        "m",
+    ),
     ("mesh_distance_p90_m", "the same, 90th percentile", "m"),
     ("mesh_normal_median_deg", "mesh normal error, median", "degrees"),
     ("pipeline_time_s", "photos to evaluation, set-up apart", "s"),

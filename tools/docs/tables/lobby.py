@@ -90,7 +90,7 @@ def _lobby_seeds() -> str:
     found = read("lobby_seeds")
     lines = [
         [
-            _seeded(r["figure"]),
+            _seeded(r),
             *(show(r[k], "{:.4g}") for k in ("mean", "spread", "least", "most")),
         ]
         for r in found["rows"]
@@ -104,20 +104,14 @@ def _lobby_seeds() -> str:
     )
 
 
-def _seeded(figure: str) -> str:
+def _seeded(row: Row) -> str:
     """A figure of several seeds in the words of the other tables."""
-    words = {
-        "psnr_db_blocked": "PSNR, blocked [dB]", "psnr_db": "PSNR [dB]", "bistatic (ours)": "bistatic",
-        "truth exact": f"truth of {TRUTHS['exact']}", "truth Sionna RT": f"truth of {TRUTHS['sionna']}",
-        "surveyed-scale camera positions, rms error [m]": "camera positions, rms error [m]",
-        "PSNR between two render seeds of a view (the photos' own noise) [dB]": "PSNR between two renderings of one photo with "
-        "different noise [dB]",
-        "mesh to true surface where a photo sees it, median [m]": "distance of the mesh to the true surface, where a photo sees "
-        "it: median [m]",
-    }  # fmt: skip
-    for word, said in words.items():
-        figure = figure.replace(word, said)
-    return figure
+    if not row["key"].startswith("methods"):
+        return row["figure"]
+    group, method, score = row["key"].split(".")
+    truth = TRUTHS["sionna" if group == "methods_sionna" else "exact"]
+    heading = {key: name for key, name, _ in SCORES}[score]
+    return f"{_name(method).replace('**', '')}, truth of {truth}: {heading}"
 
 
 @entry("ablation")
