@@ -40,6 +40,25 @@ def places(found: wp.array(dtype=wp.vec2i)):
     found[k] = wp.vec2i(patch_match.across_of(k), patch_match.down_of(k))
 
 
+@wp.kernel
+def correlations(
+    planes: wp.array(dtype=wp.vec3),
+    greys: wp.array(dtype=patch_match.window),
+    weights: wp.array(dtype=patch_match.window),
+    moments: wp.array(dtype=wp.vec2),
+    turn: wp.mat33,
+    shift: wp.vec3,
+    images: wp.array(dtype=wp.float32),
+    size: wp.vec3i,
+    found: wp.array(dtype=wp.float32),
+):
+    k = wp.tid()
+    m = moments[k]
+    found[k] = patch_match.correlation(
+        planes[k], 20.5, 15.5, greys[k], weights[k], m[0], m[1], turn, shift, images, size
+    )
+
+
 @pytest.fixture(scope="module")
 def room():
     cameras = [
@@ -95,6 +114,50 @@ def test_a_window_is_a_chess_board_round_its_middle():
     wp.launch(places, dim=13, inputs=[found], device="cpu")
     board = {(i, j) for i in range(-4, 5, 2) for j in range(-4, 5, 2) if (i + j) % 4 == 0}
     assert set(map(tuple, found.numpy().tolist())) == board and len(board) == 13
+
+
+def test_a_window_correlates_with_what_another_photo_shows_at_its_places():
+    """Against NumPy and SciPy's interpolation, for planes that lie in the other photo and beyond each of its borders."""
+    rng, n, (height, width) = np.random.default_rng(7), 4000, (40, 50)
+    image = ndimage.gaussian_filter(rng.random((height, width)), 1.0).astype(np.float32)
+    board = [(i, j) for j in range(-4, 5, 2) for i in range(-4, 5, 2) if (i + j) % 4 == 0]
+    turn = np.eye(3) + rng.normal(0, 0.02, (3, 3)) * [[1, 1, 20], [1, 1, 20], [0.02, 0.02, 0.1]]
+    shift = np.array([3.0, -2.0, 0.1])
+    planes = np.stack([rng.uniform(-12, 12, n), *rng.normal(0, 0.1, (2, n))], axis=1)
+    greys, weights = np.zeros((n, 16)), np.zeros((n, 16))
+    greys[:, :13], weights[:, :13] = rng.random((n, 13)), rng.random((n, 13))
+    weights /= weights.sum(axis=1, keepdims=True)
+    mean = (weights * greys).sum(axis=1)
+    variance = (weights * greys**2).sum(axis=1) - mean**2
+    pixel = np.array([(20.5 + i, 15.5 + j, 1.0) for i, j in board])
+    inverse = planes[:, :1] + planes[:, 1:] @ np.array(board).T
+    h = pixel @ turn.T + inverse[..., None] * shift
+    x, y = h[..., 0] / h[..., 2], h[..., 1] / h[..., 2]
+    there = (h[..., 2] > 1e-6) & (x > 0.5) & (y > 0.5) & (x < width - 0.51) & (y < height - 0.51)
+    value = ndimage.map_coordinates(image, [y - 0.5, x - 0.5], order=1, mode="nearest")
+    w = weights[:, :13]
+    total, square = (w * value).sum(axis=1), (w * value**2).sum(axis=1)
+    product = (w * value * greys[:, :13]).sum(axis=1)
+    expected = (product - total * mean) / np.sqrt(np.maximum(square - total**2, 1e-12) * variance)
+    expected[~there.all(axis=1)] = -2.0
+    found = wp.zeros(n, dtype=wp.float32, device="cpu")
+    given = [
+        wp.array(planes, dtype=wp.vec3, device="cpu"), wp.array(greys, dtype=patch_match.window, device="cpu"),
+        wp.array(weights, dtype=patch_match.window, device="cpu"),
+        wp.array(np.stack([mean, variance], axis=1), dtype=wp.vec2, device="cpu"), wp.mat33(turn), wp.vec3(shift),
+        wp.array(np.concatenate([np.zeros(7), image.ravel()]), dtype=wp.float32, device="cpu"),
+        wp.vec3i(7, width, height),
+    ]  # fmt: skip
+    wp.launch(correlations, dim=n, inputs=[*given, found], device="cpu")
+    one_sided = [
+        (x.min(axis=1) < 0.5),
+        (y.min(axis=1) < 0.5),
+        (x.max(axis=1) > width - 0.51),
+        (y.max(axis=1) > height - 0.51),
+    ]
+    assert min(side.sum() for side in one_sided) > 50 and (expected > -2).mean() > 0.2
+    near = np.abs(np.stack([x - 0.5, y - 0.5, x - width + 0.51, y - height + 0.51])).min(axis=(0, 2)) < 1e-3
+    np.testing.assert_allclose(found.numpy()[~near], expected[~near], atol=2e-3)
 
 
 def test_photos_mend_wrong_depths(room, spoiled, found):

@@ -11,6 +11,7 @@ from trimesh.remesh import subdivide_to_size
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import NEPER
+from warprrf.rf.fields.bistatic import residual
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
 from warprrf.rf.fields.bistatic.residual import fit_residual, shares_of
@@ -66,6 +67,15 @@ def test_planted_gains_come_back(field):
         within = found[0] - (np.bincount(element, found[0]) / np.bincount(element))[element]
         assert within.std() < 0.5 * smooth[0].std()
     assert np.mean(found_again) > 0.9
+
+
+def test_receivers_in_several_batches_teach_what_they_do_in_one(field, monkeypatch):
+    gains = np.random.default_rng(8).normal(0.0, 0.3, field.residual.shape)
+    shares = planted_shares(field, gains)
+    expected = fit_residual(shares, field.surface)
+    monkeypatch.setattr(residual, "AT_ONCE", 2)
+    assert np.abs(expected).max() > 0.3
+    np.testing.assert_allclose(fit_residual(shares, field.surface), expected, atol=1e-3)
 
 
 def test_nothing_seen_is_nothing_learned(field):

@@ -28,6 +28,8 @@ from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import SPECULAR
 
+AT_ONCE = 16  # receivers that go through a measurement together
+
 
 @dataclass(frozen=True)
 class Shares:
@@ -87,11 +89,10 @@ def fit_residual(
         noise_db: standard deviation of a reading's error.
     """
     rounds, conjugate = (2, 8) if quick else (4, 12)  # Gauss-Newton steps, and of conjugate gradients in each
-    at_once = 16  # receivers that go through a measurement together
     own_rows = [slice(*own) for own in pairwise(np.cumsum([0, *(len(s.rest) for s in shares)]))]
     # Receivers that are measured alike go through the measurement together, batches of them side by side.
     alike = [list(own) for _, own in groupby(shares, key=lambda s: s.observed.measured.alike)]
-    batches = [own[k : k + at_once] for own in alike for k in range(0, len(own), at_once)]
+    batches = [own[k : k + AT_ONCE] for own in alike for k in range(0, len(own), AT_ONCE)]
     powers = [vstack([s.power for s in batch], format="csr") for batch in batches]
     counts = np.cumsum([len(batch) * len(batch[0].rest) for batch in batches])
 
