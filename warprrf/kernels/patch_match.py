@@ -34,21 +34,10 @@ STEEPEST = wp.constant(6.0)  # tangent of a plane's largest angle to the image
 window = wp.types.vector(length=LANES, dtype=wp.float32)
 
 
-@wp.func
-def across_of(sample: int) -> int:
-    """Columns from a window's middle to one of its samples."""
-    return STEP * ((2 * sample) % wp.static(SIDE) - wp.static(SIDE // 2))
-
-
-@wp.func
-def down_of(sample: int) -> int:
-    """Rows from a window's middle to one of its samples."""
-    return STEP * ((2 * sample) // wp.static(SIDE) - wp.static(SIDE // 2))
-
-
 _PLACES = [*range(0, SIDE * SIDE, 2), *(0,) * (LANES - SAMPLES)]
-COLUMNS = ", ".join(f"{STEP * (k % SIDE - SIDE // 2)}.0f" for k in _PLACES)
-ROWS = ", ".join(f"{STEP * (k // SIDE - SIDE // 2)}.0f" for k in _PLACES)
+COLUMNS = wp.constant(window(*(float(STEP * (k % SIDE - SIDE // 2)) for k in _PLACES)))
+ROWS = wp.constant(window(*(float(STEP * (k // SIDE - SIDE // 2)) for k in _PLACES)))
+"""From a window's middle to its samples [pixels]."""
 CORRELATION = f"""
 #pragma clang fp reassociate(on) contract(fast)
     const float b0 = b[0], b1 = b[1], b2 = b[2];
@@ -58,7 +47,7 @@ CORRELATION = f"""
     const float s2 = a.data[2][0] * u + a.data[2][1] * v + a.data[2][2] + b2 * p0;
     const float c0 = a.data[0][0] + b0 * p1, c1 = a.data[1][0] + b1 * p1, c2 = a.data[2][0] + b2 * p1;
     const float d0 = a.data[0][1] + b0 * p2, d1 = a.data[1][1] + b1 * p2, d2 = a.data[2][1] + b2 * p2;
-    const float columns[] = {{ {COLUMNS} }}, rows[] = {{ {ROWS} }};
+    const float columns[] = {{ {", ".join(map(str, COLUMNS))} }}, rows[] = {{ {", ".join(map(str, ROWS))} }};
     const float right = (float)size[1] - 0.51f, low = (float)size[2] - 0.51f;
     const float* pixels = images.data + size[0];
     const int width = size[1];
@@ -210,8 +199,8 @@ def match(
     weight = window()
     whole = float(0.0)
     for k in range(SAMPLES):
-        x = wp.clamp(j + across_of(k), 0, width - 1)
-        y = wp.clamp(i + down_of(k), 0, height - 1)
+        x = wp.clamp(j + int(COLUMNS[k]), 0, width - 1)
+        y = wp.clamp(i + int(ROWS[k]), 0, height - 1)
         grey[k] = images[size[0] + y * width + x]
         weight[k] = wp.exp(-wp.abs(grey[k] - middle) / SIMILAR)
         whole = whole + weight[k]

@@ -35,12 +35,6 @@ def truth(camera):
 
 
 @wp.kernel
-def places(found: wp.array(dtype=wp.vec2i)):
-    k = wp.tid()
-    found[k] = wp.vec2i(patch_match.across_of(k), patch_match.down_of(k))
-
-
-@wp.kernel
 def correlations(
     planes: wp.array(dtype=wp.vec3),
     greys: wp.array(dtype=patch_match.window),
@@ -110,10 +104,9 @@ def patterned(room):
 
 
 def test_a_window_is_a_chess_board_round_its_middle():
-    found = wp.zeros(13, dtype=wp.vec2i, device="cpu")
-    wp.launch(places, dim=13, inputs=[found], device="cpu")
+    places = list(zip(patch_match.COLUMNS, patch_match.ROWS, strict=True))[: patch_match.SAMPLES]
     board = {(i, j) for i in range(-4, 5, 2) for j in range(-4, 5, 2) if (i + j) % 4 == 0}
-    assert set(map(tuple, found.numpy().tolist())) == board and len(board) == 13
+    assert set(places) == board and len(board) == len(places) == 13
 
 
 @pytest.mark.parametrize("shift", [(3.5, 0.1, 0.01), (-0.1, 3.5, 0.01)])
