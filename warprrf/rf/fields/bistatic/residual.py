@@ -28,7 +28,7 @@ from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import SPECULAR
 
-AT_ONCE = 16  # receivers that go through a measurement together
+AT_ONCE = 8  # receivers that go through a measurement together
 
 
 @dataclass(frozen=True)
