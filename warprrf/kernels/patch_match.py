@@ -34,6 +34,22 @@ STEEPEST = wp.constant(6.0)  # tangent of a plane's largest angle to the image
 window = wp.types.vector(length=LANES, dtype=wp.float32)
 
 
+@wp.struct
+class Others:
+    """Photos that one is compared with: ``A``, ``b`` and size of each, and what all photos have so far.
+
+    ``images`` and ``told``, their planes, are laid out alike; a plane costs ``contradicting`` where it contradicts the one that
+    is told of another photo.
+    """
+
+    turns: wp.array(dtype=wp.mat33)
+    shifts: wp.array(dtype=wp.vec3)
+    sizes: wp.array(dtype=wp.vec3i)
+    images: wp.array(dtype=wp.float32)
+    told: wp.array(dtype=wp.vec3)
+    contradicting: float
+
+
 _PLACES = [*range(0, SIDE * SIDE, 2), *(0,) * (LANES - SAMPLES)]
 COLUMNS = wp.constant(window(*(float(STEP * (k % SIDE - SIDE // 2)) for k in _PLACES)))
 ROWS = wp.constant(window(*(float(STEP * (k // SIDE - SIDE // 2)) for k in _PLACES)))
@@ -125,20 +141,18 @@ def disagreement(
     weight: window,
     mean: float,
     variance: float,
-    turns: wp.array(dtype=wp.mat33),
-    shifts: wp.array(dtype=wp.vec3),
-    sizes: wp.array(dtype=wp.vec3i),
-    images: wp.array(dtype=wp.float32),
-    told: wp.array(dtype=wp.vec3),
-    contradicting: float,
+    others: Others,
 ) -> float:
     """One minus the mean of the two best correlations: what hides a surface in some photos does not count."""
     best = float(-2.0)
     second = float(-2.0)
-    for s in range(sizes.shape[0]):
-        c = correlation(plane, u, v, grey, weight, mean, variance, turns[s], shifts[s], images, sizes[s])
-        if contradicting > 0.0 and c > -1.5:
-            c = c - contradicting * contradiction(plane, u, v, turns[s], shifts[s], told, sizes[s])
+    for s in range(others.sizes.shape[0]):
+        a = others.turns[s]
+        b = others.shifts[s]
+        size = others.sizes[s]
+        c = correlation(plane, u, v, grey, weight, mean, variance, a, b, others.images, size)
+        if others.contradicting > 0.0 and c > -1.5:
+            c = c - others.contradicting * contradiction(plane, u, v, a, b, others.told, size)
         if c > best:
             second = best
             best = c
@@ -159,12 +173,7 @@ def match(
     bounds: wp.vec2,
     settled: float,
     size: wp.vec3i,
-    turns: wp.array(dtype=wp.mat33),
-    shifts: wp.array(dtype=wp.vec3),
-    sizes: wp.array(dtype=wp.vec3i),
-    images: wp.array(dtype=wp.float32),
-    told: wp.array(dtype=wp.vec3),
-    contradicting: float,
+    others: Others,
     planes: wp.array(dtype=wp.vec3),
     costs: wp.array(dtype=wp.float32),
 ):
@@ -175,10 +184,7 @@ def match(
         slope: change of inverse depth per pixel, over itself, of a plane at 45 degrees to the image.
         bounds: lowest and highest inverse depth [1/m].
         settled: planes of less cost stay.
-        size: of the photo: where it begins in ``images``, its width and its height.
-        turns, shifts, sizes: ``A``, ``b`` and size of each photo that it is compared with.
-        told: planes that all photos have so far, as ``images`` are laid out.
-        contradicting: cost of a plane that contradicts the one that is told of another photo.
+        size: of the photo: where it begins in ``others.images``, its width and its height.
     """
     n = offset + wp.tid()
     width = size[1]
@@ -194,14 +200,14 @@ def match(
     cost = costs[here]
     if turn >= 0 and (cost < settled or cost > UNKNOWN):
         return
-    middle = images[size[0] + here]
+    middle = others.images[size[0] + here]
     grey = window()
     weight = window()
     whole = float(0.0)
     for k in range(SAMPLES):
         x = wp.clamp(j + int(COLUMNS[k]), 0, width - 1)
         y = wp.clamp(i + int(ROWS[k]), 0, height - 1)
-        grey[k] = images[size[0] + y * width + x]
+        grey[k] = others.images[size[0] + y * width + x]
         weight[k] = wp.exp(-wp.abs(grey[k] - middle) / SIMILAR)
         whole = whole + weight[k]
     mean = float(0.0)
@@ -216,9 +222,7 @@ def match(
         return
     best = planes[here]
     if turn < 0:
-        costs[here] = disagreement(
-            best, u, v, grey, weight, mean, variance, turns, shifts, sizes, images, told, contradicting
-        )
+        costs[here] = disagreement(best, u, v, grey, weight, mean, variance, others)
         return
     for k in range(4):
         y = int(-1)
@@ -241,21 +245,7 @@ def match(
             new = wp.abs(w - best[0]) + wp.static(1.0 * SIDE) * bend > SAME * best[0]
             if new and w > bounds[0] and w < bounds[1]:
                 trial = wp.vec3(w, other[1], other[2])
-                c = disagreement(
-                    trial,
-                    u,
-                    v,
-                    grey,
-                    weight,
-                    mean,
-                    variance,
-                    turns,
-                    shifts,
-                    sizes,
-                    images,
-                    told,
-                    contradicting,
-                )
+                c = disagreement(trial, u, v, grey, weight, mean, variance, others)
                 if c < cost:
                     cost = c
                     best = trial
@@ -270,9 +260,7 @@ def match(
         dy = wp.clamp(best[2] + reach * 4.0 * slope * w * wp.randf(state, -1.0, 1.0), -limit, limit)
         if w > bounds[0] and w < bounds[1]:
             trial = wp.vec3(w, dx, dy)
-            c = disagreement(
-                trial, u, v, grey, weight, mean, variance, turns, shifts, sizes, images, told, contradicting
-            )
+            c = disagreement(trial, u, v, grey, weight, mean, variance, others)
             if c < cost:
                 cost = c
                 best = trial

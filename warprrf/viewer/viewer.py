@@ -149,8 +149,6 @@ class Viewer:
             raise ValueError(f"path: got {os.fspath(path)!r}, expected a name that ends in .html or .png")
         write_bytes(path, kinds[suffix]())
 
-    # ------------------------------------------------------------------------------------------ what is dragged
-
     def _add_gizmos(self) -> None:
         low, high = self.subject.bounds
         middle, first, places = 0.5 * (low + high), self.subject.transmitter, self.subject.places
@@ -187,8 +185,6 @@ class Viewer:
         hit = self.subject.mesh.cast(origin[None], direction[None])
         if np.isfinite(hit.t[0]):
             self.add_transmitter(hit.point[0] - 0.2 * direction)
-
-    # ------------------------------------------------------------------------------------------ answers
 
     def _asked(self) -> answers.Source | None:
         """What is asked, as the settings say."""
@@ -239,8 +235,6 @@ class Viewer:
             + f" ({1e3 * found.seconds:.0f} ms)"
         )
         return found
-
-    # ------------------------------------------------------------------------------------------ sharing
 
     def _add_share(self) -> None:
         gui = self._page.gui

@@ -15,12 +15,12 @@ import numpy as np
 import warp as wp
 from scipy import ndimage
 
-from warprrf.device import DeviceLike, Progress, launch
+from warprrf.device import DeviceLike, Progress, filled, launch
 from warprrf.geometry.photos.cells import in_frame
 from warprrf.geometry.photos.grey import GreyPhotos, lens_matrix
 from warprrf.geometry.photos.targets import PosedPhotos
 from warprrf.geometry.splats.camera import Camera
-from warprrf.kernels.patch_match import UNKNOWN, match
+from warprrf.kernels.patch_match import UNKNOWN, Others, match
 
 GOOD_ANGLE_DEG = 9.0  # between two lines of sight: less tells depths badly, more changes what a window shows
 SOURCES = 3  # photos that one is compared with
@@ -162,11 +162,10 @@ class _Comparison:
         lenses = [lens_matrix(cameras[s]) for s in others]
         rotations = np.array([k @ r @ inverse for k, r in zip(lenses, turn, strict=True)], dtype=np.float32)
         shifts = np.array([k @ t for k, t in zip(lenses, shift, strict=True)], dtype=np.float32)
-        sources = [
-            wp.array(rotations, dtype=wp.mat33, device=device), wp.array(shifts, dtype=wp.vec3, device=device),
-            wp.array(sizes[others], dtype=wp.vec3i, device=device), self.photos.flat, told, contradicting,
-            planes, costs,
-        ]  # fmt: skip
+        sources = filled(
+            Others, device, turns=rotations, shifts=shifts, sizes=sizes[others], images=self.photos.flat, told=told,
+            contradicting=contradicting,
+        )  # fmt: skip
         for number in (-1, *turns):
             for colour in (0, 1):
                 settings = [
@@ -174,7 +173,7 @@ class _Comparison:
                     wp.vec3i(*map(int, sizes[view])),
                 ]  # fmt: skip
                 count = camera.height * ((camera.width + 1) // 2)
-                launch(match, count, [*settings, *sources], device=device, grain=32)
+                launch(match, count, [*settings, sources, planes, costs], device=device, grain=32)
         return planes.numpy().reshape(first.shape), costs.numpy().reshape(first.shape[:2])
 
 

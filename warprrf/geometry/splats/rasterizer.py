@@ -358,8 +358,8 @@ class Rasterizer:
     def _stretches(self, width: int, inputs: list[Any]) -> wp.array:
         """Whole stretches of the lists, each blended by itself."""
         count, lanes = len(inputs[1]) // reference.STRETCH, reference.LANES
-        dtype = reference.layers_of(self.real, width)
-        found = wp.empty((count, lanes), dtype=dtype, device=self.device)
+        kind = reference.layers(self.real, width).Layers
+        found = wp.empty((count, lanes), dtype=kind, device=self.device)
         kernel = reference.build_stretches(self.real, width)
         launch(kernel, count * lanes, [*inputs, found], device=self.device, grain=lanes * GRAIN)
         return found

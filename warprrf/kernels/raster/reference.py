@@ -3,9 +3,8 @@
 A GPU runs these. On a CPU :mod:`.blocks` computes the same 16 pixels at a time, and tests compare the two. Threads go
 tile by tile; a tile's entries ``ids[starts[tile]:starts[tile + 1]]`` are the Gaussians that it may see, near to far.
 What a GPU waits for is memory: its 16 threads of a tile each fetch one of the 16 rows that all of them walk next
-(:func:`touch`), and what they add to a Gaussian is summed before it leaves the warp (:func:`build_add`). Nor may a few
-threads walk a long list while the others have finished: the entries of all lists, one after the other, are cut into
-stretches, which are blended side by side (:func:`build_stretches`) and then laid one behind the other.
+(:func:`touch`), and what they add to a Gaussian is summed before it leaves the warp (:func:`build_add`). Few threads
+would walk a long list alone: stretches of it are blended side by side (:func:`build_stretches`).
 """
 
 from types import SimpleNamespace
@@ -68,9 +67,12 @@ def pair_sums(s: Any, slope: Any, q: Any, y1: Any, y2: Any, h0: Any, h1: Any, h2
 
 
 @once
-def layers_of(real: type, width: int) -> Any:
-    """The struct of what a pixel has met, for ``width`` channels."""
+def layers(real: type, width: int) -> SimpleNamespace:
+    """What a pixel has met, the walk along a list, and what was met on two parts of it as one, for ``width`` channels."""
+    vec3 = wp.types.vector(3, real)
     values = wp.types.vector(width, real)
+    Splat = splat_of(real)
+    least = 1.0e-30 if real is wp.float32 else 1.0e-250
 
     @wp.struct
     class Layers:
@@ -81,16 +83,6 @@ def layers_of(real: type, width: int) -> Any:
         best: real  # the largest weight, its range and its Gaussian
         peak: real
         owner: int
-
-    return Layers
-
-
-@once
-def layer_functions(real: type, width: int) -> SimpleNamespace:
-    """The walk along a list, and what was met on two parts of it as one, for ``width`` channels."""
-    vec3 = wp.types.vector(3, real)
-    Layers, Splat = layers_of(real, width), splat_of(real)
-    least = 1.0e-30 if real is wp.float32 else 1.0e-250
 
     @wp.func
     def nothing():
@@ -153,16 +145,15 @@ def layer_functions(real: type, width: int) -> SimpleNamespace:
         met.transmittance = through * back.transmittance
         return met
 
-    return SimpleNamespace(nothing=nothing, walk=walk, over=over)
+    return SimpleNamespace(Layers=Layers, nothing=nothing, walk=walk, over=over)
 
 
 @once
 def build_stretches(real: type, width: int) -> Any:
     """The kernel that blends every whole stretch of a list by itself, as :func:`build_blend` makes it."""
     vec3 = wp.types.vector(3, real)
-    Layers, Splat = layers_of(real, width), splat_of(real)
-    of = layer_functions(real, width)
-    nothing, walk = of.nothing, of.walk
+    Splat, of = splat_of(real), layers(real, width)
+    Layers, nothing, walk = of.Layers, of.nothing, of.walk
 
     @wp.kernel(module="unique", enable_backward=False)
     def blend_stretches(
@@ -197,9 +188,8 @@ def build_stretches(real: type, width: int) -> Any:
 def build_blend(real: type, width: int) -> Any:
     """The kernel that blends ``width`` channels (1 to 4) at once, for ``wp.float32`` or ``wp.float64``."""
     vec3 = wp.types.vector(3, real)
-    Layers, Splat = layers_of(real, width), splat_of(real)
-    of = layer_functions(real, width)
-    nothing, walk, over = of.nothing, of.walk, of.over
+    Splat, of = splat_of(real), layers(real, width)
+    Layers, nothing, walk, over = of.Layers, of.nothing, of.walk, of.over
 
     @wp.kernel(module="unique", enable_backward=False)
     def blend(

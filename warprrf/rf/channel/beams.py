@@ -322,9 +322,6 @@ def signal_over_interference(
     return signal / (heard.sum(axis=1) - signal + noise * len(heard))
 
 
-# ------------------------------------------------------------------------------------------------------- pieces
-
-
 def _search(gains: list[np.ndarray], noise: float) -> dict[int, tuple[int, int]]:
     """Receiving and transmitting beam of each user, by ascent on the sum of rates."""
     served: dict[int, tuple[int, int]] = {}

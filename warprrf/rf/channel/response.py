@@ -208,9 +208,6 @@ def diffuse_power(paths: PathArrays, *, tx_array: End = None, rx_array: End = No
     return (scattered * gains).sum(axis=-1)
 
 
-# --------------------------------------------------------------------------------------------- one receiver's link
-
-
 @dataclass(frozen=True)
 class _Link:
     """Paths of one receiver between two arrays, ready to be summed.

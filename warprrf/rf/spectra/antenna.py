@@ -374,9 +374,6 @@ def main_lobe(antenna: Antenna) -> Antenna:
     return replace(antenna, pattern=_MainLobe(own, around, ends), polarisation=None)
 
 
-# ------------------------------------------------------------------------------------------------------- patterns
-
-
 def _isotropic(zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
     return np.ones(zenith.shape)
 

@@ -357,8 +357,6 @@ class BistaticField(RadioField):
         """
         return replace(self, **edited.with_objects(self, objects, materials or {}))
 
-    # ------------------------------------------------------------------------------------------ asking
-
     def spectrum(
         self,
         receivers: ArrayLike,
@@ -595,8 +593,6 @@ class BistaticField(RadioField):
         return self.errors.std_db(
             NEPER * np.log1p(power).reshape(image.shape), view.receivers[0], slopes, index
         )
-
-    # ------------------------------------------------------------------------------------------ files
 
     def _taken_apart(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         return files.taken_apart({f.name: getattr(self, f.name) for f in fields(self)})

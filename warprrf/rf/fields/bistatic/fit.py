@@ -172,9 +172,8 @@ def choose(t: Training) -> Solution:
 
 
 def _spared(t: Training, best: Solution, least: float) -> tuple[Solution, float]:
-    """``best`` and its loss without those of :data:`RARE` that readings are predicted better without: a scene may need what is
-    not in its readings (a simulation without diffraction), or what its mesh shows wrongly. Places held out are too few to
-    say so alone: none of them may be behind a wall."""
+    """``best`` and its loss without those of :data:`RARE` that readings are predicted better without. Places held out are too
+    few to say so alone: none of them may be behind a wall."""
     chosen, places = best, np.union1d(t.split.few(1), t.split.held)
     for name, on in RARE.items() if t.options.effects == "auto" and t.options.relevance is None else ():
         off: dict[str, Any] = dict.fromkeys(on, 0)
