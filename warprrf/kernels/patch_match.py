@@ -73,7 +73,7 @@ CORRELATION = f"""
         const float depth = s2 + c2 * columns[k] + d2 * rows[k];
         x[k] = (s0 + c0 * columns[k] + d0 * rows[k]) / depth;
         y[k] = (s1 + c1 * columns[k] + d1 * rows[k]) / depth;
-        beyond |= (depth < 1.0e-6f) | (x[k] < 0.5f) | (y[k] < 0.5f) | (x[k] > right) | (y[k] > low);
+        beyond |= !((depth >= 1.0e-6f) & (x[k] >= 0.5f) & (y[k] >= 0.5f) & (x[k] <= right) & (y[k] <= low));
     }}
     if (beyond) return -2.0f;
     float total = 0.0f, square = 0.0f, product = 0.0f;
