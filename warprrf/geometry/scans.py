@@ -44,6 +44,7 @@ class SurfaceConfig:
 
 
 PATCH_ANGLE_DEG = 35.0  # most between the smoothed normal of a face and that of its patch
+NEARLY_PARALLEL_DEG = 2.0  # twice what small planes err by in films of rooms
 MIN_PATCH_M2 = 0.15  # smallest planar patch
 SIMPLIFY_M = 0.25  # flat parts are made of faces of about this size in the end
 LONGEST_MOVE_M = 0.15  # of a vertex to its plane
@@ -61,7 +62,7 @@ def find_patches(
     """Which faces of ``mesh`` lie on which of the given planes, and which others on planes found among them.
 
     A patch gathers the faces near its plane that face its way; islands too small to matter are left out. Patch k lies
-    on ``planes[k]``; those of planes found here come after them.
+    on ``planes[k]``, turned where it is nearly parallel to a larger one; those of planes found here come after them.
     """
     config = config or SurfaceConfig()
     normals, areas = smoothed_normals(mesh, 3), mesh.areas
@@ -91,10 +92,37 @@ def find_patches(
     weights = areas[drawn] * (areas[free].sum() / max(areas[drawn].sum(), 1e-30))
     found = detect_planes(centres[drawn], normals[drawn], weights=weights, config=among_faces)
     gather(found, len(planes))
-    every = [*planes, *found]
+    every = _parallel(planes, found, mesh, label, config.patch_distance_m)
     return PlanarPatches.from_planes(
         mesh, label, [p.normal for p in every], [p.offset for p in every], tolerance_m=FLAT_M
     )
+
+
+def _parallel(
+    given: Sequence[Plane], found: Sequence[Plane], mesh: Mesh, label: np.ndarray, reach_m: float
+) -> list[Plane]:
+    """All planes, of the faces of each ``label``, those of less area parallel to larger ones that they are nearly parallel
+    to, and ``found`` to ``given`` ones: built rooms have few directions, and a small plane's is known badly. A plane turns
+    about the middle of its faces, unless that moves more than a tenth of them by ``reach_m``."""
+    centres, directions = mesh.triangles.mean(axis=1), list[np.ndarray]()
+    result = [*given, *found]
+    area = np.bincount(label[label >= 0], mesh.areas[label >= 0], minlength=len(result))
+    for k in np.lexsort((-area, np.arange(len(result)) >= len(given))):
+        own, plane = label == k, result[k]
+        if not own.any():
+            continue
+        middle = mesh.areas[own] @ centres[own] / area[k]
+        for direction in directions:
+            turned = np.sign(direction @ plane.normal) * direction
+            moved = np.abs((centres[own] - middle) @ (turned - plane.normal))
+            alike = turned @ plane.normal > np.cos(np.radians(NEARLY_PARALLEL_DEG))
+            if alike and np.percentile(moved, 90) < reach_m:
+                on_plane = middle - plane.distance(middle) * plane.normal
+                result[k] = replace(plane, normal=turned, offset=float(turned @ on_plane))
+                break
+        else:
+            directions.append(plane.normal)
+    return result
 
 
 def snapped(mesh: Mesh, planes: Sequence[Plane], config: SurfaceConfig) -> PlanarPatches:

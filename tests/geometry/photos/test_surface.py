@@ -147,6 +147,37 @@ def test_depth_maps_are_as_large_as_small_photos_and_smaller_than_large_ones():
         SurfaceConfig(depth_pixels=0)
 
 
+def test_small_planes_are_parallel_to_larger_ones_that_they_are_nearly_parallel_to():
+    def built(middle, size, tilt_deg):
+        tilt = np.radians(tilt_deg)
+        along, normal = np.array([np.cos(tilt), 0, np.sin(tilt)]), np.array([-np.sin(tilt), 0, np.cos(tilt)])
+        x, y = (np.arange(-side / 2, side / 2 + 0.01, 0.1) for side in size)
+        vertices = np.array(middle) + x[:, None, None] * along + y[:, None] * np.array([0.0, 1, 0])
+        n = len(y)
+        first = (np.arange(len(x) - 1)[:, None] * n + np.arange(n - 1)).ravel()
+        faces = np.concatenate(
+            [np.stack([first, first + n, first + n + 1], 1), np.stack([first, first + n + 1, first + 1], 1)]
+        )
+        plane = Plane(normal, float(normal @ middle), np.zeros(0, np.int64))
+        return vertices.reshape(-1, 3), faces, plane
+
+    boards = [
+        built([0.0, 0, 0], (4, 4), 0.0), built([0.0, 5, 1], (1, 1), 1.5), built([0.0, 8, 3], (1, 1), 4.0),
+        built([0.0, 12, 2], (9, 0.5), 1.5),
+    ]  # fmt: skip
+    start = np.cumsum([0, *(len(v) for v, _, _ in boards)])
+    mesh = Mesh(
+        np.concatenate([v for v, _, _ in boards]),
+        np.concatenate([f + first for (_, f, _), first in zip(boards, start, strict=False)]),
+    )
+    given = [plane for _, _, plane in boards]
+    patches = find_patches(mesh, given)
+    np.testing.assert_array_equal(patches.normal[1], given[0].normal)
+    assert patches.offset[1] == pytest.approx(1.0)  # turned about its middle
+    for k, why in ((0, "the largest"), (2, "4 degrees"), (3, "its ends would move by 12 cm")):
+        np.testing.assert_array_equal(patches.normal[k], given[k].normal, err_msg=why)
+
+
 def test_a_depth_map_with_few_known_pixels_does_not_end_the_fusion():
     few = np.zeros_like(WALL)
     few[9:12, 9:12] = WALL[9:12, 9:12]
