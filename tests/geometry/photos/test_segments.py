@@ -51,7 +51,7 @@ def test_segments_are_those_of_scikit_image():
     colours = np.round(200 * PHOTO + rng.integers(0, 40, PHOTO.shape)).astype(np.uint8)
     expected = felzenszwalb(colours, scale=COARSENESS, sigma=BLUR_PX, min_size=LEAST_PX)
     pairs = np.unique(np.stack([expected.ravel(), cut_by_colour(colours).ravel()]), axis=1)
-    assert expected.max() > 20
+    assert expected.max() > 10
     assert all(len(pairs[0]) == len(np.unique(side)) for side in pairs)  # one of theirs for each of ours
 
 

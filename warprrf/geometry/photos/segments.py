@@ -13,6 +13,8 @@ walls; the figures change little with any of them.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 from scipy import ndimage
@@ -73,7 +75,7 @@ def cut_by_colour(colours: np.ndarray) -> np.ndarray:
     """A number for the segment of each pixel of a photo ``(H, W, 3)`` of bytes, shape ``(H, W)``."""
     smooth = ndimage.gaussian_filter(colours / 255.0, [BLUR_PX, BLUR_PX, 0])
     number = np.arange(smooth[..., 0].size, dtype=np.int32).reshape(smooth.shape[:2])
-    pairs = [
+    pairs: list[tuple[Any, Any]] = [
         (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]),
         (np.s_[:-1, :-1], np.s_[1:, 1:]), (np.s_[1:, :-1], np.s_[:-1, 1:]),
     ]  # fmt: skip
