@@ -8,7 +8,7 @@ true multi-image matching", 1996). The same test extends a known plane beyond it
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import warp as wp
@@ -16,8 +16,8 @@ from scipy import ndimage
 
 from warprrf.device import launch
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos.cells import CONTESTED_M, PARALLEL, plane_mesh, visible_from
-from warprrf.geometry.photos.grey import GreyPhotos, lens_matrix
+from warprrf.geometry.photos.cells import plane_mesh, visible_from
+from warprrf.geometry.photos.grey import GreyPhotos, projections
 from warprrf.geometry.planes import AROUND, Plane, dilate, plane_axes
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.photo_consistency import SIDE, patch_agreement
@@ -25,10 +25,9 @@ from warprrf.kernels.photo_consistency import SIDE, patch_agreement
 VIEWS = 5  # photos compared
 MIN_ANGLE_DEG = 6.0  # between any two of them, seen from the patch: without parallax every height fits
 PATCH_M = 0.12  # side of a patch
-AGREES, DISAGREES = 0.6, 0.25  # mean correlation of a true patch, and of one that is certainly not
+AGREES = 0.6  # mean correlation of a true patch
 CONTRAST = 0.012  # patches flatter than this part of white prove nothing
 STEP_M = 0.03  # between heights of the sweep; a patch shows a shift of that much
-REACH_M, LARGE_M2 = 2.5, 3.0  # a plane of this area is extended at most so far
 MIN_CELLS = 15  # of a plane found by the sweep
 SAME_PLANE_M = 0.008  # a piece this close to a known plane belongs to it
 UP_M2, DOWN_M2 = 0.3, 2.0  # least area of a new plane that faces up, or down
@@ -40,7 +39,6 @@ def agreement_of(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Correlation in [-1, 1] and contrast of the patches at ``centres`` (N, 3) over ``views`` (N, V), -1 padded."""
     n, device = len(centres), photos.device
-    projections = np.array([lens_matrix(c) @ c.world_to_camera[:3] for c in photos.cameras])
     result, contrast = (wp.zeros(n, dtype=wp.float32, device=device) for _ in range(2))
     launch(
         patch_agreement,
@@ -48,7 +46,7 @@ def agreement_of(
         [
             wp.array(centres, dtype=wp.vec3, device=device), wp.vec3(*axes[0]), wp.vec3(*axes[1]), PATCH_M / (SIDE - 1),
             wp.array(views, dtype=wp.int32, device=device),
-            wp.array(projections.astype(np.float32), dtype=wp.vec4, device=device), photos.flat,
+            wp.array(projections(photos.cameras), dtype=wp.vec4, device=device), photos.flat,
             wp.array(photos.sizes, dtype=wp.vec3i, device=device), result, contrast,
         ],
         device=device,
@@ -78,72 +76,6 @@ def choose_views(
         close = np.einsum("nci,ni->nc", line, line[rows, best]) > np.cos(np.radians(MIN_ANGLE_DEG))
         worth = np.where(close, -1.0, worth)
     return chosen
-
-
-@dataclass(frozen=True)
-class _Scored:
-    """A plane with all cells that might be its own, and for each of them, on the grid: whether it was occupied before,
-    how well photos agree on it (NaN: nothing proved), whether any sees it, and whether a point of the plane lies there.
-    """
-
-    plane: Plane
-    before: np.ndarray
-    score: np.ndarray
-    visible: np.ndarray
-    own: np.ndarray
-
-
-def proven_cells(planes: Sequence[Plane], points: np.ndarray, photos: GreyPhotos) -> list[Plane]:
-    """``planes`` with their cells corrected by the photos: extended (large planes far, others little) where the photos
-    agree, emptied where they disagree and no point of the plane is near. Of two parallel planes close to each other,
-    such as a sign and its wall, the one that the photos agree on more has the cell."""
-    surface = plane_mesh(planes)
-    scored = [_scored(plane, surface, points, photos) for plane in planes]
-    result = []
-    for k, this in enumerate(scored):
-        with np.errstate(invalid="ignore"):
-            yes, no = this.score > AGREES, this.score < DISAGREES
-        lost, taken = _rivals(this, scored[:k] + scored[k + 1 :])
-        grown = _majority(yes, 5) & ~this.before & ~taken
-        kept = this.before & ~(_majority(no, 3) & ~dilate(this.own, 1)) & ~lost
-        attached = _pieces(grown | kept, 6) & grown
-        result.append(replace(this.plane, occupied=(kept | attached) & this.visible))
-    return result
-
-
-def _scored(plane: Plane, surface: Mesh | None, points: np.ndarray, photos: GreyPhotos) -> _Scored:
-    reach = int(round(REACH_M / plane.cell_m)) if plane.area() >= LARGE_M2 else 2
-    wide = plane.widened(reach)
-    full = replace(wide, occupied=dilate(wide.occupied, reach))
-    # Photos are chosen once for every 2 x 2 cells.
-    index = np.argwhere(full.occupied)
-    key, group = np.unique(index // 2, axis=0, return_inverse=True)
-    middle = full.to_world(full.corner + (2 * key + 1.0) * full.cell_m)
-    seen = visible_from(surface, middle, full.normal, photos.cameras)
-    views = choose_views(middle, full.normal, seen, photos.cameras)[group.ravel()]
-    agreement, contrast = agreement_of(photos, full.cells(), full.axes, views)
-    score = np.full(full.occupied.shape, np.nan)
-    score[full.occupied] = np.where((contrast > CONTRAST) & (views[:, 1] >= 0), agreement, np.nan)
-    visible = np.zeros_like(full.occupied)
-    visible[full.occupied] = np.asarray(seen.any(axis=1))[group.ravel()]
-    return _Scored(full, wide.occupied, score, visible, full.count(points[plane.inliers]) > 0)
-
-
-def _rivals(this: _Scored, others: Sequence[_Scored]) -> tuple[np.ndarray, np.ndarray]:
-    """Cells that a parallel plane close by has the better claim to, and cells that one holds already."""
-    plane = this.plane
-    lost, taken = (np.zeros_like(this.before) for _ in range(2))
-    unproven = 0.3  # what photos that prove nothing count as, between agreement and disagreement
-    cells, mine = plane.cells(), np.nan_to_num(this.score[plane.occupied], nan=unproven)
-    for other in others:
-        if other.plane.normal @ plane.normal < PARALLEL:
-            continue
-        place, inside = other.plane.cell_of(cells)
-        held = inside & (np.abs(other.plane.distance(cells)) < CONTESTED_M) & other.before[place]
-        better = (np.nan_to_num(other.score[place], nan=unproven) > mine) | other.own[place]
-        lost[plane.occupied] |= held & better
-        taken[plane.occupied] |= held
-    return lost & ~this.own, taken
 
 
 def level_planes(
@@ -285,11 +217,6 @@ def _united(plane: Plane, other: Plane) -> Plane:
     occupied = np.zeros(index.max(axis=0) - low + 1, dtype=bool)
     occupied[tuple((index - low).T)] = True
     return replace(plane, corner=plane.corner + low * plane.cell_m, occupied=_closed(occupied))
-
-
-def _majority(mask: np.ndarray, of_nine: int) -> np.ndarray:
-    """Cells of ``mask`` that belong to at least so many with their neighbours, themselves counted."""
-    return mask & (ndimage.convolve(mask.astype(int), AROUND.astype(int), mode="constant") >= of_nine)
 
 
 def _closed(mask: np.ndarray) -> np.ndarray:
