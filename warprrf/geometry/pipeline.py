@@ -268,7 +268,8 @@ def _steps(
 
     def depth(attempt: Attempt) -> Arrays:
         ranges = depth_maps(
-            gaussians, list(cameras.values()), photos=photos(), config=config, progress=attempt.progress, device=device
+            gaussians, list(cameras.values()), photos=photos(), planes=planes, config=config, progress=attempt.progress,
+            device=device,
         )  # fmt: skip
         return {str(k): map_ for k, map_ in enumerate(ranges)}
 

@@ -9,7 +9,7 @@ from views import pinhole
 from warprrf.geometry import pipeline
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.cells import occupancy
-from warprrf.geometry.photos.fusion import depth_views, fuse_depth, fuse_maps
+from warprrf.geometry.photos.fusion import _sure, depth_views, fuse_depth, fuse_maps
 from warprrf.geometry.planes import Plane, detect_planes, plane_axes
 from warprrf.geometry.scans import SurfaceConfig, find_patches
 
@@ -145,6 +145,24 @@ def test_depth_maps_are_as_large_as_small_photos_and_smaller_than_large_ones():
     assert depth_views(given[:1], SurfaceConfig(depth_pixels=1))[0].width == 1
     with pytest.raises(ValueError, match="depth_pixels: got 0"):
         SurfaceConfig(depth_pixels=0)
+
+
+def test_of_depths_that_no_photo_proves_those_stay_that_lie_on_a_plane():
+    plane = Plane(
+        np.array([0, 0, -1.0]),
+        -2.0,
+        np.zeros(0, np.int64),
+        occupied=np.ones((3, 40), bool),
+        corner=np.array([-0.1, -2]),
+    )
+    proved = np.zeros(WALL.shape, dtype=bool)
+    proved[:5] = True
+    for shift, held in ((1.0, True), (1.1, False)):
+        kept = _sure(shift * WALL, proved, CAMERA, [plane], 0.06) > 0
+        points = CAMERA.position + shift * WALL[..., None] * CAMERA.directions()
+        there = plane.covers(points.reshape(-1, 3)).reshape(WALL.shape)
+        assert 0.01 < (there & ~proved).mean() < 0.9
+        np.testing.assert_array_equal(kept, proved | (there & held))
 
 
 def test_a_depth_map_with_few_known_pixels_does_not_end_the_fusion():

@@ -24,7 +24,7 @@ from warprrf.geometry.photos.grey import GreyPhotos
 from warprrf.geometry.photos.plain import plain_surfaces, with_plain
 from warprrf.geometry.photos.points import clean_points, detect_room_planes, estimate_normals
 from warprrf.geometry.photos.sparse import SparseModel
-from warprrf.geometry.photos.sweep import choose_views, joined, level_planes
+from warprrf.geometry.photos.sweep import choose_views, joined, level_planes, proven_cells, united
 from warprrf.geometry.planes import Plane, aligned, plane_axes
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Y00, Gaussians, quaternions_of
@@ -209,6 +209,7 @@ def initialise(
     report("planes", 1, 6)
     if config.sweep and len(cameras) > 2 and planes:
         photos = GreyPhotos.upload(list(cameras.values()), images, device)
+        planes = proven_cells(planes, points, photos)
         report("planes", 2, 6)
         if level:
             levels = []
@@ -225,7 +226,7 @@ def initialise(
         planes = with_plain(planes, plain.planes, points, sight)
         real = np.add.reduceat(reflected, sparse.track_start[:-1]) < 0.5 * sparse.track_length
     report("planes", 5, 6)
-    planes = seen_cells(meeting(planes), list(sparse.cameras.values()))
+    planes = seen_cells(meeting(united((), planes)), list(sparse.cameras.values()))
     gaussians = initial_gaussians(
         points[real],
         sparse.colors[real],

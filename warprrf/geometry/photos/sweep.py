@@ -8,7 +8,7 @@ true multi-image matching", 1996). The same test extends a known plane beyond it
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from warprrf.device import launch
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos.cells import plane_mesh, visible_from
+from warprrf.geometry.photos.cells import CONTESTED_M, PARALLEL, plane_mesh, visible_from
 from warprrf.geometry.photos.grey import GreyPhotos, projections
 from warprrf.geometry.planes import AROUND, Plane, dilate, plane_axes
 from warprrf.geometry.splats.camera import Camera
@@ -25,11 +25,15 @@ from warprrf.kernels.photo_consistency import SIDE, patch_agreement
 VIEWS = 5  # photos compared
 MIN_ANGLE_DEG = 6.0  # between any two of them, seen from the patch: without parallax every height fits
 PATCH_M = 0.12  # side of a patch
-AGREES = 0.6  # mean correlation of a true patch
+AGREES, DISAGREES = 0.6, 0.25  # mean correlation of a true patch, and of one that is certainly not
 CONTRAST = 0.012  # patches flatter than this part of white prove nothing
 STEP_M = 0.03  # between heights of the sweep; a patch shows a shift of that much
+REACH_M, LARGE_M2 = 2.5, 3.0  # a plane of this area is extended at most so far
 MIN_CELLS = 15  # of a plane found by the sweep
-SAME_PLANE_M = 0.008  # a piece this close to a known plane belongs to it
+SAME_PLANE_M, SAME_PLANE_DEG = (
+    0.02,
+    3.0,
+)  # a piece this close to a larger plane is one with it: poses are no better
 UP_M2, DOWN_M2 = 0.3, 2.0  # least area of a new plane that faces up, or down
 FINE_M = 0.005  # a plane's height is settled in steps of this length
 
@@ -76,6 +80,72 @@ def choose_views(
         close = np.einsum("nci,ni->nc", line, line[rows, best]) > np.cos(np.radians(MIN_ANGLE_DEG))
         worth = np.where(close, -1.0, worth)
     return chosen
+
+
+@dataclass(frozen=True)
+class _Scored:
+    """A plane with all cells that might be its own, and for each of them, on the grid: whether it was occupied before,
+    how well photos agree on it (NaN: nothing proved), whether any sees it, and whether a point of the plane lies there.
+    """
+
+    plane: Plane
+    before: np.ndarray
+    score: np.ndarray
+    visible: np.ndarray
+    own: np.ndarray
+
+
+def proven_cells(planes: Sequence[Plane], points: np.ndarray, photos: GreyPhotos) -> list[Plane]:
+    """``planes`` with their cells corrected by the photos: extended (large planes far, others little) where the photos
+    agree, emptied where they disagree and no point of the plane is near. Of two parallel planes close to each other,
+    such as a sign and its wall, the one that the photos agree on more has the cell."""
+    surface = plane_mesh(planes)
+    scored = [_scored(plane, surface, points, photos) for plane in planes]
+    result = []
+    for k, this in enumerate(scored):
+        with np.errstate(invalid="ignore"):
+            yes, no = this.score > AGREES, this.score < DISAGREES
+        lost, taken = _rivals(this, scored[:k] + scored[k + 1 :])
+        grown = _majority(yes, 5) & ~this.before & ~taken
+        kept = this.before & ~(_majority(no, 3) & ~dilate(this.own, 1)) & ~lost
+        attached = _pieces(grown | kept, 6) & grown
+        result.append(replace(this.plane, occupied=(kept | attached) & this.visible))
+    return result
+
+
+def _scored(plane: Plane, surface: Mesh | None, points: np.ndarray, photos: GreyPhotos) -> _Scored:
+    reach = int(round(REACH_M / plane.cell_m)) if plane.area() >= LARGE_M2 else 2
+    wide = plane.widened(reach)
+    full = replace(wide, occupied=dilate(wide.occupied, reach))
+    # Photos are chosen once for every 2 x 2 cells.
+    index = np.argwhere(full.occupied)
+    key, group = np.unique(index // 2, axis=0, return_inverse=True)
+    middle = full.to_world(full.corner + (2 * key + 1.0) * full.cell_m)
+    seen = visible_from(surface, middle, full.normal, photos.cameras)
+    views = choose_views(middle, full.normal, seen, photos.cameras)[group.ravel()]
+    agreement, contrast = agreement_of(photos, full.cells(), full.axes, views)
+    score = np.full(full.occupied.shape, np.nan)
+    score[full.occupied] = np.where((contrast > CONTRAST) & (views[:, 1] >= 0), agreement, np.nan)
+    visible = np.zeros_like(full.occupied)
+    visible[full.occupied] = np.asarray(seen.any(axis=1))[group.ravel()]
+    return _Scored(full, wide.occupied, score, visible, full.count(points[plane.inliers]) > 0)
+
+
+def _rivals(this: _Scored, others: Sequence[_Scored]) -> tuple[np.ndarray, np.ndarray]:
+    """Cells that a parallel plane close by has the better claim to, and cells that one holds already."""
+    plane = this.plane
+    lost, taken = (np.zeros_like(this.before) for _ in range(2))
+    unproven = 0.3  # what photos that prove nothing count as, between agreement and disagreement
+    cells, mine = plane.cells(), np.nan_to_num(this.score[plane.occupied], nan=unproven)
+    for other in others:
+        if other.plane.normal @ plane.normal < PARALLEL:
+            continue
+        place, inside = other.plane.cell_of(cells)
+        held = inside & (np.abs(other.plane.distance(cells)) < CONTESTED_M) & other.before[place]
+        better = (np.nan_to_num(other.score[place], nan=unproven) > mine) | other.own[place]
+        lost[plane.occupied] |= held & better
+        taken[plane.occupied] |= held
+    return lost & ~this.own, taken
 
 
 def level_planes(
@@ -195,18 +265,25 @@ def _settled(piece: Plane, surface: Mesh | None, photos: GreyPhotos) -> Plane | 
 def joined(planes: Sequence[Plane], levels: Sequence[Plane]) -> list[Plane]:
     """``planes`` and ``levels`` with pieces of one plane united; new planes need a least area, a larger one where they
     face down (seen from below, stripes on a wall pass for a soffit)."""
-    result = list(planes)
-    for level in sorted(levels, key=lambda p: -p.area()):
-        for k, plane in enumerate(result):
-            near = np.abs(plane.distance(level.cells())).mean() < SAME_PLANE_M
-            if near and plane.normal @ level.normal > np.cos(np.radians(1.0)):
-                result[k] = _united(plane, level)
-                break
-        else:
-            result.append(level)
+    result = united(planes, levels)
     least = [UP_M2 if p.normal[2] > 0 else DOWN_M2 for p in result[len(planes) :]]
     large = [p for p, area in zip(result[len(planes) :], least, strict=True) if p.area() >= area]
     return result[: len(planes)] + large
+
+
+def united(planes: Sequence[Plane], others: Sequence[Plane]) -> list[Plane]:
+    """``planes`` and ``others``, the largest first; those that one before them describes as well only add cells to it."""
+    result = list(planes)
+    for other in sorted(others, key=lambda p: -p.area()):
+        cells = other.cells()
+        for k, plane in enumerate(result):
+            near = np.abs(plane.distance(cells)).sum() < SAME_PLANE_M * len(cells)
+            if near and plane.normal @ other.normal > np.cos(np.radians(SAME_PLANE_DEG)):
+                result[k] = _united(plane, other)
+                break
+        else:
+            result.append(other)
+    return result
 
 
 def _united(plane: Plane, other: Plane) -> Plane:
@@ -217,6 +294,11 @@ def _united(plane: Plane, other: Plane) -> Plane:
     occupied = np.zeros(index.max(axis=0) - low + 1, dtype=bool)
     occupied[tuple((index - low).T)] = True
     return replace(plane, corner=plane.corner + low * plane.cell_m, occupied=_closed(occupied))
+
+
+def _majority(mask: np.ndarray, of_nine: int) -> np.ndarray:
+    """Cells of ``mask`` that belong to at least so many with their neighbours, themselves counted."""
+    return mask & (ndimage.convolve(mask.astype(int), AROUND.astype(int), mode="constant") >= of_nine)
 
 
 def _closed(mask: np.ndarray) -> np.ndarray:
