@@ -23,13 +23,10 @@ EDGE_DEG = 6.0  # and its direction in the photo is good to this
 SEGMENT_PX, GAP_PX = 24.0, 6.0  # shortest segment, and longest gap in one
 SIDE_PX = 4.0  # colours are taken so far beside an edge,
 ALIKE = 0.08  # and are one surface's when they differ by no more than this
-MEETING_DEG = 3.0  # two bearings that differ by less meet nowhere for sure
 LINE_VIEWS = 3  # fewest photos that show an edge
-LEAST_SLOPE = 0.15  # a ray closer to the direction than this (sine) fixes no bearing
 FARTHEST_M = 25.0  # a line is sought so far from a camera
 POSE_M = 0.02  # what poses may be off
 REFITS = 5
-LEAST_SUPPORT = 0.5  # segments that meet, by how sharply: a guess with less is not tried
 
 
 @dataclass(frozen=True)
@@ -148,7 +145,8 @@ def find_segments(
     u, v = (axis + 1) % 3, (axis + 2) % 3
     size = np.hypot(rays[:, u], rays[:, v])
     straight = np.abs((along_image * across).sum(axis=1)) < np.sin(np.radians(EDGE_DEG))
-    own = np.flatnonzero(straight & (size > LEAST_SLOPE * np.linalg.norm(rays, axis=1)))
+    # 0.15: a ray closer to the direction than this (sine) fixes no bearing
+    own = np.flatnonzero(straight & (size > 0.15 * np.linalg.norm(rays, axis=1)))
     # How the bearing changes along ``across``, per pixel.
     step = np.pad(across / [camera.fx, camera.fy], [(0, 0), (0, 1)]) @ camera.rotation
     turn = (step[:, v] * rays[:, u] - step[:, u] * rays[:, v]) / np.maximum(size, 1e-9) ** 2
@@ -231,7 +229,8 @@ def _placed(segments: Segments, positions: np.ndarray, axis: int) -> list[Line]:
     support = np.array([weight for weight, _ in guesses])
     free, lines = np.ones(len(support), dtype=bool), []
     for k in np.argsort(-support, kind="stable"):
-        if support[k] < LEAST_SUPPORT:
+        # 0.5: segments that meet, by how sharply: a guess with less is not tried
+        if support[k] < 0.5:
             break
         if not free[k]:
             continue
@@ -255,7 +254,8 @@ def _met(
 ) -> tuple[float, float]:
     """How many segments of other photos meet segment ``k`` at one place, by weight, and at which distance [m]."""
     sine = towards[k, 0] * towards[:, 1] - towards[k, 1] * towards[:, 0]
-    meet = np.abs(sine) > np.sin(np.radians(MEETING_DEG))
+    # 3.0: two bearings that differ by less meet nowhere for sure
+    meet = np.abs(sine) > np.sin(np.radians(3.0))
     others = np.flatnonzero(meet & (segments.camera != segments.camera[k]) & segments.alike(k))
     apart, towards_k, towards, sine = across[others] - across[k], towards[k], towards[others], sine[others]
     mine = (apart[:, 0] * towards[:, 1] - apart[:, 1] * towards[:, 0]) / sine

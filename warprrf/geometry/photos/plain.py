@@ -38,11 +38,8 @@ from warprrf.geometry.splats.camera import Camera
 
 SURE_VIEWS, LINE_M = 4, 0.4  # photos and length from which on an edge counts
 FLAT, PLAIN_PX = 0.006, 7  # a pixel is plain where none in a square of this side changes by more than this
-SHOWN_SHARE = 0.15  # where so much of an edge shows in a photo, all of it parts regions
-LEAST_SHARE = 0.12  # a dozen photos with fewer plain pixels than this share show no plain surface
 REGION_PX, VOTES_PX = 150, 25.0  # fewest pixels of a plain region, and of its border on a plane
 SAME_M = 0.04  # an edge this close to a plane lies on it
-RIVAL = 0.8  # of the planes with at least this share of the most votes, the nearest has the region
 BEHIND_M = 0.15  # an edge, or a surface, this far behind a plane is behind it
 STRIDE, CELL_M = 4, 0.1  # cells, of this side, look up every so many-th pixel
 AGREEING, PIECE_M2 = 2, 0.1  # fewest photos that put a cell on its plane, and least area of a piece of one
@@ -120,7 +117,8 @@ def plain_surfaces(
     turn[:3, :3] = axes.T
     cameras = [replace(c, world_to_camera=c.world_to_camera @ turn) for c in cameras]
     some = images[:: -(-len(images) // 12)] if images else []
-    if np.mean([_plain(find_edgels(image)).mean() for image in some] or 0) < LEAST_SHARE:
+    # 0.12: a dozen photos with fewer plain pixels than this share show no plain surface
+    if np.mean([_plain(find_edgels(image)).mean() for image in some] or 0) < 0.12:
         return PlainSurfaces([], [], axes)
     with ThreadPoolExecutor(threads()) as pool:
         edgels = list(pool.map(find_edgels, images))
@@ -265,7 +263,8 @@ def _regions_on(
         if not own.any():
             continue
         rivals = []
-        for number in np.flatnonzero(votes[k] >= RIVAL * votes[k].max()).tolist():
+        # 0.8: of the planes with at least this share of the most votes, the nearest has the region
+        for number in np.flatnonzero(votes[k] >= 0.8 * votes[k].max()).tolist():
             axis, height, *_ = heights[number]
             with np.errstate(divide="ignore", invalid="ignore"):
                 t = (height - camera.position[axis]) / rays[own][:, axis]
@@ -307,7 +306,8 @@ def _shown(
         if on.sum() < SEGMENT_PX / 2:
             continue
         of_line[near[own[on]]] = number[own[0]]
-        if on.mean() < SHOWN_SHARE:
+        # 0.15: where so much of an edge shows in a photo, all of it parts regions
+        if on.mean() < 0.15:
             on = ndimage.binary_closing(np.pad(on, 40), np.ones(40))[40:-40]
             own = own[on]
         barrier[y[own], x[own]] = True

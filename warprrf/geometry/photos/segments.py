@@ -27,10 +27,8 @@ COARSENESS = 60.0  # of the segments: scikit-image's ``scale``, of colours from 
 BLUR_PX, LEAST_PX = 0.6, 80  # before a photo is cut, and pixels of the smallest segment
 PROVED_PX, PROVED_SHARE = 15, 0.04  # so many pixels of a segment, and such a part of it, must be proved
 TOLERANCE = 0.02  # a depth that differs from a plane's by less than this part lies on it
-ON_ONE_PLANE = 0.4  # part of the proved depths of a segment that must lie on its plane
 TRIALS, DRAWN = 48, 300  # planes through three proved pixels, and pixels that they are judged by
 UNSURE = 0.02  # where a plane's standard deviation is larger than this part of the depth, it says nothing
-ALIKE_PX = 25.0  # neighbouring pixels, of which errors are alike
 NEAR = 0.12  # proved depths that differ by more than this part from the plane are something else, and stay
 
 
@@ -111,9 +109,11 @@ def _plane(
         plane = np.linalg.solve(_regular(weighted.T @ rays), weighted.T @ inverse)
     left = rays @ plane - inverse
     on = np.abs(left) < TOLERANCE * inverse
-    if on.mean() < ON_ONE_PLANE:
+    # 0.4: part of the proved depths of a segment that must lie on its plane
+    if on.mean() < 0.4:
         return None
-    return plane, ALIKE_PX * left[on].var() * np.linalg.inv(_regular(rays[on].T @ rays[on]))
+    # 25.0: neighbouring pixels, of which errors are alike
+    return plane, 25.0 * left[on].var() * np.linalg.inv(_regular(rays[on].T @ rays[on]))
 
 
 def _regular(normal_matrix: np.ndarray) -> np.ndarray:
