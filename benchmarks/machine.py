@@ -35,7 +35,7 @@ PACKAGES = (
 )
 
 VERSIONS = {
-    "geometry": 6,
+    "geometry": 7,
     "renderer": 1,
     "metrics": 1,
     "exact": 2,

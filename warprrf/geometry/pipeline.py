@@ -56,7 +56,7 @@ from warprrf.geometry.report.sight import how_seen
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.steps import Attempt, Steps
 
-VERSIONS = {**sfm.VERSIONS, "initial": 2, "refined": 2, "depth": 2, "surface": 9}
+VERSIONS = {**sfm.VERSIONS, "initial": 3, "refined": 2, "depth": 3, "surface": 9}
 """Of all steps: counted up by whoever changes what a step computes."""
 
 MUCH_UNKNOWN = 0.25  # share of a surface that is worth a warning
@@ -268,7 +268,8 @@ def _steps(
 
     def depth(attempt: Attempt) -> Arrays:
         ranges = depth_maps(
-            gaussians, list(cameras.values()), photos=photos(), config=config, progress=attempt.progress, device=device
+            gaussians, list(cameras.values()), photos=photos(), planes=planes, config=config, progress=attempt.progress,
+            device=device,
         )  # fmt: skip
         return {str(k): map_ for k, map_ in enumerate(ranges)}
 

@@ -92,3 +92,42 @@ def patch_agreement(
     else:
         agreement[n] = float(-1.0)
         contrast[n] = float(0.0)
+
+
+@wp.kernel
+def count_votes(
+    offset: int,
+    points: wp.array(dtype=wp.vec3),
+    ranges: wp.array(dtype=wp.float32),
+    projections: wp.array2d(dtype=wp.vec4),
+    eyes: wp.array(dtype=wp.vec3),
+    sizes: wp.array(dtype=wp.vec3i),
+    tolerance: float,
+    agreed: wp.array(dtype=wp.int32),
+    crossed: wp.array(dtype=wp.int32),
+):
+    """How many depth maps have the surface that a point lies on, up to a ``tolerance`` of its distance, and how many see
+    one behind it.
+
+    ``ranges`` are those of all maps; ``sizes`` says where each begins, its width and its height.
+    """
+    n = offset + wp.tid()
+    point = points[n]
+    yes = int(0)
+    no = int(0)
+    for s in range(sizes.shape[0]):
+        place = wp.vec4(point[0], point[1], point[2], 1.0)
+        depth = wp.dot(projections[s, 2], place)
+        if depth > 0.0:
+            shape = sizes[s]
+            u = wp.dot(projections[s, 0], place) / depth
+            v = wp.dot(projections[s, 1], place) / depth
+            if u >= 0.0 and v >= 0.0 and u < float(shape[1]) and v < float(shape[2]):
+                seen = ranges[shape[0] + int(v) * shape[1] + int(u)]
+                distance = wp.length(point - eyes[s])
+                if seen > 0.0 and wp.abs(seen - distance) < tolerance * distance:
+                    yes += 1
+                elif seen > distance:
+                    no += 1
+    agreed[n] = yes
+    crossed[n] = no

@@ -124,6 +124,16 @@ def test_wall_and_floor_reach_their_common_edge():
     assert floor2.area() == pytest.approx(floor.area() + 0.2 * 2, rel=0.1)
 
 
+def test_pieces_of_one_plane_are_united_and_a_sign_before_its_wall_is_not():
+    wall = flat([0, -1, 0], [0, 0, 0], [2, 0, 2])[1]
+    piece = flat([0, -1, 0], [2.5, 0.015, 0], [3, 0.015, 1])[1]
+    sign = flat([0, -1, 0], [0.5, -0.03, 0.5], [1, -0.03, 1])[1]
+    back = flat([0, 1, 0], [0, 0.01, 0], [1, 0.01, 2])[1]
+    one, *others = sweep.united((), [sign, piece, wall, back])
+    assert one.area() == pytest.approx(wall.area() + piece.area(), rel=0.01)
+    assert one.offset == wall.offset and [p.offset for p in others] == [back.offset, sign.offset]
+
+
 def test_the_faces_of_a_pillar_end_at_its_edge():
     front = flat([0, -1, 0], [-0.5, 0, 0], [0.7, 0, 2])[1]  # true to x = 0.5, hangs over to 0.7
     side = flat([1, 0, 0], [0.5, 0, 0], [0.5, 1, 2])[1]

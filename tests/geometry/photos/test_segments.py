@@ -7,10 +7,16 @@ import pytest
 import views
 
 from warprrf.geometry.photos.fusion import _flat
-from warprrf.geometry.photos.segments import UNSURE, with_segments
+from warprrf.geometry.photos.segments import (
+    BLUR_PX,
+    COARSENESS,
+    LEAST_PX,
+    UNSURE,
+    cut_by_colour,
+    with_segments,
+)
 from warprrf.geometry.photos.targets import PosedPhotos
 
-pytest.importorskip("skimage")
 LOW, HIGH = np.array([-2.0, -2.0, 0.0]), np.array([2.0, 2.0, 2.5])
 CAMERA = views.look([-0.6, -1.2, 1.2], [0.8, 2.0, 1.0], width=160, height=120, f=110.0)
 TRUE = views.range_in_box(CAMERA, LOW, HIGH)
@@ -37,6 +43,16 @@ def rough(noise=0.01):
     """Depths of the rims alone, with errors."""
     factor = 1 + noise * np.random.default_rng(3).standard_normal(TRUE.shape)
     return np.where(RIM, factor * TRUE, 0.0)
+
+
+def test_segments_are_those_of_scikit_image():
+    felzenszwalb = pytest.importorskip("skimage.segmentation").felzenszwalb
+    rng = np.random.default_rng(6)
+    colours = np.round(200 * PHOTO + rng.integers(0, 40, PHOTO.shape)).astype(np.uint8)
+    expected = felzenszwalb(colours, scale=COARSENESS, sigma=BLUR_PX, min_size=LEAST_PX)
+    pairs = np.unique(np.stack([expected.ravel(), cut_by_colour(colours).ravel()]), axis=1)
+    assert expected.max() > 10
+    assert all(len(pairs[0]) == len(np.unique(side)) for side in pairs)  # one of theirs for each of ours
 
 
 def test_walls_are_whole_and_smooth_where_their_rims_alone_are_known():

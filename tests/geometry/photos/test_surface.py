@@ -9,7 +9,9 @@ from views import pinhole
 from warprrf.geometry import pipeline
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.cells import occupancy
-from warprrf.geometry.photos.fusion import depth_views, fuse_depth, fuse_maps
+from warprrf.geometry.photos.fusion import _sure, depth_maps, depth_views, fuse_depth, fuse_maps
+from warprrf.geometry.photos.initialise import discs
+from warprrf.geometry.photos.targets import PosedPhotos
 from warprrf.geometry.planes import Plane, detect_planes, plane_axes
 from warprrf.geometry.scans import SurfaceConfig, find_patches
 
@@ -176,6 +178,35 @@ def test_small_planes_are_parallel_to_larger_ones_that_they_are_nearly_parallel_
     assert patches.offset[1] == pytest.approx(1.0)  # turned about its middle
     for k, why in ((0, "the largest"), (2, "4 degrees"), (3, "its ends would move by 12 cm")):
         np.testing.assert_array_equal(patches.normal[k], given[k].normal, err_msg=why)
+
+
+def test_of_depths_that_no_photo_proves_those_stay_that_lie_on_a_plane():
+    plane = Plane(
+        np.array([0, 0, -1.0]),
+        -2.0,
+        np.zeros(0, np.int64),
+        occupied=np.ones((3, 40), bool),
+        corner=np.array([-0.1, -2]),
+    )
+    proved = np.zeros(WALL.shape, dtype=bool)
+    proved[:5] = True
+    for shift, held in ((1.0, True), (1.1, False)):
+        kept = _sure(shift * WALL, proved, CAMERA, [plane], 0.06) > 0
+        points = CAMERA.position + shift * WALL[..., None] * CAMERA.directions()
+        there = plane.covers(points.reshape(-1, 3)).reshape(WALL.shape)
+        assert 0.01 < (there & ~proved).mean() < 0.9
+        np.testing.assert_array_equal(kept, proved | (there & held))
+
+
+def test_depth_maps_of_gaussians_end_where_neither_photos_nor_planes_hold_them():
+    at = np.stack([*np.mgrid[-2:2:0.05, -2:2:0.05], np.full((80, 80), 2.0)], axis=-1).reshape(-1, 3)
+    wall = discs(at, np.tile([0, 0, -1.0], (len(at), 1)), np.full(len(at), 0.05), np.full(at.shape, 0.5))
+    photos = PosedPhotos([np.full((48, 64, 3), 0.5, np.float32)], [CAMERA])  # one photo proves nothing
+    plane = Plane(np.array([0, 0, -1.0]), -2.0, np.zeros(0, np.int64), occupied=np.ones((80, 80), bool),
+                  corner=np.array([-4.0, -4.0]))  # fmt: skip
+    kept, none = (depth_maps(wall, [CAMERA], photos=photos, planes=p)[0] for p in ([plane], []))
+    assert (kept > 0).mean() > 0.9 and np.abs(kept / WALL - 1)[kept > 0].max() < 0.02
+    assert (none == 0).all()
 
 
 def test_a_depth_map_with_few_known_pixels_does_not_end_the_fusion():

@@ -32,11 +32,7 @@ position), ``hits`` (steps) and ``seen`` (sum of blending weights)."""
 
 PARAMETERS = ("means", "quaternions", "log_scales", "logits", "sh")
 STATISTICS = ("pull", "hits", "seen")
-SPLIT_ABOVE_M = 0.03  # larger ones are split, smaller ones cloned
 PRUNE_OPACITY = 0.02  # fainter ones are removed
-APART = 0.7  # of its largest standard deviation: how far the halves of a split Gaussian lie from its centre
-SMALLER = 1.6  # the largest standard deviation of a split Gaussian is divided by this
-DENSIFY_SHARE = 0.08  # at most of the Gaussians is split or cloned at a time, those pulled hardest
 DENSIFY_TO, LARGEST_SHARE = 30_000, 0.5
 """Up to this share of the Gaussians is split or cloned at a time where fewer than so many would be there in the end."""
 JITTER = 0.3  # standard deviation of a clone's place, in those of the Gaussian
@@ -70,18 +66,22 @@ def densified(
     pull = np.where(keep, arrays["pull"][:, 0] / np.maximum(hits, 1), 0.0)
     kept = int(keep.sum())
     catching_up = min((DENSIFY_TO - kept) / rounds_left, LARGEST_SHARE * kept)
-    room = min(config.max_gaussians - kept, int(max(DENSIFY_SHARE * kept, catching_up)))
+    # 0.08: at most of the Gaussians is split or cloned at a time, those pulled hardest
+    room = min(config.max_gaussians - kept, int(max(0.08 * kept, catching_up)))
     chosen = np.argsort(-pull, kind="stable")[: max(room, 0)]
     chosen = np.sort(chosen[pull[chosen] > 0])
 
     rows = {name: value[chosen].astype(np.float64) for name, value in arrays.items()}
-    split = (largest[chosen] > SPLIT_ABOVE_M)[:, None]
+    # 0.03: larger ones are split, smaller ones cloned
+    split = (largest[chosen] > 0.03)[:, None]
     longest = np.eye(3)[scales[chosen].argmax(axis=1)]
     rotations = rotations_of(rows["quaternions"])
     jitter = JITTER * scales[chosen] * rng.normal(size=(len(chosen), 3)) * [1, 1, 0]  # in the surface
-    in_half = APART * longest * scales[chosen]
+    # 0.7: of its largest standard deviation: how far the halves of a split Gaussian lie from its centre
+    in_half = 0.7 * longest * scales[chosen]
     step = np.einsum("nij,nj->ni", rotations, np.where(split, in_half, jitter))
-    rows["log_scales"] -= split * longest * np.log(SMALLER)
+    # 1.6: the largest standard deviation of a split Gaussian is divided by this
+    rows["log_scales"] -= split * longest * np.log(1.6)
     for name in PARAMETERS:
         for moment in ("first", "second"):
             rows[f"{moment}.{name}"][:] = 0
@@ -97,10 +97,7 @@ def densified(
     return result
 
 
-PIXELS = 60_000  # of a rendering in which holes are looked for, about
 BLOCK = 4  # pixels of such a rendering: side of what one disc covers
-OPEN = 0.5  # a block that blocks less light than this is a hole
-OPACITY = 0.5  # of a new disc: its depth is a guess, so others may be seen through it
 
 
 def filled(gaussians: Gaussians, photos: PosedPhotos, *, device: DeviceLike = None) -> Gaussians:
@@ -121,13 +118,15 @@ def _missing(
     gaussians: Gaussians, image: np.ndarray, mask: np.ndarray | None, camera: Camera, device: DeviceLike
 ) -> Gaussians | None:
     """Discs for the holes of one photo; None if there are none, or nothing around them is known."""
-    share = min(1.0, (PIXELS / (camera.width * camera.height)) ** 0.5)
+    # 60_000: of a rendering in which holes are looked for, about
+    share = min(1.0, (60_000 / (camera.width * camera.height)) ** 0.5)
     rows, columns = (max(1, round(share * n / BLOCK)) for n in (camera.height, camera.width))
     small = camera.resized(columns * BLOCK, rows * BLOCK)
     seen = render(gaussians, small, device=device, blending=Blending())
     alpha = _blocks(seen.alpha)
     nearness = _blocks(seen.alpha / np.maximum(seen.depth, 1e-6)) / np.maximum(alpha, 1e-6)  # 1 / m
-    known = alpha >= OPEN
+    # 0.5: a block that blocks less light than this is a hole
+    known = alpha >= 0.5
     if not known.any():
         return None
     shown = np.stack([_shrunk(image[..., c], known.shape) for c in range(3)], axis=-1)
@@ -141,7 +140,8 @@ def _missing(
     toward = coarse.directions()[hole]
     radius = SPREAD * depth / min(coarse.fx, coarse.fy)
     centres = camera.position + depth[:, None] * toward
-    return replace(discs(centres, -toward, radius, shown[hole]), opacities=np.full(len(depth), OPACITY))
+    # 0.5: of a new disc: its depth is a guess, so others may be seen through it
+    return replace(discs(centres, -toward, radius, shown[hole]), opacities=np.full(len(depth), 0.5))
 
 
 def _blocks(pixels: np.ndarray) -> np.ndarray:

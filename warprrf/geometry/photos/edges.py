@@ -10,7 +10,7 @@ frame, whose axes are the three directions. Lengths in metres.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -23,13 +23,10 @@ EDGE_DEG = 6.0  # and its direction in the photo is good to this
 SEGMENT_PX, GAP_PX = 24.0, 6.0  # shortest segment, and longest gap in one
 SIDE_PX = 4.0  # colours are taken so far beside an edge,
 ALIKE = 0.08  # and are one surface's when they differ by no more than this
-MEETING_DEG = 3.0  # two bearings that differ by less meet nowhere for sure
 LINE_VIEWS = 3  # fewest photos that show an edge
-LEAST_SLOPE = 0.15  # a ray closer to the direction than this (sine) fixes no bearing
 FARTHEST_M = 25.0  # a line is sought so far from a camera
 POSE_M = 0.02  # what poses may be off
 REFITS = 5
-LEAST_SUPPORT = 0.5  # segments that meet, by how sharply: a guess with less is not tried
 
 
 @dataclass(frozen=True)
@@ -123,7 +120,7 @@ class Segments:
         rise: where it begins and ends: metres along the direction per metre of distance, shape ``(N, 2)``.
         pixel: radians of bearing that a pixel is worth, shape ``(N,)``.
         length: [pixels], shape ``(N,)``.
-        sides: colours on the side of smaller and of larger bearing, shape ``(N, 2, 3)``.
+        sides: colours on the side of smaller and of larger bearing, shape ``(2, 3, N)``.
     """
 
     camera: np.ndarray
@@ -135,7 +132,7 @@ class Segments:
 
     def alike(self, k: int) -> np.ndarray:
         """Which have the colour of segment ``k`` on one side at least (an occluding edge keeps only one)."""
-        gap = np.abs(self.sides - self.sides[k]).max(axis=2).min(axis=1)
+        gap = np.abs(self.sides - self.sides[..., k : k + 1]).max(axis=1).min(axis=0)
         return np.asarray(gap < ALIKE)
 
 
@@ -148,7 +145,8 @@ def find_segments(
     u, v = (axis + 1) % 3, (axis + 2) % 3
     size = np.hypot(rays[:, u], rays[:, v])
     straight = np.abs((along_image * across).sum(axis=1)) < np.sin(np.radians(EDGE_DEG))
-    own = np.flatnonzero(straight & (size > LEAST_SLOPE * np.linalg.norm(rays, axis=1)))
+    # 0.15: a ray closer to the direction than this (sine) fixes no bearing
+    own = np.flatnonzero(straight & (size > 0.15 * np.linalg.norm(rays, axis=1)))
     # How the bearing changes along ``across``, per pixel.
     step = np.pad(across / [camera.fx, camera.fy], [(0, 0), (0, 1)]) @ camera.rotation
     turn = (step[:, v] * rays[:, u] - step[:, u] * rays[:, v]) / np.maximum(size, 1e-9) ** 2
@@ -158,19 +156,23 @@ def find_segments(
     first = np.searchsorted(bearing[own], bearing[own] - wide)
     last = np.searchsorted(bearing[own], bearing[own] + wide, side="right")
     used, result = np.zeros(len(own), dtype=bool), []
+    x, y = position[own].T
     for k in np.argsort(first - last, kind="stable"):
         if last[k] - first[k] < SEGMENT_PX:
             break
-        group = np.arange(first[k], last[k])
-        group = group[~used[group]]
+        if used[k]:  # the others of its window were tried with it
+            continue
+        group = first[k] + np.flatnonzero(~used[first[k] : last[k]])
         if len(group) < SEGMENT_PX:
             continue
         group = group[np.argsort(rise[own[group]], kind="stable")]
-        gap = np.linalg.norm(np.diff(position[own[group]], axis=0), axis=1)
-        for run in np.split(group, np.flatnonzero(gap > GAP_PX) + 1):
+        gap = np.hypot(np.diff(x[group]), np.diff(y[group]))
+        ends_at = np.concatenate([[0], np.flatnonzero(gap > GAP_PX) + 1, [len(group)]])
+        for run_at in np.flatnonzero(np.diff(ends_at) >= SEGMENT_PX):
+            run = group[ends_at[run_at] : ends_at[run_at + 1]]
             pixels = own[run]
             length = float(np.linalg.norm(position[pixels[-1]] - position[pixels[0]]))
-            if len(run) < SEGMENT_PX or length < SEGMENT_PX or len(run) < 0.6 * length:
+            if length < SEGMENT_PX or len(run) < 0.6 * length:
                 continue
             used[run] = True
             ends = float(rise[pixels[0]]), float(rise[pixels[-1]])
@@ -181,12 +183,15 @@ def find_segments(
     return result
 
 
-def lines_through(camera: Camera, pixels: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rays of pixels, shape ``(N, 3)``, of depth one, and the image direction of lines along ``axis`` there, ``(N, 2)``."""
+def lines_through(
+    camera: Camera, pixels: np.ndarray, axis: int | np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rays of pixels, shape ``(N, 3)``, of depth one, and the image direction of lines along ``axis`` (one, or one a pixel)
+    there, ``(N, 2)``."""
     lens = np.array([camera.fx, camera.fy])
     local = np.pad((pixels - [camera.cx, camera.cy]) / lens, [(0, 0), (0, 1)], constant_values=1.0)
-    towards = camera.rotation[:, axis]
-    image = lens * (towards[:2] - local[:, :2] * towards[2])
+    towards = camera.rotation.T[axis]
+    image = lens * (towards[..., :2] - local[:, :2] * towards[..., 2:])
     return local @ camera.rotation, image / np.maximum(np.linalg.norm(image, axis=1, keepdims=True), 1e-9)
 
 
@@ -210,6 +215,7 @@ def find_lines(
         ]
         if rows:
             segments = Segments(*(np.array(column) for column in zip(*rows, strict=True)))
+            segments = replace(segments, sides=np.moveaxis(segments.sides, 0, 2).copy())
             lines += _placed(segments, positions, axis)
     return lines
 
@@ -223,12 +229,13 @@ def _placed(segments: Segments, positions: np.ndarray, axis: int) -> list[Line]:
     support = np.array([weight for weight, _ in guesses])
     free, lines = np.ones(len(support), dtype=bool), []
     for k in np.argsort(-support, kind="stable"):
-        if support[k] < LEAST_SUPPORT:
+        # 0.5: segments that meet, by how sharply: a guess with less is not tried
+        if support[k] < 0.5:
             break
         if not free[k]:
             continue
         distance = guesses[k][1]
-        alike = free & segments.alike(k)
+        alike = np.flatnonzero(free & segments.alike(k))
         start = across[k] + distance * towards[k], along[k] + distance * segments.rise[k]
         place, chosen = _fitted(alike, start, segments, across, along, towards)
         line = _extent(place, chosen, segments, across, along, axis)
@@ -247,17 +254,17 @@ def _met(
 ) -> tuple[float, float]:
     """How many segments of other photos meet segment ``k`` at one place, by weight, and at which distance [m]."""
     sine = towards[k, 0] * towards[:, 1] - towards[k, 1] * towards[:, 0]
-    apart = across - across[k]
-    ok = (np.abs(sine) > np.sin(np.radians(MEETING_DEG))) & (segments.camera != segments.camera[k])
-    ok &= segments.alike(k)
-    safe = np.where(ok, sine, 1.0)
-    mine = (apart[:, 0] * towards[:, 1] - apart[:, 1] * towards[:, 0]) / safe
-    theirs = (apart[:, 0] * towards[k, 1] - apart[:, 1] * towards[k, 0]) / safe
-    ok &= (np.minimum(mine, theirs) > 0.15) & (np.maximum(mine, theirs) < FARTHEST_M)
-    ends = along[:, None] + segments.rise * theirs[:, None]
+    # 3.0: two bearings that differ by less meet nowhere for sure
+    meet = np.abs(sine) > np.sin(np.radians(3.0))
+    others = np.flatnonzero(meet & (segments.camera != segments.camera[k]) & segments.alike(k))
+    apart, towards_k, towards, sine = across[others] - across[k], towards[k], towards[others], sine[others]
+    mine = (apart[:, 0] * towards[:, 1] - apart[:, 1] * towards[:, 0]) / sine
+    theirs = (apart[:, 0] * towards_k[1] - apart[:, 1] * towards_k[0]) / sine
+    ok = (np.minimum(mine, theirs) > 0.15) & (np.maximum(mine, theirs) < FARTHEST_M)
+    ends = along[others, None] + segments.rise[others] * theirs[:, None]
     own = along[k] + segments.rise[k] * mine[:, None]
     ok &= np.minimum(ends[:, 1], own[:, 1]) - np.maximum(ends[:, 0], own[:, 0]) > 0.05
-    blur = (1.5 * (segments.pixel * theirs + segments.pixel[k] * mine) + POSE_M) / np.abs(safe)
+    blur = (1.5 * (segments.pixel[others] * theirs + segments.pixel[k] * mine) + POSE_M) / np.abs(sine)
     ok &= blur < 0.4
     if not ok.any():
         return 0.0, 0.0
@@ -277,36 +284,37 @@ def _fitted(
     along: np.ndarray,
     towards: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Place in the cross-section that the segments near a first guess fix, and which segments those are."""
-    (place, (low, high)), chosen = start, alike
+    """Place in the cross-section that those of the segments ``alike`` near a first guess fix, and which segments those are."""
+    (place, (low, high)), chosen = start, np.ones(len(alike), dtype=bool)
+    across, along, towards = across[alike], along[alike], towards[alike]
+    rise, pixel, length = (of[alike] for of in (segments.rise, segments.pixel, segments.length))
     for step in range(REFITS):
         reach = place - across
-        distance = np.linalg.norm(reach, axis=1)
+        distance = np.hypot(reach[:, 0], reach[:, 1])
         miss = reach[:, 0] * towards[:, 1] - reach[:, 1] * towards[:, 0]
-        near = (2 if step > 1 else 3) * segments.pixel * distance + POSE_M
-        ends = along[:, None] + segments.rise * distance[:, None]
-        chosen = alike & ((reach * towards).sum(axis=1) > 0.1) & (np.abs(miss) < near)
+        near = (2 if step > 1 else 3) * pixel * distance + POSE_M
+        ends = along[:, None] + rise * distance[:, None]
+        chosen = ((reach * towards).sum(axis=1) > 0.1) & (np.abs(miss) < near)
         chosen &= np.minimum(ends[:, 1], high) - np.maximum(ends[:, 0], low) > -0.3
         if chosen.sum() < 2:
             break
         normal = np.stack([towards[chosen, 1], -towards[chosen, 0]], axis=1)
-        sure = np.minimum(segments.length, 100) / ((segments.pixel * distance) ** 2 + 1e-4)
+        sure = np.minimum(length, 100) / ((pixel * distance) ** 2 + 1e-4)
         w = (sure / (1 + (2 * miss / near) ** 2))[chosen, None] * normal
         place = np.linalg.lstsq(w.T @ normal, w.T @ (normal * across[chosen]).sum(axis=1), rcond=1e-9)[0]
         low, high = np.percentile(ends[chosen, 0], 2), np.percentile(ends[chosen, 1], 98)
-    return place, chosen
+    return place, alike[chosen]
 
 
 def _extent(
     place: np.ndarray,
-    chosen: np.ndarray,
+    picked: np.ndarray,
     segments: Segments,
     across: np.ndarray,
     along: np.ndarray,
     axis: int,
 ) -> Line | None:
     """The line at ``place``, from where to where two photos at least show it."""
-    picked = np.flatnonzero(chosen)
     if not len(picked):
         return None
     distance = np.linalg.norm(place - across[picked], axis=1)

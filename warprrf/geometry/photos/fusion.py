@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -66,6 +67,7 @@ def depth_maps(
     cameras: Sequence[Camera],
     *,
     photos: PosedPhotos | None = None,
+    planes: Sequence[Plane] = (),
     config: ReconstructionConfig | None = None,
     progress: Progress | None = None,
     device: DeviceLike = None,
@@ -74,6 +76,7 @@ def depth_maps(
 
     Args:
         photos: what ``cameras`` saw, in the same order; the depth maps are mended by them.
+        planes: that Gaussians were kept on: elsewhere only what photos prove is reliable.
     """
     config = config or ReconstructionConfig()
     report = progress or (lambda stage, done, total: None)
@@ -89,7 +92,25 @@ def depth_maps(
         return depths
     seen = photos.subset(spread(range(len(cameras)), VIEWS))
     depths, proved = mended(depths, views, seen, progress=report, device=device)
+    reach = partial(_sure, planes=planes, reach_m=config.surface.patch_distance_m)
+    with ThreadPoolExecutor(threads()) as pool:
+        depths = list(pool.map(reach, depths, proved, views))
     return _flat(depths, proved, views, seen, report) if config.segments else depths
+
+
+def _sure(
+    depth: np.ndarray, proved: np.ndarray, view: Camera, planes: Sequence[Plane], reach_m: float
+) -> np.ndarray:
+    """A depth map without what neither photos prove nor a plane within ``reach_m`` holds: Gaussians are vague there."""
+    rest = (depth > 0) & ~proved
+    points = view.position + depth[rest][:, None] * view.directions()[rest]
+    held = np.zeros(len(points), dtype=bool)
+    for plane in planes:
+        near = np.abs(plane.distance(points)) < reach_m
+        held[near] |= plane.covers(points[near])
+    result = np.where(proved, depth, 0.0)
+    result[rest] = np.where(held, depth[rest], 0.0)
+    return result
 
 
 def _flat(

@@ -58,3 +58,8 @@ class GreyPhotos:
 def lens_matrix(camera: Camera) -> np.ndarray:
     """Pixels ``(u, v, 1)`` of directions ``(x, y, 1)`` of a pinhole camera, shape ``(3, 3)``."""
     return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+
+
+def projections(cameras: Sequence[Camera]) -> np.ndarray:
+    """Homogeneous pixels of places ``(x, y, z, 1)`` in pinhole cameras, shape ``(N, 3, 4)`` float32."""
+    return np.array([lens_matrix(c) @ c.world_to_camera[:3] for c in cameras], dtype=np.float32)

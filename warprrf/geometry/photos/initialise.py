@@ -24,16 +24,14 @@ from warprrf.geometry.photos.grey import GreyPhotos
 from warprrf.geometry.photos.plain import plain_surfaces, with_plain
 from warprrf.geometry.photos.points import clean_points, detect_room_planes, estimate_normals
 from warprrf.geometry.photos.sparse import SparseModel
-from warprrf.geometry.photos.sweep import choose_views, joined, level_planes, proven_cells
+from warprrf.geometry.photos.sweep import choose_views, joined, level_planes, proven_cells, united
 from warprrf.geometry.planes import Plane, aligned, plane_axes
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Y00, Gaussians, quaternions_of
 
 OPACITY = 0.95
 SPREAD = 0.65  # standard deviation of a disc in units of the spacing: little light leaks between neighbours
-FLATNESS = 0.05  # thickness over radius
 MIN_SCALE, MAX_SCALE = 0.004, 0.12  # of a disc on a sparse point [m]
-ON_PLANE_M = 0.02  # a sparse point this close to an occupied cell gives way to the plane's own discs
 
 
 def initial_gaussians(
@@ -67,7 +65,8 @@ def initial_gaussians(
         raise ValueError(f"images: got {len(images)} for {len(cameras)} cameras, expected one for each")
     free = np.ones(len(points), dtype=bool)
     for plane in planes if len(cameras) else ():
-        free &= ~((np.abs(plane.distance(points)) < ON_PLANE_M) & plane.covers(points))
+        # 0.02: a sparse point this close to an occupied cell gives way to the plane's own discs
+        free &= ~((np.abs(plane.distance(points)) < 0.02) & plane.covers(points))
     radius = np.full(len(points), MAX_SCALE)
     if len(points) > 3:
         gap = cKDTree(points).query(points[free], k=4)[0][:, 1:]
@@ -86,7 +85,8 @@ def discs(centres: np.ndarray, normals: np.ndarray, radius: np.ndarray, colors: 
     kinds, which = np.unique(normals, axis=0, return_inverse=True)
     axes = np.array([plane_axes(n) for n in kinds])[which.ravel()]
     rotation = np.stack([axes[:, 0], axes[:, 1], normals], axis=2)
-    scales = np.stack([radius, radius, np.maximum(FLATNESS * radius, 1e-4)], axis=1)
+    # 0.05: thickness over radius
+    scales = np.stack([radius, radius, np.maximum(0.05 * radius, 1e-4)], axis=1)
     sh = ((colors - 0.5) / Y00)[:, None, :]
     return Gaussians(centres, quaternions_of(rotation), scales, np.full(len(centres), OPACITY), sh)
 
@@ -226,7 +226,7 @@ def initialise(
         planes = with_plain(planes, plain.planes, points, sight)
         real = np.add.reduceat(reflected, sparse.track_start[:-1]) < 0.5 * sparse.track_length
     report("planes", 5, 6)
-    planes = seen_cells(meeting(planes), list(sparse.cameras.values()))
+    planes = seen_cells(meeting(united((), planes)), list(sparse.cameras.values()))
     gaussians = initial_gaussians(
         points[real],
         sparse.colors[real],

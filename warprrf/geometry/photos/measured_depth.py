@@ -15,12 +15,9 @@ from warprrf.geometry.photos.sparse import SparseModel
 from warprrf.geometry.photos.undistort import stored_pixels
 from warprrf.geometry.splats.camera import Camera
 
-CELL_M = 0.03  # one point for each cube of this side
-MOST_PIXELS = 400_000  # of all maps that points are made of
 VIEWS = 120  # most maps that are used, spread over all
 NEAR_M = 0.02  # a map shows a point that it measures this near to,
 NEAR_SHARE = 0.02  # or within this part of its range
-AGREE = 0.5  # least share of the points in a map's sight that it shows, over those that it looks through
 
 
 def range_maps(sparse: SparseModel, files: Mapping[str, DepthFile]) -> dict[str, tuple[Camera, np.ndarray]]:
@@ -76,7 +73,8 @@ def with_points(sparse: SparseModel, files: Mapping[str, DepthFile]) -> SparseMo
         shown += int(seen[:, k].sum())
         through += int((known & (off > NEAR_M + NEAR_SHARE * here)).sum())
     shown -= len(points)  # by the map that it comes from
-    if shown < AGREE * (shown + through):
+    # 0.5: least share of the points in a map's sight that it shows, over those that it looks through
+    if shown < 0.5 * (shown + through):
         raise ValueError(
             f"depth: of the points in sight of another depth image {max(shown, 0) / max(shown + through, 1):.0%} are where it "
             "measures them; expected most: depth and poses differ in unit (scale=, depth_unit_scale_factor) or are of "
@@ -102,7 +100,8 @@ def _cloud(
     maps: Mapping[str, tuple[Camera, np.ndarray]], photos: Mapping[str, Path]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points and colours of all maps, the mean of those in a cube."""
-    stride = max(1, int(np.ceil(np.sqrt(sum(r.size for _, r in maps.values()) / MOST_PIXELS))))
+    # 400_000: of all maps that points are made of
+    stride = max(1, int(np.ceil(np.sqrt(sum(r.size for _, r in maps.values()) / 400_000))))
     some = (slice(stride // 2, None, stride),) * 2
     points, colors = [], []
     for name, (view, measured) in maps.items():
@@ -117,7 +116,8 @@ def _cloud(
         )
         colors.append(image[np.ix_(rows.astype(int), columns.astype(int))].reshape(-1, 3)[known])
     xyz, rgb = np.concatenate(points).astype(np.float64), np.concatenate(colors).astype(np.float64)
-    cell = np.floor(xyz / CELL_M).astype(np.int64)
+    # 0.03: one point for each cube of this side
+    cell = np.floor(xyz / 0.03).astype(np.int64)
     _, group, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     total = [[np.bincount(group.ravel(), weights=of[:, k]) for k in range(3)] for of in (xyz, rgb)]
     return np.array(total[0]).T / count[:, None], np.array(total[1]).T / count[:, None]

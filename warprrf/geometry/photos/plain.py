@@ -12,12 +12,15 @@ Within this module cameras, lines and cells are in the room's frame, whose axes 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
+from warprrf.device import threads
 from warprrf.geometry.photos.cells import BEHIND_M as SEEN_BEHIND_M
 from warprrf.geometry.photos.cells import CONTESTED_M, PARALLEL, in_frame
 from warprrf.geometry.photos.edges import (
@@ -35,11 +38,8 @@ from warprrf.geometry.splats.camera import Camera
 
 SURE_VIEWS, LINE_M = 4, 0.4  # photos and length from which on an edge counts
 FLAT, PLAIN_PX = 0.006, 7  # a pixel is plain where none in a square of this side changes by more than this
-SHOWN_SHARE = 0.15  # where so much of an edge shows in a photo, all of it parts regions
-LEAST_SHARE = 0.12  # a dozen photos with fewer plain pixels than this share show no plain surface
 REGION_PX, VOTES_PX = 150, 25.0  # fewest pixels of a plain region, and of its border on a plane
 SAME_M = 0.04  # an edge this close to a plane lies on it
-RIVAL = 0.8  # of the planes with at least this share of the most votes, the nearest has the region
 BEHIND_M = 0.15  # an edge, or a surface, this far behind a plane is behind it
 STRIDE, CELL_M = 4, 0.1  # cells, of this side, look up every so many-th pixel
 AGREEING, PIECE_M2 = 2, 0.1  # fewest photos that put a cell on its plane, and least area of a piece of one
@@ -117,20 +117,24 @@ def plain_surfaces(
     turn[:3, :3] = axes.T
     cameras = [replace(c, world_to_camera=c.world_to_camera @ turn) for c in cameras]
     some = images[:: -(-len(images) // 12)] if images else []
-    if np.mean([_plain(find_edgels(image)).mean() for image in some] or 0) < LEAST_SHARE:
+    # 0.12: a dozen photos with fewer plain pixels than this share show no plain surface
+    if np.mean([_plain(find_edgels(image)).mean() for image in some] or 0) < 0.12:
         return PlainSurfaces([], [], axes)
-    edgels = [find_edgels(image) for image in images]
-    plain = [_plain(e) for e in edgels]
+    with ThreadPoolExecutor(threads()) as pool:
+        edgels = list(pool.map(find_edgels, images))
+        plain = list(pool.map(_plain, edgels))
     lines = find_lines(cameras, images, edgels)
     lines = [x for x in lines if len(x.views) >= SURE_VIEWS and x.high - x.low >= LINE_M]
     panes, lines = _mirrors(lines, cameras)
     heights = _heights(lines)
     if not heights:
         return PlainSurfaces([], panes, axes)
-    seen = [_regions_on(heights, lines, *view, panes) for view in zip(cameras, edgels, plain, strict=True)]
+    on_planes = partial(_regions_on, heights, lines, _traced(lines), panes)
+    with ThreadPoolExecutor(threads()) as pool:
+        seen = list(pool.map(on_planes, cameras, edgels, plain))
     planes = [
         plane
-        for number in range(len(heights))
+        for number in np.unique(np.concatenate([view.plane[view.plane >= 0] for view in seen])).tolist()
         for side in (1, -1)
         for plane in _agreed(number, side, heights, cameras, seen)
     ]
@@ -179,7 +183,7 @@ def _mirrors(lines: list[Line], cameras: Sequence[Camera]) -> tuple[list[Pane], 
         for side in (1, -1):
             pane = Pane(axis, height, side, low - 0.1, high + 0.1)
             parts = [part for x in lines for part in _parted(pane, x)]
-            through = [_only_through(pane, x, positions) for x in parts]
+            through = _only_through(pane, parts, positions)
             shown = [x for x, only in zip(parts, through, strict=True) if only]
             total = sum(x.weight for x in shown)
             twins = sum(x.weight for x in shown if _has_twin(pane, x, parts))
@@ -204,12 +208,15 @@ def _is_behind(pane: Pane, line: Line) -> bool:
     return bool(pane.side * (middle - pane.height) < -0.1)
 
 
-def _only_through(pane: Pane, line: Line, positions: np.ndarray) -> bool:
-    """Whether nearly all of a line is seen through the pane alone."""
-    points = line.points(np.linspace(line.low, line.high, 7)[1:-1])
-    eyes = positions[list(line.views)]
-    crossing = pane.between(np.repeat(eyes, len(points), axis=0), np.tile(points, (len(eyes), 1)))
-    return bool(crossing.mean() > 0.8)
+def _only_through(pane: Pane, lines: Sequence[Line], positions: np.ndarray) -> np.ndarray:
+    """Of which lines nearly all is seen through the pane alone, shape ``(L,)`` bool."""
+    points = np.array([line.points(np.linspace(line.low, line.high, 7)[1:-1]) for line in lines])
+    views = [len(line.views) for line in lines]
+    eyes = positions[np.concatenate([line.views for line in lines])]
+    targets = np.repeat(points, views, axis=0)
+    crossing = pane.between(np.repeat(eyes, points.shape[1], axis=0), targets.reshape(-1, 3))
+    share = np.bincount(np.repeat(np.arange(len(lines)), views), crossing.reshape(len(eyes), -1).mean(axis=1))
+    return np.asarray(share > 0.8 * np.array(views))
 
 
 def _has_twin(pane: Pane, line: Line, lines: Sequence[Line]) -> bool:
@@ -235,13 +242,14 @@ class _View(NamedTuple):
 def _regions_on(
     heights: Sequence[Height],
     lines: Sequence[Line],
+    traced: tuple[np.ndarray, np.ndarray],
+    panes: Sequence[Pane],
     camera: Camera,
     edgels: Edgels,
     plain: np.ndarray,
-    panes: Sequence[Pane],
 ) -> _View:
     """The plain regions of a photo, each on the plane that its border votes for."""
-    of_line, barrier = _shown(lines, camera, edgels)
+    of_line, barrier = _shown(lines, traced, camera, edgels)
     region, count = ndimage.label(plain & ~ndimage.binary_dilation(barrier, np.ones((3, 3))))
     size = np.bincount(region.ravel(), minlength=count + 1)
     size[0] = 0
@@ -255,7 +263,8 @@ def _regions_on(
         if not own.any():
             continue
         rivals = []
-        for number in np.flatnonzero(votes[k] >= RIVAL * votes[k].max()).tolist():
+        # 0.8: of the planes with at least this share of the most votes, the nearest has the region
+        for number in np.flatnonzero(votes[k] >= 0.8 * votes[k].max()).tolist():
             axis, height, *_ = heights[number]
             with np.errstate(divide="ignore", invalid="ignore"):
                 t = (height - camera.position[axis]) / rays[own][:, axis]
@@ -273,7 +282,9 @@ def _regions_on(
     return _View(plane, ranges)
 
 
-def _shown(lines: Sequence[Line], camera: Camera, edgels: Edgels) -> tuple[np.ndarray, np.ndarray]:
+def _shown(
+    lines: Sequence[Line], traced: tuple[np.ndarray, np.ndarray], camera: Camera, edgels: Edgels
+) -> tuple[np.ndarray, np.ndarray]:
     """The line that each edgel lies on (-1: none), and the pixels that part regions: lines, where enough of them shows
     in whole, else their shown parts with gaps bridged."""
     height, width = edgels.strength.shape
@@ -281,26 +292,32 @@ def _shown(lines: Sequence[Line], camera: Camera, edgels: Edgels) -> tuple[np.nd
     place[edgels.pixel] = np.arange(len(edgels.position))
     off, (row, column) = ndimage.distance_transform_edt(place < 0, return_indices=True)
     of_line, barrier = np.full(len(edgels.position), -1), np.zeros((height, width), dtype=bool)
-    for number, line in enumerate(lines):
-        along = np.linspace(line.low, line.high, int((line.high - line.low) / 0.01) + 2)
-        inside, pixels = in_frame(camera, line.points(along), 0.1)
-        y, x = pixels[inside].T
-        first = np.flatnonzero(np.concatenate([x[:1] == x[:1], (np.diff(x) != 0) | (np.diff(y) != 0)]))
-        x, y = x[first], y[first]
-        if len(x) < SEGMENT_PX / 2:
-            continue
-        near = place[row[y, x], column[y, x]]
-        direction = lines_through(camera, np.stack([x, y], axis=1) + 0.5, line.axis)[1]
-        straight = np.abs((edgels.across[near] * direction).sum(axis=1)) < np.sin(np.radians(2 * EDGE_DEG))
-        on = (off[y, x] < 3.5) & straight
+    points, number = traced
+    inside, pixels = in_frame(camera, points, 0.1)
+    steps = np.c_[number[inside], pixels[inside]]
+    number, y, x = steps[np.diff(steps, axis=0, prepend=-1).any(axis=1)].T
+    near = place[row[y, x], column[y, x]]
+    axis = np.array([line.axis for line in lines])[number]
+    direction = lines_through(camera, np.stack([x, y], axis=1) + 0.5, axis)[1]
+    straight = np.abs((edgels.across[near] * direction).sum(axis=1)) < np.sin(np.radians(2 * EDGE_DEG))
+    shown = (off[y, x] < 3.5) & straight
+    for own in np.split(np.arange(len(x)), np.flatnonzero(np.diff(number)) + 1):
+        on = shown[own]
         if on.sum() < SEGMENT_PX / 2:
             continue
-        of_line[near[on]] = number
-        if on.mean() < SHOWN_SHARE:
+        of_line[near[own[on]]] = number[own[0]]
+        # 0.15: where so much of an edge shows in a photo, all of it parts regions
+        if on.mean() < 0.15:
             on = ndimage.binary_closing(np.pad(on, 40), np.ones(40))[40:-40]
-            x, y = x[on], y[on]
-        barrier[y, x] = True
+            own = own[on]
+        barrier[y[own], x[own]] = True
     return of_line, barrier
+
+
+def _traced(lines: Sequence[Line]) -> tuple[np.ndarray, np.ndarray]:
+    """Points along all lines, a centimetre apart, shape ``(N, 3)``; and the number of the line of each, ``(N,)``."""
+    points = [x.points(np.linspace(x.low, x.high, int((x.high - x.low) / 0.01) + 2)) for x in lines]
+    return np.concatenate(points), np.repeat(np.arange(len(lines)), [len(p) for p in points])
 
 
 def _votes(

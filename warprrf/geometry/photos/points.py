@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 from warprrf.checks import check_array
 from warprrf.geometry.planes import Plane, PlaneConfig, detect_planes
 
-MAX_REPROJECTION_ERROR = 1.0  # of a sparse point that is kept [pixels]
 SMALL_POINTS = 16  # fewest points of a small plane, looked for among those that the large ones leave
 NEIGHBOURS = 16  # that a point is compared with
 MIN_TRACK_LENGTH = 3  # photos that see a point which is kept
@@ -44,7 +43,8 @@ def clean_points(
     keep = np.ones(len(points), dtype=bool)
     if reprojection_error is not None:
         error = check_array("reprojection_error", reprojection_error, (len(points),))
-        keep &= error <= MAX_REPROJECTION_ERROR
+        # 1.0: of a sparse point that is kept [pixels]
+        keep &= error <= 1.0
     if track_length is not None:
         keep &= check_array("track_length", track_length, (len(points),)) >= MIN_TRACK_LENGTH
     chosen = np.flatnonzero(keep)

@@ -29,8 +29,6 @@ from warprrf.tensor_files import named as naming
 OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # to x right, y down, z forward
 POSE_FILE, COLOUR_FILE, DEPTH_FILE = ".pose.txt", ".color", ".depth.png"
 MILLIMETRE = 1e-3
-NOT_RIGID = 0.02  # most that a rotation may stretch: KinectFusion writes some that are off by 0.005
-LARGEST_TEXT = 100_000  # bytes of a pose or of intrinsics
 
 
 @dataclass(frozen=True)
@@ -312,7 +310,8 @@ def _inverse(camera_to_world: ArrayLike) -> np.ndarray:
     if len(given) not in (3, 4) or (len(given) == 4 and not np.allclose(given[3], [0, 0, 0, 1], atol=1e-6)):
         raise ValueError(f"pose: got {len(given)} rows, expected 4 of which the last is 0 0 0 1")
     u, size, vt = np.linalg.svd(given[:3, :3])
-    if np.abs(size - 1).max() > NOT_RIGID or np.linalg.det(u @ vt) < 0:
+    # 0.02: most that a rotation may stretch: KinectFusion writes some that are off by 0.005
+    if np.abs(size - 1).max() > 0.02 or np.linalg.det(u @ vt) < 0:
         raise ValueError(
             f"pose: its rotation stretches by {size.min():.3g} to {size.max():.3g} or mirrors, expected a rigid transform"
         )
@@ -357,7 +356,8 @@ def _read_frames(folder: Path) -> dict[str, KnownCamera]:
 
 def _numbers(path: Path, size: int, finite: bool = True) -> np.ndarray:
     """A square matrix of numbers in a small text file."""
-    if path.stat().st_size > LARGEST_TEXT:
+    # 100_000: bytes of a pose or of intrinsics
+    if path.stat().st_size > 100_000:
         raise ValueError(
             f"poses: {path} has {path.stat().st_size} bytes, expected {size} rows of {size} numbers"
         )

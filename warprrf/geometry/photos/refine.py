@@ -41,14 +41,10 @@ ENOUGH_TO_FILL = 100
 """Iterations from which on holes are filled: new Gaussians stand at a guessed depth until photos have moved them."""
 CHECKPOINT = "warprrf refinement 2"
 
-DENSIFY_UNTIL = 0.65  # of the iterations Gaussians are split and cloned
-SH_DEGREE = 1  # of the colours: rooms are nearly matt
 FINE_FROM, COARSE_PIXELS = 0.8, 100_000
 """Until this share of the iterations squares are twice as wide, and twice again, as long as photos would have more pixels."""
 FULL_FROM = 0.9  # share of the iterations after which photos are taken as they are
 FULL_PIXELS = 400_000  # of larger photos fewer iterations see all, so that they take as long
-SSIM_SHARE = 0.2  # weight of 1 - SSIM; L1 has the rest
-FINAL_MEAN_RATE = 4e-5  # metres a step at the end; exponential from that at the start
 SCALE_RATE, QUATERNION_RATE, OPACITY_RATE, COLOR_RATE = 5e-3, 2e-3, 3e-2, 5e-3
 """Of the logarithms of scales, quaternions, logits of opacities and constant colours."""
 PLANE_DISTANCE_M, PLANE_ANGLE_RAD = 0.04, 0.6  # a Gaussian this close to a plane belongs to it
@@ -104,7 +100,8 @@ class _Refinement:
         self, photos: PosedPhotos, config: RefineConfig, planes: Sequence[Plane], device: wp.Device
     ) -> None:
         self.config, self.planes, self.device = config, list(planes), device
-        self.loss = PhotoLoss(device, SSIM_SHARE)
+        # 0.2: weight of 1 - SSIM; L1 has the rest
+        self.loss = PhotoLoss(device, 0.2)
         self.targets = Targets(photos, self.loss)
         self.exposures = Exposures(len(self.targets), config.fit_exposure)
         self.iteration = 0
@@ -173,7 +170,8 @@ class _Refinement:
         self.move()
         if self.iteration % 100 == 0 and not np.isfinite(score.numpy()).all():
             raise RuntimeError(f"refine: the loss became NaN at iteration {self.iteration}")
-        until = DENSIFY_UNTIL * c.iterations
+        # 0.65: of the iterations Gaussians are split and cloned
+        until = 0.65 * c.iterations
         if c.densify_from <= self.iteration <= until and self.iteration % c.densify_every == 0:
             rng = np.random.default_rng([c.seed, 2, self.iteration])
             left = 1 + int((until - self.iteration) // c.densify_every)
@@ -227,7 +225,8 @@ class _Refinement:
     def move(self) -> None:
         """One step of Adam on everything, then the pull towards planes."""
         c, t = self.config, self.iteration
-        mean_rate = c.mean_rate * (FINAL_MEAN_RATE / c.mean_rate) ** (t / c.iterations)
+        # 4e-5: metres a step at the end; exponential from that at the start
+        mean_rate = c.mean_rate * (4e-5 / c.mean_rate) ** (t / c.iterations)
         higher = [COLOR_RATE / 20] * (self.widths["sh"] - 3)  # the slower rate of the published method
         rates = {
             "means": [mean_rate] * 3, "quaternions": [QUATERNION_RATE] * 4, "log_scales": [SCALE_RATE] * 3,
@@ -277,7 +276,8 @@ def _initial(g: Gaussians) -> Arrays:
     order = np.argsort(-g.scales, axis=1, kind="stable")
     rotations = np.take_along_axis(g.rotations, order[:, None, :], axis=2)
     rotations[:, :, 2] *= np.linalg.det(rotations)[:, None]
-    sh = np.zeros((len(g), COEFFICIENTS[SH_DEGREE], 3))
+    # 1: of the colours: rooms are nearly matt
+    sh = np.zeros((len(g), COEFFICIENTS[1], 3))
     kept = min(sh.shape[1], g.sh.shape[1])
     sh[:, :kept] = g.sh[:, :kept]
     opacity = np.clip(g.opacities.astype(np.float64), 1e-4, 1 - 1e-4)

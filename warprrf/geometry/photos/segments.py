@@ -13,19 +13,22 @@ walls; the figures change little with any of them.
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from warprrf.device import require
+import numpy as np
+import warp as wp
+from scipy import ndimage
+
+from warprrf.device import launch, require
 from warprrf.geometry.splats.camera import Camera
+from warprrf.kernels.segments import cut
 
 COARSENESS = 60.0  # of the segments: scikit-image's ``scale``, of colours from 0 to 255
 BLUR_PX, LEAST_PX = 0.6, 80  # before a photo is cut, and pixels of the smallest segment
 PROVED_PX, PROVED_SHARE = 15, 0.04  # so many pixels of a segment, and such a part of it, must be proved
 TOLERANCE = 0.02  # a depth that differs from a plane's by less than this part lies on it
-ON_ONE_PLANE = 0.4  # part of the proved depths of a segment that must lie on its plane
 TRIALS, DRAWN = 48, 300  # planes through three proved pixels, and pixels that they are judged by
 UNSURE = 0.02  # where a plane's standard deviation is larger than this part of the depth, it says nothing
-ALIKE_PX = 25.0  # neighbouring pixels, of which errors are alike
 NEAR = 0.12  # proved depths that differ by more than this part from the plane are something else, and stay
 
 
@@ -42,10 +45,10 @@ def with_segments(
         view: pinhole camera of the depth map.
     """
     image = require("PIL.Image", extra="photos")
-    segmentation = require("skimage.segmentation", extra="photos")
     bytes_ = np.round(255 * np.asarray(photo)).astype(np.uint8)
-    colours = np.asarray(image.fromarray(bytes_).resize((view.width, view.height), image.BOX))
-    segment = segmentation.felzenszwalb(colours, scale=COARSENESS, sigma=BLUR_PX, min_size=LEAST_PX).ravel()
+    segment = cut_by_colour(
+        np.asarray(image.fromarray(bytes_).resize((view.width, view.height), image.BOX))
+    ).ravel()
     rays = view.directions().reshape(-1, 3)
     inverse = np.where(depth.ravel() > 0, 1 / np.maximum(depth.ravel(), 1e-9), 0.0)
     result, sure = depth.flatten(), proved.ravel()
@@ -59,11 +62,34 @@ def with_segments(
             continue
         plane, covariance = found
         there = rays[pixels] @ plane
-        spread = np.sqrt(np.einsum("ni,ij,nj->n", rays[pixels], covariance, rays[pixels]))
+        spread = np.sqrt(((rays[pixels] @ covariance) * rays[pixels]).sum(axis=1))
         put = shown.ravel()[pixels] & (there > 1e-6) & (spread < UNSURE * there)
         put &= ~sure[pixels] | (np.abs(there - inverse[pixels]) < NEAR * inverse[pixels])
         result[pixels[put]] = 1 / there[put]
     return result.reshape(depth.shape)
+
+
+def cut_by_colour(colours: np.ndarray) -> np.ndarray:
+    """A number for the segment of each pixel of a photo ``(H, W, 3)`` of bytes, shape ``(H, W)``."""
+    smooth = ndimage.gaussian_filter(colours / 255.0, [BLUR_PX, BLUR_PX, 0])
+    number = np.arange(smooth[..., 0].size, dtype=np.int32).reshape(smooth.shape[:2])
+    pairs: list[tuple[Any, Any]] = [
+        (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]),
+        (np.s_[:-1, :-1], np.s_[1:, 1:]), (np.s_[1:, :-1], np.s_[:-1, 1:]),
+    ]  # fmt: skip
+    first, second = (np.concatenate([number[pair[k]].ravel() for pair in pairs]) for k in (0, 1))
+    apart = [np.sqrt(((smooth[a] - smooth[b]) ** 2).sum(axis=2)).ravel() for a, b in pairs]
+    difference, count = np.concatenate(apart).astype(np.float32), len(first)
+    ascending, order = (
+        wp.array(np.resize(x, 2 * count), device="cpu")
+        for x in (difference, np.arange(count, dtype=np.int32))
+    )
+    wp.utils.radix_sort_pairs(ascending, order, count)
+    parent = wp.array(number.ravel(), device="cpu")
+    edges = [first, second, difference, order[:count]]
+    alone = np.ones(number.size, dtype=np.int32), np.zeros(number.size, dtype=np.float32)
+    launch(cut, 1, [*edges, COARSENESS / 255, LEAST_PX, parent, *alone], device="cpu")
+    return np.asarray(parent.numpy().reshape(number.shape))
 
 
 def _plane(
@@ -72,14 +98,24 @@ def _plane(
     """The plane on which many of a segment's depths lie, its coefficients and their covariance; None if few lie on one."""
     drawn = rng.permutation(len(rays))[:DRAWN]
     three = drawn[rng.integers(0, len(drawn), (TRIALS, 3))]
-    tried = np.einsum("nij,nj->ni", np.linalg.pinv(rays[three]), inverse[three])
+    a, b, c = np.moveaxis(rays[three], 1, 0)
+    across = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)  # Cramer's rule
+    volume = (a * across[:, 0]).sum(axis=1)
+    tried = (inverse[three][:, None] @ across)[:, 0] / np.where(volume == 0, 1.0, volume)[:, None]
     off = np.abs(tried @ rays[drawn].T / inverse[drawn] - 1)
     plane = tried[(off < TOLERANCE).sum(axis=1).argmax()]
     for _ in range(4):
-        weight = 1 / (1 + ((rays @ plane / inverse - 1) / TOLERANCE) ** 2) / inverse
-        plane = np.linalg.lstsq(rays * weight[:, None], inverse * weight, rcond=None)[0]
+        weighted = rays / (inverse * (1 + ((rays @ plane / inverse - 1) / TOLERANCE) ** 2))[:, None] ** 2
+        plane = np.linalg.solve(_regular(weighted.T @ rays), weighted.T @ inverse)
     left = rays @ plane - inverse
     on = np.abs(left) < TOLERANCE * inverse
-    if on.mean() < ON_ONE_PLANE:
+    # 0.4: part of the proved depths of a segment that must lie on its plane
+    if on.mean() < 0.4:
         return None
-    return plane, ALIKE_PX * left[on].var() * np.linalg.pinv(rays[on].T @ rays[on])
+    # 25.0: neighbouring pixels, of which errors are alike
+    return plane, 25.0 * left[on].var() * np.linalg.inv(_regular(rays[on].T @ rays[on]))
+
+
+def _regular(normal_matrix: np.ndarray) -> np.ndarray:
+    """A normal matrix that can be inverted though all pixels lie on one line."""
+    return normal_matrix + 1e-12 * np.trace(normal_matrix) * np.eye(3)

@@ -57,7 +57,6 @@ VERSIONS = {"features": 3, "matches": 2, "model": 4, "photos": 1}
 """Of the steps: counted up by whoever changes what a step computes."""
 
 LEAST_PIXELS = 10_000  # of max_pixels
-FEATURE_SIDE = 1600  # features are found in photos reduced to this length of their longer side [pixels]
 
 # Above this many pairs matching them all takes minutes; a coarse comparison then picks the pairs worth matching.
 MAX_EXHAUSTIVE_PAIRS = 2000
@@ -76,8 +75,6 @@ LENIENT = {
 """Of COLMAP's mapper, where its own limits leave photos without a pose: of a film of monitors and desks they pose 7 of 25, these
 22; the largest model of 125 frames of a walk through a lounge has 44 photos by them, 118 by these. Taken alone, these put a
 photo of ten into a wrong place where COLMAP's own leave it out."""
-SHARED_ROUNDS = 5  # of fitting one model to another, each without what the last one fits badly
-SHARED_ERROR = 0.01  # median of points that two models share, over their extent, up to which the two are one
 EXTRACT_BATCH = 12
 MATCH_BATCH = 400
 
@@ -340,7 +337,8 @@ def _extract(
         colmap.import_images(working, images, colmap.CameraMode.SINGLE, image_names=group, options=reader)
     if any(mask_beside(path) for path in named.values()):
         reader.mask_path = _write_masks(named, attempt.folder / "masks")
-    extraction = colmap.FeatureExtractionOptions(use_gpu=False, max_image_size=FEATURE_SIDE)
+    # 1600: features are found in photos reduced to this length of their longer side [pixels]
+    extraction = colmap.FeatureExtractionOptions(use_gpu=False, max_image_size=1600)
     extraction.sift.max_num_features = max_features
     extraction.sift.peak_threshold = PEAK_THRESHOLD
     for start in range(0, len(names), EXTRACT_BATCH):
@@ -558,11 +556,13 @@ def _joined(
         return None
     ours, theirs = np.array(pairs).transpose(1, 0, 2)
     right = np.full(len(pairs), True)
-    for _ in range(SHARED_ROUNDS):
+    # 5: of fitting one model to another, each without what the last one fits badly
+    for _ in range(5):
         scale, rotation, shift = fit_similarity(ours[right], theirs[right])
         error = np.linalg.norm(scale * ours @ rotation.T + shift - theirs, axis=1)
         right = error <= 3 * np.median(error)
-    if np.median(error) > SHARED_ERROR * np.ptp(theirs, axis=0).max():
+    # 0.01: median of points that two models share, over their extent, up to which the two are one
+    if np.median(error) > 0.01 * np.ptp(theirs, axis=0).max():
         return None
     other.transform(colmap.Sim3d(scale, colmap.Rotation3d(rotation), shift))
     both = colmap.Reconstruction()

@@ -17,10 +17,11 @@ from scipy import ndimage
 
 from warprrf.device import DeviceLike, Progress, filled, launch
 from warprrf.geometry.photos.cells import in_frame
-from warprrf.geometry.photos.grey import GreyPhotos, lens_matrix
+from warprrf.geometry.photos.grey import GreyPhotos, lens_matrix, projections
 from warprrf.geometry.photos.targets import PosedPhotos
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.patch_match import UNKNOWN, Others, match
+from warprrf.kernels.photo_consistency import count_votes
 
 GOOD_ANGLE_DEG = 9.0  # between two lines of sight: less tells depths badly, more changes what a window shows
 SOURCES = 3  # photos that one is compared with
@@ -75,8 +76,8 @@ def mended(
     for k, (view, depth) in enumerate(zip(views, depths, strict=True)):
         checked = _companions(k, views, depths, np.ones(len(views)), CHECKED)
         maps = [(views[s], found[s]) for s in checked]
-        agreed, _ = _votes(found[k], view, maps, TOLERANCE)
-        _, crossed = _votes(depth, view, maps, 2 * TOLERANCE)
+        agreed, _ = _votes(found[k], view, maps, TOLERANCE, device)
+        _, crossed = _votes(depth, view, maps, 2 * TOLERANCE, device)
         proved.append(agreed > 0)
         result.append(np.where(agreed > 0, found[k], np.where(crossed > 0, 0.0, depth)))
     return result, proved
@@ -208,16 +209,25 @@ def _companions(
 
 
 def _votes(
-    depth: np.ndarray, camera: Camera, others: Sequence[tuple[Camera, np.ndarray]], tolerance: float
+    depth: np.ndarray,
+    camera: Camera,
+    others: Sequence[tuple[Camera, np.ndarray]],
+    tolerance: float,
+    device: DeviceLike = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """How many of the ``others`` (cameras and their ranges) confirm the depth at each pixel, and how many see through."""
-    agreed, crossed = (np.zeros(depth.shape, dtype=np.int64) for _ in range(2))
     known = depth > 0
+    agreed, crossed = (np.zeros(depth.shape, dtype=np.int64) for _ in range(2))
+    cameras, ranges = [other for other, _ in others], [seen.ravel() for _, seen in others]
+    if not known.any() or not cameras:
+        return agreed, crossed
     points = camera.position + depth[known][:, None] * camera.directions()[known]
-    for other, ranges in others:
-        inside, place = in_frame(other, points)
-        seen = np.where(inside, ranges[place[:, 0], place[:, 1]], 0.0)
-        distance = np.linalg.norm(points - other.position, axis=1)
-        agreed[known] += (seen > 0) & (np.abs(seen - distance) < tolerance * distance)
-        crossed[known] += seen > (1 + tolerance) * distance
+    first = np.cumsum([0, *map(len, ranges)])[:-1]
+    sizes = np.array([(at, c.width, c.height) for at, c in zip(first, cameras, strict=True)], dtype=np.int32)
+    found = [wp.zeros(len(points), dtype=wp.int32, device=device) for _ in range(2)]
+    maps = [
+        np.concatenate(ranges).astype(np.float32), projections(cameras), np.array([c.position for c in cameras]), sizes
+    ]  # fmt: skip
+    launch(count_votes, len(points), [points, *maps, tolerance, *found], device=device)
+    agreed[known], crossed[known] = (votes.numpy() for votes in found)
     return agreed, crossed

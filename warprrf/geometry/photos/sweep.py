@@ -17,7 +17,7 @@ from scipy import ndimage
 from warprrf.device import launch
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.cells import CONTESTED_M, PARALLEL, plane_mesh, visible_from
-from warprrf.geometry.photos.grey import GreyPhotos, lens_matrix
+from warprrf.geometry.photos.grey import GreyPhotos, projections
 from warprrf.geometry.planes import AROUND, Plane, dilate, plane_axes
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.photo_consistency import SIDE, patch_agreement
@@ -30,7 +30,10 @@ CONTRAST = 0.012  # patches flatter than this part of white prove nothing
 STEP_M = 0.03  # between heights of the sweep; a patch shows a shift of that much
 REACH_M, LARGE_M2 = 2.5, 3.0  # a plane of this area is extended at most so far
 MIN_CELLS = 15  # of a plane found by the sweep
-SAME_PLANE_M = 0.008  # a piece this close to a known plane belongs to it
+SAME_PLANE_M, SAME_PLANE_DEG = (
+    0.02,
+    3.0,
+)  # a piece this close to a larger plane is one with it: poses are no better
 UP_M2, DOWN_M2 = 0.3, 2.0  # least area of a new plane that faces up, or down
 FINE_M = 0.005  # a plane's height is settled in steps of this length
 
@@ -40,7 +43,6 @@ def agreement_of(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Correlation in [-1, 1] and contrast of the patches at ``centres`` (N, 3) over ``views`` (N, V), -1 padded."""
     n, device = len(centres), photos.device
-    projections = np.array([lens_matrix(c) @ c.world_to_camera[:3] for c in photos.cameras])
     result, contrast = (wp.zeros(n, dtype=wp.float32, device=device) for _ in range(2))
     launch(
         patch_agreement,
@@ -48,7 +50,7 @@ def agreement_of(
         [
             wp.array(centres, dtype=wp.vec3, device=device), wp.vec3(*axes[0]), wp.vec3(*axes[1]), PATCH_M / (SIDE - 1),
             wp.array(views, dtype=wp.int32, device=device),
-            wp.array(projections.astype(np.float32), dtype=wp.vec4, device=device), photos.flat,
+            wp.array(projections(photos.cameras), dtype=wp.vec4, device=device), photos.flat,
             wp.array(photos.sizes, dtype=wp.vec3i, device=device), result, contrast,
         ],
         device=device,
@@ -263,18 +265,25 @@ def _settled(piece: Plane, surface: Mesh | None, photos: GreyPhotos) -> Plane | 
 def joined(planes: Sequence[Plane], levels: Sequence[Plane]) -> list[Plane]:
     """``planes`` and ``levels`` with pieces of one plane united; new planes need a least area, a larger one where they
     face down (seen from below, stripes on a wall pass for a soffit)."""
-    result = list(planes)
-    for level in sorted(levels, key=lambda p: -p.area()):
-        for k, plane in enumerate(result):
-            near = np.abs(plane.distance(level.cells())).mean() < SAME_PLANE_M
-            if near and plane.normal @ level.normal > np.cos(np.radians(1.0)):
-                result[k] = _united(plane, level)
-                break
-        else:
-            result.append(level)
+    result = united(planes, levels)
     least = [UP_M2 if p.normal[2] > 0 else DOWN_M2 for p in result[len(planes) :]]
     large = [p for p, area in zip(result[len(planes) :], least, strict=True) if p.area() >= area]
     return result[: len(planes)] + large
+
+
+def united(planes: Sequence[Plane], others: Sequence[Plane]) -> list[Plane]:
+    """``planes`` and ``others``, the largest first; those that one before them describes as well only add cells to it."""
+    result = list(planes)
+    for other in sorted(others, key=lambda p: -p.area()):
+        cells = other.cells()
+        for k, plane in enumerate(result):
+            near = np.abs(plane.distance(cells)).sum() < SAME_PLANE_M * len(cells)
+            if near and plane.normal @ other.normal > np.cos(np.radians(SAME_PLANE_DEG)):
+                result[k] = _united(plane, other)
+                break
+        else:
+            result.append(other)
+    return result
 
 
 def _united(plane: Plane, other: Plane) -> Plane:

@@ -29,7 +29,6 @@ from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.planes import Plane
 from warprrf.geometry.splats.camera import Camera
 
-LEAST_SEEN = 0.7  # of the surface must be seen; else the photos cover too little for the rest to be inferred
 KEEP_M = 0.12  # pieces of the old mesh this far from every known plane are kept,
 KEEP_M2 = 0.3  # if they are this large
 
@@ -75,7 +74,8 @@ def complete(
     if filled.all():
         return patches
     whole, known = surface_of(grid, filled, patches.tolerance_m)
-    if seen_share(grid, whole, solid) < LEAST_SEEN:
+    # 0.7: of the surface must be seen; else the photos cover too little for the rest to be inferred
+    if seen_share(grid, whole, solid) < 0.7:
         return patches
     return _with_rest(whole, known, patches, faces)
 

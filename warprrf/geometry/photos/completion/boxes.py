@@ -16,11 +16,7 @@ from warprrf.geometry.planar_patches import PlanarPatches
 
 CELL_M, MARGIN_M = 0.1, 0.3  # largest side of a box, and space kept around the mesh
 SURE_VOTES = 10.0  # votes that make half a certainty
-PRIOR = 0.3  # votes by which a box that nobody saw leans to solid
-LEAK = 0.05  # share of the lines of sight that go astray: so many votes of a neighbour count for nothing
 BEHIND = 2.0  # votes that a hit on a plane is worth: far more certain than a line of sight through a box
-TRUST = 0.6  # cost of a box that goes against all its votes, per square metre of its sides
-KNOWN = 0.4  # cost of a square metre of surface on a known plane; one where no plane is known costs 1
 CAPACITY = 10_000  # the flow is in whole numbers: so many for a square metre
 FINE_M = 0.002  # boxes are looked up in tables of this step: much faster than a search, and fine enough for evidence
 
@@ -114,8 +110,11 @@ def least_surface(grid: Grid, free: np.ndarray, solid: np.ndarray, closed: np.nd
     cross = ndimage.generate_binary_structure(3, 1)
     cross[1, 1, 1] = False
     beside = ndimage.maximum_filter(free / volume, footprint=cross, mode="constant")
-    against = BEHIND * solid + PRIOR + LEAK * beside * volume
-    cost = TRUST * around * (free - against) / (free + against + SURE_VOTES)
+    # 0.3: votes by which a box that nobody saw leans to solid
+    # 0.05: share of the lines of sight that go astray: so many votes of a neighbour count for nothing
+    against = BEHIND * solid + 0.3 + 0.05 * beside * volume
+    # 0.6: cost of a box that goes against all its votes, per square metre of its sides
+    cost = 0.6 * around * (free - against) / (free + against + SURE_VOTES)
     for a in range(3):
         for end, is_closed in zip((0, -1), closed[a], strict=True):
             rim = np.moveaxis(cost, a, 0)
@@ -130,7 +129,8 @@ def _minimum_cut(grid: Grid, cost: np.ndarray, sides: Sequence[np.ndarray]) -> n
     rows, columns, capacity = [], [], []
     for a in range(3):
         box, side = np.moveaxis(number, a, 0), np.moveaxis(sides[a], a, 0)
-        weight = np.where(grid.known[a][1:-1], KNOWN, 1.0)[:, None, None]
+        # 0.4: cost of a square metre of surface on a known plane; one where no plane is known costs 1
+        weight = np.where(grid.known[a][1:-1], 0.4, 1.0)[:, None, None]
         rows.append(box[:-1].ravel())
         columns.append(box[1:].ravel())
         capacity.append(np.maximum(CAPACITY * weight * side[:-1], 1).ravel())

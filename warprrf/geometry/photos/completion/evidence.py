@@ -15,11 +15,9 @@ from warprrf.geometry.splats.camera import Camera
 
 STRIDE = 5  # every so many-th row and column of the depth maps is used
 SNAP_M = 0.12  # a depth agrees with the mesh when both are this close
-SHY_M = 0.1  # a line of sight proves nothing this close to an end that lies on no plane
 STEP_M = 0.06  # spacing of samples along lines of sight
 BESIDE_M = 0.006  # a hit votes for the boxes this far before and behind its plane: within the thinnest board
 RIM_M, RIM_SHARE = 0.6, 0.25  # a side is closed when planes this near to it cover so much of it
-SEEN_PIECE = 0.1  # a flat piece of surface is seen when hits lie on so much of it
 RAYS_AT_ONCE = 20_000
 
 
@@ -46,7 +44,8 @@ def votes(
     slope = np.where(on, cosine, 1.0)
     t_plane = (np.einsum("ni,ni->n", o, normal) - sign * height) / slope
     on &= np.abs(t_plane - ranges) < SNAP_M / np.maximum(slope, 0.3)
-    end = np.where(on, t_plane - BESIDE_M / slope, np.minimum(ranges, t) - SHY_M)
+    # 0.1: a line of sight proves nothing this close to an end that lies on no plane
+    end = np.where(on, t_plane - BESIDE_M / slope, np.minimum(ranges, t) - 0.1)
     point = (o + t_plane[:, None] * d)[on]
     free = grid.count(point + BESIDE_M * normal[on]).astype(float)
     solid = grid.count(point - BESIDE_M * normal[on]).astype(float)
@@ -104,5 +103,6 @@ def seen_share(grid: Grid, patches: PlanarPatches, solid: np.ndarray) -> float:
     hit = (behind >= 0) & (solid.ravel()[behind] > 0)
     piece = connected_pieces(mesh, patches.face_patch)
     area = np.bincount(piece, weights=mesh.areas)
-    seen = np.bincount(piece, weights=mesh.areas * hit) > SEEN_PIECE * area
+    # 0.1: a flat piece of surface is seen when hits lie on so much of it
+    seen = np.bincount(piece, weights=mesh.areas * hit) > 0.1 * area
     return float(area[seen].sum() / area.sum())

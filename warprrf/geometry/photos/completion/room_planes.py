@@ -16,11 +16,8 @@ ALIGNED_DEG = 4.0  # a plane this parallel to one of three perpendicular directi
 EXACT_DEG, STRONG_M2 = 0.1, 2.0
 """A plane this parallel, with a proven area above the second, keeps its own tilt (0.1 degrees are 2 cm over 12 m): it is
 fitted better than the directions are."""
-LEAST_SHARE = 0.5  # of the mesh that has to lie on such planes; else it is no place of boxes
 SAME_SIDE_M = 0.035  # planes facing one way and closer than this are two fits of one surface
-BOARD_M = 0.012  # planes facing opposite ways can be closer, down to this: the two faces of a board
 GATHER_M2, GATHER_M = 0.08, 0.03  # so much area of left-over faces within so much height makes one more plane
-REACH_M = 0.12  # a face this close to a part of a plane that the photos proved belongs to it
 
 
 class Level(NamedTuple):
@@ -72,7 +69,8 @@ def directions(normals: np.ndarray, areas: np.ndarray, whole_m2: float) -> np.nd
         u, _, vt = np.linalg.svd(mean)
         axes = u @ vt
     on = areas[(np.abs(normals @ axes.T) > parallel).any(axis=1)].sum()
-    if on < LEAST_SHARE * whole_m2:
+    # 0.5: of the mesh that has to lie on such planes; else it is no place of boxes
+    if on < 0.5 * whole_m2:
         return None
     main = np.abs(axes).argmax(axis=1)
     if len(set(main)) == 3:  # in the order and sense of the world axes
@@ -136,7 +134,8 @@ def _parallel_to(normal: np.ndarray, axes: np.ndarray) -> tuple[int, int]:
 def _twin(level: Level, others: Sequence[Level]) -> Level | None:
     """The first of ``others`` that is the same surface."""
     for other in others:
-        gap = SAME_SIDE_M if other.sign == level.sign else BOARD_M
+        # 0.012: planes facing opposite ways can be closer, down to this: the two faces of a board
+        gap = SAME_SIDE_M if other.sign == level.sign else 0.012
         if other.axis == level.axis and abs(other.height - level.height) < gap:
             return other
     return None
@@ -200,7 +199,8 @@ def claim_proven(
     facing = smoothed_normals(mesh, 3) @ axes.T
     centres = mesh.triangles.mean(axis=1)
     heights = centres @ axes.T
-    least = np.full(len(centres), REACH_M)
+    # 0.12: a face this close to a part of a plane that the photos proved belongs to it
+    least = np.full(len(centres), 0.12)
     for plane, level in proven:
         gap = np.abs(heights[:, level.axis] - level.height)
         towards = level.sign * facing[:, level.axis] > np.cos(np.radians(35.0))
