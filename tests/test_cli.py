@@ -16,7 +16,7 @@ from warprrf import cli
 from warprrf.cli.inputs import read_positions, read_receivers
 from warprrf.cli.views import _look_at
 from warprrf.rf.fields.bistatic.options import FitOptions
-from warprrf.rf.fields.harmonic.options import FieldOptions
+from warprrf.rf.fields.harmonic.fitting import FieldOptions
 from warprrf.rf.maps.radio_map import RadioMap
 from warprrf.rf.spectra.spectrum import pixel_directions
 

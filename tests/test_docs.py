@@ -20,7 +20,7 @@ from warprrf.geometry import pipeline
 from warprrf.rf.fields.base import ResponseOptions
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.options import FitOptions
-from warprrf.rf.fields.harmonic.options import FieldOptions
+from warprrf.rf.fields.harmonic.fitting import FieldOptions
 from warprrf.rf.maps.radio_map import MapOptions
 from warprrf.rf.relevance.search import Setting
 from warprrf.steps import digest

@@ -21,7 +21,7 @@ import warprrf as wr
 from fuzz.place import POINTS, READINGS, TOWARDS, Place
 from warprrf.rf.fields import BistaticField, HarmonicField
 from warprrf.rf.fields.bistatic.options import FitOptions
-from warprrf.rf.fields.harmonic.options import FieldOptions
+from warprrf.rf.fields.harmonic.fitting import FieldOptions
 
 IGNORED = ("progress", "ax", "client")
 """Arguments that are not mutated unless an example names them: a caller's own functions, matplotlib's axes."""

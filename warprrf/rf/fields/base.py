@@ -115,7 +115,7 @@ class RadioField(ABC):
             options: by name, ``device`` and ``progress`` among them. A ``bistatic`` field takes ``client``, and those of
                 :class:`~warprrf.rf.fields.bistatic.options.FitOptions`: ``quick=True``, ``effects``, ``relevance``, ``lobes``,
                 ``reciprocal``, ``sub_pixels``, ``gain_offset``, ``iterations``, ``seed``. The others take those of
-                :class:`~warprrf.rf.fields.harmonic.options.FieldOptions`: ``iterations``, ``batch``, ``sh_degree``,
+                :class:`~warprrf.rf.fields.harmonic.fitting.FieldOptions`: ``iterations``, ``batch``, ``sh_degree``,
                 ``checkpoint``, ``seed``, ...
 
         Raises:
@@ -301,7 +301,7 @@ class RadioField(ABC):
         centre of the Gaussian that contributes most there (RF-3DGS+'s rule). Wide Gaussians reach over many pixels: arrival and
         direction to the vertex differ by 1 to 2 degrees in the median with 30,000 Gaussians in a room, and by 10 and more
         with less than 700; ``interaction_point="peak"`` or
-        ``"mesh"`` of :class:`~warprrf.rf.fields.harmonic.options.FieldOptions` puts the vertex on the ray.
+        ``"mesh"`` of :class:`~warprrf.rf.fields.harmonic.fitting.FieldOptions` puts the vertex on the ray.
 
         Args:
             receivers, transmitter: as for :meth:`spectrum`.

@@ -1,17 +1,26 @@
-"""From what receivers see and a model to the path gains that they get, and from those to spectra."""
+"""From what receivers see and a model to the path gains that they get, and from those to spectra.
+
+Surfaces light each other: elements are a source that records may start from in the transmitter's place. Rays from every
+side of an element, density by the cosine, see what the transmitter lights; that is what the element gets of first
+scatterings. What elements get of others after that is even over each. Elements are half a metre wide in a room.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
+from warprrf.geometry.mesh import vectors_across
 from warprrf.rf.spectra.beam import BeamOperator
-from warprrf.rf.tracing.interreflection import irradiance
-from warprrf.rf.tracing.model import Model, Parameters
+from warprrf.rf.tracing.model import Effects, Model, Parameters
 from warprrf.rf.tracing.records import Materials, Records
-from warprrf.rf.tracing.tracer import SPECULAR, Tracer, View
+from warprrf.rf.tracing.surface import Surface
+from warprrf.rf.tracing.tracer import SPECULAR, Rays, Tracer, View
+
+ELEMENT_RAYS = 128  # from each element, over its hemisphere
 
 
 @dataclass(frozen=True)
@@ -102,3 +111,108 @@ def images(gains: PathGains, beam: BeamOperator) -> np.ndarray:
     for image, own in zip(found, (view.paths.receiver == k for k in range(count)), strict=True):
         image += np.tensordot(specular[own], view.beams[own], axes=1)
     return np.maximum(found, 0.0)
+
+
+class Interreflection:
+    """Geometry of light between the elements of a surface under one transmitter.
+
+    Args:
+        tracer: casts the rays.
+        most: slabs that first scatterings may pass, at most.
+
+    Attributes:
+        lit: what the rays of sides see of first scatterings: records whose ray is the side, of irradiance where the
+            transmitter gives cos(theta_i) / d1^2 [1/m^2].
+        through: the same of surfaces that are lit through slabs.
+        behind: the same of surfaces that are seen through slabs.
+        between: irradiance of sides (rows) by radiance of sides (columns), shape ``(E, E)``: those of first sides, and of
+            second ones that light can reach; solids' inner ones are left dark.
+    """
+
+    def __init__(self, tracer: Tracer, most: int) -> None:
+        surface, grid = tracer.surface, tracer.grid
+        point, normal = _sample_points(surface)
+        known = np.arange(len(point))
+        if surface.two_sided:
+            point, normal = np.tile(point, (2, 1)), np.concatenate([normal, -normal])
+            face = grid.hit(tracer.transmitter).face
+            ray = np.flatnonzero(face >= 0)
+            known = np.union1d(known, surface.side_met(face[ray], grid.directions[ray]))
+        lift_m = 0.02  # rays start so far off the surface
+        shift = np.random.default_rng(0).random((2, len(surface.element_area)))
+        scale = np.float32(np.pi / ELEMENT_RAYS * (4.0 * np.pi / tracer.wavelength_m) ** 2)
+        lit, through, behind = list[Records](), list[Records](), list[Records]()
+        rows, columns, values, new = [], [], [], known
+        while len(new):
+            directions = _hemispheres(normal[new], shift[:, new % shift.shape[1]])
+            hits = grid.hit_along(point[new] + lift_m * normal[new], directions, np.ones(len(directions)))
+            hit = np.flatnonzero(hits.face >= 0)
+            side, met = np.repeat(new, ELEMENT_RAYS), surface.side_met(hits.face[hit], directions[hit])
+            rays = Rays(hits, side)
+            light = tracer.light(rays)
+            tables = [(lit, tracer.lit(rays, light))]
+            if most:
+                onward = tracer.behind(rays, most)
+                tables += [
+                    (through, tracer.lit_through(rays, light, most)),
+                    (behind, tracer.lit(onward, tracer.light(onward))),
+                ]
+            for table, found in tables:
+                table.append(replace(found, power=scale * found.power))
+            rows.append(side[hit])
+            columns.append(met)
+            values.append(
+                np.pi / ELEMENT_RAYS * np.broadcast_to(grid.transmittance(hits.range_m[hit]), len(hit))
+            )
+            new = np.setdiff1d(met, known)
+            known = np.union1d(known, new)
+        self.lit = Records.joined(lit)
+        self.through, self.behind = (
+            Records.joined(tables) if tables else self.lit.take(np.zeros(0, int))
+            for tables in (through, behind)
+        )
+        pairs = tuple(map(np.concatenate, (rows, columns)))
+        self.between = csr_matrix((np.concatenate(values), pairs), shape=(surface.element_sides,) * 2)
+
+
+def irradiance(tracer: Tracer, p: Parameters, effects: Effects) -> np.ndarray | None:
+    """Irradiance of elements' sides by surfaces that scattered before, under parameters of groups, in units in which the
+    transmitter gives cos(theta_i) / d1^2 [1/m^2], shape ``(E,)``; None where ``effects`` hold no second scattering."""
+    if effects.scatterings < 2:
+        return None
+    most, sides = effects.transmissions, tracer.surface.element_sides
+    light = tracer.kept.get(("interreflection", most), lambda: Interreflection(tracer.of_transmitter, most))
+    materials = Materials(p, tracer.slabs, device=tracer.grid.device)
+    share = p.scattered_share[tracer.surface.side_group] / np.pi
+    tables = [light.lit, light.through] + [light.behind] * effects.scatter_mirror
+    got = sum(np.bincount(r.ray, r.powers(materials), minlength=sides) for r in tables)
+    if effects.mirror_scatter:
+        for onto in (tracer.mirrored(slabs).onto for slabs in {0, most}):
+            got = got + light.between @ (
+                share * np.bincount(onto.ray, onto.powers(materials), minlength=sides)
+            )
+    first = got
+    for _ in range(2, effects.scatterings):
+        got = first + light.between @ (share * got)
+    return np.asarray(got)
+
+
+def _sample_points(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """A place on each element, and its first side's normal: the centre of the face nearest to its middle."""
+    centre = surface.mesh.triangles.mean(axis=1)
+    gap = np.linalg.norm(centre - surface.element_centre[surface.element], axis=1)
+    order = np.lexsort((gap, surface.element))
+    first = order[np.searchsorted(surface.element[order], np.arange(len(surface.element_area)))]
+    return centre[first], surface.side_normal[first]
+
+
+def _hemispheres(normal: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """``ELEMENT_RAYS`` directions for each normal (T, 3), density proportional to the cosine, shape ``(T * ELEMENT_RAYS, 3)``."""
+    k = np.arange(ELEMENT_RAYS)
+    u = np.mod(k * 0.7548776662466927 + shift[0, :, None], 1.0)  # R2 sequence (Roberts 2018), shifted
+    v = np.mod(k * 0.5698402909980532 + shift[1, :, None], 1.0)
+    radius, turn = np.sqrt(u), 2.0 * np.pi * v
+    a, b = vectors_across(normal)
+    x, y, z = radius * np.cos(turn), radius * np.sin(turn), np.sqrt(np.maximum(1.0 - u, 0.0))
+    d = x[..., None] * a[:, None] + y[..., None] * b[:, None] + z[..., None] * normal[:, None]
+    return d.reshape(-1, 3)

@@ -28,8 +28,7 @@ from warprrf.rf.em.fresnel import SurfaceTable
 from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, is_name_alone, itu_name, itu_permittivity
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.slabs import Walls
-from warprrf.rf.tracing.colours import Colours, colour_groups
-from warprrf.rf.tracing.shapes import SHAPES, shape_groups
+from warprrf.rf.tracing.groups import SHAPES, Colours, colour_groups, shape_groups
 
 ELEMENT_M = 0.5  # width of an element in a room
 ELEMENTS = 30_000

@@ -2,7 +2,7 @@
 
 Rays fill the sphere around a receiver. What they hit is connected to the transmitter (``S``) and to its images in mirrors
 (``MS``); some go on turned at a mirror and are connected there (``SM``, ``MSM``). Elements of the surface send on what they
-got of others (:mod:`warprrf.rf.tracing.interreflection`), and are seen directly (``E``) or in a mirror (``EM``). Slabs
+got of others (:mod:`warprrf.rf.tracing.render`), and are seen directly (``E``) or in a mirror (``EM``). Slabs
 (``T``) may stand in the way of light to a surface (``TS``; ``MTS``, before or behind the mirror), or of sight (``ST``, ``ET``),
 where rays go straight on. Line of sight and mirrors alone, through slabs too, come from the image method
 (:mod:`warprrf.rf.paths.mirror_paths`).

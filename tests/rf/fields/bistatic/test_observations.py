@@ -24,9 +24,9 @@ from warprrf.rf.fields.bistatic.observations import OWN_GAIN, Target, observe, p
 from warprrf.rf.spectra.antenna import horn
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.readings import Readings, path_weights
-from warprrf.rf.tracing.interreflection import irradiance
 from warprrf.rf.tracing.model import SETS, Effects, Layout
 from warprrf.rf.tracing.records import Bins, Materials
+from warprrf.rf.tracing.render import irradiance
 from warprrf.rf.tracing.tracer import SPECULAR
 
 RX = RECEIVERS[0]

@@ -10,7 +10,7 @@ from warprrf.geometry.planar_patches import planar_patches
 from warprrf.geometry.scans import is_scan, scanned_patches
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.spectra.metrics import evaluate
-from warprrf.rf.tracing.shapes import shape_groups
+from warprrf.rf.tracing.groups import shape_groups
 from warprrf.rf.tracing.surface import Surface
 
 CUPBOARD = box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.2])

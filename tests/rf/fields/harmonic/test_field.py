@@ -12,7 +12,7 @@ from radio_scenes import box_mesh, joined
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.splats.gaussians import Gaussians, discs_on_mesh
 from warprrf.rf.fields.harmonic.field import HarmonicField
-from warprrf.rf.fields.harmonic.options import FieldOptions
+from warprrf.rf.fields.harmonic.fitting import FieldOptions
 from warprrf.rf.fields.harmonic.paths import BEAM_REACH
 from warprrf.rf.fields.harmonic.transport import transport
 from warprrf.rf.spectra.metrics import psnr, unit_image

@@ -12,9 +12,8 @@ from scipy.special import factorial, lpmv
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.kernels.ssim import RADIUS, WINDOW
 from warprrf.rf.fields.harmonic.field import HarmonicField
-from warprrf.rf.fields.harmonic.fitting import Layer, Target, fit_layer
+from warprrf.rf.fields.harmonic.fitting import Layer, Rates, Target, fit_layer
 from warprrf.rf.fields.harmonic.opacity import Listed, OpacityTraining, list_responses
-from warprrf.rf.fields.harmonic.options import Rates
 from warprrf.rf.fields.harmonic.problem import Problem
 from warprrf.rf.fields.harmonic.transport import Rows, Transport, transport
 from warprrf.rf.spectra.spectrum import pixel_directions

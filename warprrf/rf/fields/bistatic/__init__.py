@@ -1,6 +1,6 @@
 """The bistatic radio field: parameters of materials fitted to the path table of :mod:`warprrf.rf.tracing`.
 
-``field`` holds a surface, effects, parameters and a residual, and answers with ``paths``, ``links``, ``suggest`` and
+``field`` holds a surface, effects, parameters and a residual, and answers with ``paths``, ``suggest`` and
 ``files``. ``fit`` reads as the list of steps that make it: ``observations`` of data sets of any kind (``measured`` says how
 readings come from paths), ``gauss_newton`` on parameters, ``merging`` of materials, ``residual``, ``uncertainty``; ``placing``
 finds where a receiver stood.

@@ -5,7 +5,7 @@ A pixel holds the power of every path of a scattering surface, spread by the rec
 - line of sight (Friis) and mirror reflections by the image method, blocking softened;
 - diffuse scattering of surfaces that the transmitter illuminates, directly or by a mirror, a non-negative mix of normalised
   lobes, which changes when the ends are swapped unless fitted as ``reciprocal``; it may be seen in a mirror;
-- what those illuminate in turn (:mod:`warprrf.rf.tracing.interreflection`).
+- what those illuminate in turn (:mod:`warprrf.rf.tracing.render`).
 
 Where the data hold absorption by the air, every leg of a path has its own.
 
@@ -48,8 +48,6 @@ from warprrf.rf.fields.base import Data, Measured, RadioField, with_settings
 from warprrf.rf.fields.batches import Work
 from warprrf.rf.fields.bistatic import edited, files
 from warprrf.rf.fields.bistatic.fit import fit
-from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, links, receivers_at_once
-from warprrf.rf.fields.bistatic.links import SHAPE as LINK_SHAPE
 from warprrf.rf.fields.bistatic.locate import locate
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, read
 from warprrf.rf.fields.bistatic.needs import assumed, evenly
@@ -63,7 +61,14 @@ from warprrf.rf.fields.bistatic.observations import (
     places_of,
 )
 from warprrf.rf.fields.bistatic.options import SUB_PIXELS, FitOptions
-from warprrf.rf.fields.bistatic.paths import paths_of, strongest
+from warprrf.rf.fields.bistatic.paths import (
+    LINK_SHAPE,
+    RAYS_AT_A_TIME,
+    links,
+    paths_of,
+    receivers_at_once,
+    strongest,
+)
 from warprrf.rf.fields.bistatic.suggest import SHAPE as SUGGEST_SHAPE
 from warprrf.rf.fields.bistatic.suggest import Sensitivity, Unknowns, suggest
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel

@@ -13,8 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from warprrf.rf.em.fresnel import fresnel_curves
-from warprrf.rf.fields.bistatic.batch import Batch
-from warprrf.rf.fields.bistatic.gauss_newton import Problem
+from warprrf.rf.fields.bistatic.gauss_newton import Batch, Problem
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, Observation, huber
 from warprrf.rf.tracing.model import Effects, Parameters
 from warprrf.rf.tracing.records import Materials

@@ -40,8 +40,8 @@ from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField, with_settings
 from warprrf.rf.fields.harmonic import fitting
+from warprrf.rf.fields.harmonic.fitting import CHANNEL_RATES, GAIN_RATES, FieldOptions
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining, list_responses
-from warprrf.rf.fields.harmonic.options import CHANNEL_RATES, GAIN_RATES, FieldOptions
 from warprrf.rf.fields.harmonic.paths import View, near_line_of_sight, paths_of
 from warprrf.rf.fields.harmonic.problem import Problem, harmonics
 from warprrf.rf.fields.harmonic.transport import (
@@ -147,7 +147,7 @@ class HarmonicField(RadioField):
             transport: blending weights of ``ds.receivers``, if they were computed before.
             device: where to compute.
             progress: called with the stages ``"transport"`` and ``"fit"``.
-            settings: attributes of :class:`~warprrf.rf.fields.harmonic.options.FieldOptions`, in place of those of
+            settings: attributes of :class:`~warprrf.rf.fields.harmonic.fitting.FieldOptions`, in place of those of
                 ``options``: ``gain="linear"``, ``iterations=600``, ``seed=1``, ...
 
         Raises:
