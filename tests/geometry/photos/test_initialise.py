@@ -1,5 +1,6 @@
 """What a refinement starts from, on photos of a painted floor and table that are known in closed form."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -10,6 +11,7 @@ from warprrf.geometry.photos import sweep
 from warprrf.geometry.photos.cells import meeting
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.initialise import initialise
+from warprrf.geometry.photos.points import detect_room_planes
 from warprrf.geometry.photos.sparse import SparseModel
 from warprrf.geometry.planes import Plane, aligned
 
@@ -100,6 +102,22 @@ def test_photos_of_two_sizes_are_compared(sparse):
     planes, _ = initialise(sparse, cameras, [photo(c) for c in cameras.values()], config=config)
     assert [p.offset for p in planes if p.normal[2] > 0.99] == pytest.approx([0, TABLE[2]], abs=5e-3)
     assert planes[-1].area() == pytest.approx(np.prod(TABLE[1] - TABLE[0]), rel=0.1)
+
+
+def test_a_plane_whose_features_were_taken_for_two_is_one(sparse, monkeypatch):
+    def halves(points, *args, **kwargs):
+        floor, *others = detect_room_planes(points, *args, **kwargs)
+        left = points[floor.inliers, 0] < 0
+        parts = floor.inliers[left], floor.inliers[~left]
+        return [
+            replace(floor, inliers=own, offset=floor.offset + 0.01 * k) for k, own in enumerate(parts)
+        ] + others
+
+    images = [photo(camera) for camera in sparse.cameras.values()]
+    config = ReconstructionConfig(plain=False, sweep=False, gaussians=3000)
+    monkeypatch.setattr("warprrf.geometry.photos.initialise.detect_room_planes", halves)
+    wall, floor = initialise(sparse, sparse.cameras, images, config=config)[0]
+    assert abs(wall.normal[2]) < 0.01 and floor.covers(np.array([[x, 0.7, 0] for x in (-0.7, 0.7)])).all()
 
 
 def test_compared_photos_differ_in_direction():

@@ -1,7 +1,5 @@
 """Depth maps made flat, in a box whose walls have a colour each."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 import views
@@ -13,6 +11,7 @@ from warprrf.geometry.photos.segments import (
     LEAST_PX,
     UNSURE,
     cut_by_colour,
+    segments_of,
     with_segments,
 )
 from warprrf.geometry.photos.targets import PosedPhotos
@@ -36,7 +35,10 @@ RIM = np.zeros_like(ALL)  # what photos prove: near edges of walls
 for shift, axis in ((4, 0), (-4, 0), (4, 1), (-4, 1)):
     RIM |= np.roll(WALL, shift, axis) != WALL
 BACK = WALL == 4  # what the camera looks at
-flat = partial(with_segments, shown=ALL, photo=PHOTO, view=CAMERA)
+
+
+def flat(depth, proved, shown=ALL, photo=PHOTO):
+    return with_segments(depth, proved, shown, segments_of(photo, CAMERA), CAMERA)
 
 
 def rough(noise=0.01):

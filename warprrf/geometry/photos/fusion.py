@@ -22,7 +22,7 @@ from warprrf.geometry.photos.completion import complete
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.grey import lens_matrix
 from warprrf.geometry.photos.photo_files import spread
-from warprrf.geometry.photos.segments import with_segments
+from warprrf.geometry.photos.segments import segments_of, with_segments
 from warprrf.geometry.photos.stereo import kept_pixels, mended
 from warprrf.geometry.photos.targets import PosedPhotos
 from warprrf.geometry.planar_patches import PlanarPatches
@@ -108,7 +108,7 @@ def _sure(
     for plane in planes:
         near = np.abs(plane.distance(points)) < reach_m
         held[near] |= plane.covers(points[near])
-    result = np.where(proved, depth, 0.0)
+    result = depth.copy()
     result[rest] = np.where(held, depth[rest], 0.0)
     return result
 
@@ -123,10 +123,12 @@ def _flat(
     """``depths`` with the flat segments of their photos on planes."""
     progress("segments", 0, len(views))
     result = []
-    with ThreadPoolExecutor(threads()) as pool:
-        kept = [kept_pixels(photos, k, view) for k, view in enumerate(views)]
-        for flat in pool.map(with_segments, depths, proved, kept, photos.images, views):
-            result.append(flat)
+    with ThreadPoolExecutor(
+        threads()
+    ) as pool:  # planes are many small steps of Python's, which threads would not speed up
+        cut = pool.map(segments_of, photos.images, views)
+        for k, (depth, sure, segment, view) in enumerate(zip(depths, proved, cut, views, strict=True)):
+            result.append(with_segments(depth, sure, kept_pixels(photos, k, view), segment, view))
             progress("segments", len(result), len(views))
     return result
 

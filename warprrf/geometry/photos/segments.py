@@ -33,7 +33,7 @@ NEAR = 0.12  # proved depths that differ by more than this part from the plane a
 
 
 def with_segments(
-    depth: np.ndarray, proved: np.ndarray, shown: np.ndarray, photo: np.ndarray, view: Camera
+    depth: np.ndarray, proved: np.ndarray, shown: np.ndarray, segment: np.ndarray, view: Camera
 ) -> np.ndarray:
     """A depth map with the pixels of each flat segment on its plane.
 
@@ -41,15 +41,10 @@ def with_segments(
         depth: ranges [m], 0 where unknown, shape ``(height, width)`` of ``view``.
         proved: pixels whose depth photos prove, same shape, bool.
         shown: pixels that may have a depth: what is not masked, same shape, bool.
-        photo: in [0, 1], shape ``(H, W, 3)``, of any size.
+        segment: of each pixel, as :func:`segments_of` numbers them, same shape.
         view: pinhole camera of the depth map.
     """
-    image = require("PIL.Image", extra="photos")
-    bytes_ = np.round(255 * np.asarray(photo)).astype(np.uint8)
-    segment = cut_by_colour(
-        np.asarray(image.fromarray(bytes_).resize((view.width, view.height), image.BOX))
-    ).ravel()
-    rays = view.directions().reshape(-1, 3)
+    segment, rays = segment.ravel(), view.directions().reshape(-1, 3)
     inverse = np.where(depth.ravel() > 0, 1 / np.maximum(depth.ravel(), 1e-9), 0.0)
     result, sure = depth.flatten(), proved.ravel()
     order = np.argsort(segment, kind="stable")
@@ -67,6 +62,13 @@ def with_segments(
         put &= ~sure[pixels] | (np.abs(there - inverse[pixels]) < NEAR * inverse[pixels])
         result[pixels[put]] = 1 / there[put]
     return result.reshape(depth.shape)
+
+
+def segments_of(photo: np.ndarray, view: Camera) -> np.ndarray:
+    """A number for the segment of each pixel of ``view`` in its ``photo``, in [0, 1], shape ``(H, W, 3)``, of any size."""
+    image = require("PIL.Image", extra="photos")
+    bytes_ = np.round(255 * np.asarray(photo)).astype(np.uint8)
+    return cut_by_colour(np.asarray(image.fromarray(bytes_).resize((view.width, view.height), image.BOX)))
 
 
 def cut_by_colour(colours: np.ndarray) -> np.ndarray:
@@ -98,9 +100,9 @@ def _plane(
     """The plane on which many of a segment's depths lie, its coefficients and their covariance; None if few lie on one."""
     drawn = rng.permutation(len(rays))[:DRAWN]
     three = drawn[rng.integers(0, len(drawn), (TRIALS, 3))]
-    a, b, c = np.moveaxis(rays[three], 1, 0)
-    across = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)  # Cramer's rule
-    volume = (a * across[:, 0]).sum(axis=1)
+    corner = rays[three]
+    across = np.cross(corner[:, [1, 2, 0]], corner[:, [2, 0, 1]])  # Cramer's rule
+    volume = (corner[:, 0] * across[:, 0]).sum(axis=1)
     tried = (inverse[three][:, None] @ across)[:, 0] / np.where(volume == 0, 1.0, volume)[:, None]
     off = np.abs(tried @ rays[drawn].T / inverse[drawn] - 1)
     plane = tried[(off < TOLERANCE).sum(axis=1).argmax()]
