@@ -103,13 +103,17 @@ def _parallel(
 ) -> list[Plane]:
     """All planes, of the faces of each ``label``, those of less area parallel to larger ones that they are nearly parallel
     to, and ``found`` to ``given`` ones: built rooms have few directions, and a small plane's is known badly. A plane turns
-    about the middle of its faces, unless that moves more than a tenth of them by ``reach_m``."""
+    about the middle of its faces, unless that moves more than a tenth of them by ``reach_m``; one that was found to be level
+    stays so."""
     centres, directions = mesh.triangles.mean(axis=1), list[np.ndarray]()
     result = [*given, *found]
     area = np.bincount(label[label >= 0], mesh.areas[label >= 0], minlength=len(result))
     for k in np.lexsort((-area, np.arange(len(result)) >= len(given))):
         own, plane = label == k, result[k]
         if not own.any():
+            continue
+        if abs(plane.normal[2]) == 1.0:
+            directions.append(plane.normal)
             continue
         middle = mesh.areas[own] @ centres[own] / area[k]
         for direction in directions:

@@ -163,21 +163,21 @@ def test_small_planes_are_parallel_to_larger_ones_that_they_are_nearly_parallel_
         plane = Plane(normal, float(normal @ middle), np.zeros(0, np.int64))
         return vertices.reshape(-1, 3), faces, plane
 
-    boards = [
-        built([0.0, 0, 0], (4, 4), 0.0), built([0.0, 5, 1], (1, 1), 1.5), built([0.0, 8, 3], (1, 1), 4.0),
-        built([0.0, 12, 2], (9, 0.5), 1.5),
-    ]  # fmt: skip
-    start = np.cumsum([0, *(len(v) for v, _, _ in boards)])
-    mesh = Mesh(
-        np.concatenate([v for v, _, _ in boards]),
-        np.concatenate([f + first for (_, f, _), first in zip(boards, start, strict=False)]),
-    )
-    given = [plane for _, _, plane in boards]
-    patches = find_patches(mesh, given)
+    def turned(*boards):
+        start = np.cumsum([0, *(len(v) for v, _, _ in boards)])
+        vertices = np.concatenate([v for v, _, _ in boards])
+        faces = np.concatenate([f + first for (_, f, _), first in zip(boards, start, strict=False)])
+        given = [plane for _, _, plane in boards]
+        return given, find_patches(Mesh(vertices, faces), given)
+
+    small, long = built([0.0, 5, 1], (1, 1), 1.5), built([0.0, 12, 2], (9, 0.5), 1.5)
+    given, patches = turned(built([0.0, 0, 0], (4, 4), 0.0), small, built([0.0, 8, 3], (1, 1), 4.0), long)
     np.testing.assert_array_equal(patches.normal[1], given[0].normal)
     assert patches.offset[1] == pytest.approx(1.0)  # turned about its middle
     for k, why in ((0, "the largest"), (2, "4 degrees"), (3, "its ends would move by 12 cm")):
         np.testing.assert_array_equal(patches.normal[k], given[k].normal, err_msg=why)
+    given, patches = turned(built([0.0, 0, 0], (4, 4), 1.0), built([0.0, 5, 1], (1, 1), 0.0))
+    np.testing.assert_array_equal(patches.normal[1], given[1].normal)  # it is level
 
 
 def test_of_depths_that_no_photo_proves_those_stay_that_lie_on_a_plane():

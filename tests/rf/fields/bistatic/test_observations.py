@@ -15,7 +15,7 @@ from radio_scenes import as_fits_predict, observation
 from warprrf.rf.channel.array_spectra import UP, hemisphere
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.fields.bistatic import batch as batch_module
+from warprrf.rf.fields.bistatic import gauss_newton as fitting
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.gauss_newton import Problem, _normal_equations
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, WeighedPaths, read
@@ -254,7 +254,7 @@ def test_many_places_are_fitted_to_as_each_alone(scene, kinds, monkeypatch):
 
     alone = [sum(parts) for parts in zip(*(asked([o]) for o in observations), strict=True)]
     together = asked(observations)
-    monkeypatch.setattr(batch_module, "MOST_NUMBERS", 1)
+    monkeypatch.setattr(fitting, "MOST_NUMBERS", 1)
     for found in (together, asked(observations)):
         for mine, theirs in zip(found, alone, strict=True):
             np.testing.assert_allclose(mine, theirs, rtol=1e-4, atol=1e-5 * np.abs(theirs).max())
