@@ -20,11 +20,10 @@ from warprrf.device import DeviceLike, Progress, threads
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.completion import complete
 from warprrf.geometry.photos.config import ReconstructionConfig
-from warprrf.geometry.photos.grey import lens_matrix
 from warprrf.geometry.photos.photo_files import spread
 from warprrf.geometry.photos.segments import segments_of, with_segments
 from warprrf.geometry.photos.stereo import kept_pixels, mended
-from warprrf.geometry.photos.targets import PosedPhotos
+from warprrf.geometry.photos.targets import PosedPhotos, lens_matrix
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.planes import Plane
 from warprrf.geometry.rays import open3d

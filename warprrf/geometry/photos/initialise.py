@@ -20,11 +20,11 @@ from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.photos.cells import meeting, occupancy, plane_mesh, seen_cells, visible_from
 from warprrf.geometry.photos.completion.room_planes import directions
 from warprrf.geometry.photos.config import ReconstructionConfig
-from warprrf.geometry.photos.grey import GreyPhotos
 from warprrf.geometry.photos.plain import plain_surfaces, with_plain
 from warprrf.geometry.photos.points import clean_points, detect_room_planes, estimate_normals
 from warprrf.geometry.photos.sparse import SparseModel
 from warprrf.geometry.photos.sweep import choose_views, joined, level_planes, proven_cells, united
+from warprrf.geometry.photos.targets import GreyPhotos
 from warprrf.geometry.planes import Plane, aligned, plane_axes
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Y00, Gaussians, quaternions_of

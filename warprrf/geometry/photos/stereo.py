@@ -17,8 +17,7 @@ from scipy import ndimage
 
 from warprrf.device import DeviceLike, Progress, filled, launch
 from warprrf.geometry.photos.cells import in_frame
-from warprrf.geometry.photos.grey import GreyPhotos, lens_matrix, projections
-from warprrf.geometry.photos.targets import PosedPhotos
+from warprrf.geometry.photos.targets import GreyPhotos, PosedPhotos, lens_matrix, projections
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.patch_match import UNKNOWN, Others, match
 from warprrf.kernels.photo_consistency import count_votes

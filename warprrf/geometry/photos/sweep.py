@@ -17,7 +17,7 @@ from scipy import ndimage
 from warprrf.device import launch
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.cells import CONTESTED_M, PARALLEL, plane_mesh, visible_from
-from warprrf.geometry.photos.grey import GreyPhotos, projections
+from warprrf.geometry.photos.targets import GreyPhotos, projections
 from warprrf.geometry.planes import AROUND, Plane, dilate, plane_axes
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.photo_consistency import SIDE, patch_agreement

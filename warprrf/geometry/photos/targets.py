@@ -1,4 +1,5 @@
-"""Photos as a refinement compares them: posed, masked, at several sizes, on a device, each with a gain of its own.
+"""Photos on a device: posed, masked, at several sizes, each with a gain of its own, as a refinement compares them with what is
+rendered; and grey ones, one behind the other, as kernels compare them with each other.
 
 A camera that meters each photo for itself shows one wall in many shades. In display values a change of exposure by half
 a stop is a gain up to half a percent, so a gain for each colour is all that is fitted, together with the Gaussians. What
@@ -14,12 +15,13 @@ import numpy as np
 import warp as wp
 
 from warprrf.checks import check_array
-from warprrf.device import launch
+from warprrf.device import DeviceLike, launch, require, resolve
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.photo_loss import PhotoLoss
 from warprrf.kernels import exposure as kernels
 from warprrf.kernels.ssim import stride_of
 
+LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 MOST_KEPT = 60_000_000  # numbers of photos kept on the device: with their moments 720 MB
 
 
@@ -174,3 +176,54 @@ class Exposures:
         wanted = np.log((of_photo + prior) / (of_image + prior))
         share = max(LEAST_STEP, 1 / (1 + visits))
         self.log_gains[target.view] += share * (wanted - self.log_gains[target.view])
+
+
+@dataclass(frozen=True)
+class GreyPhotos:
+    """Grey photos.
+
+    Attributes:
+        cameras: pinhole cameras of the sizes at which photos are compared.
+        pixels: of each, in [0, 1], ``(H, W)`` float32.
+        sizes: where each begins in ``flat``, its width and its height, shape ``(N, 3)`` int32.
+        flat: all pixels, on the device.
+    """
+
+    cameras: Sequence[Camera]
+    pixels: Sequence[np.ndarray]
+    sizes: np.ndarray
+    flat: wp.array
+
+    @classmethod
+    def upload(
+        cls, cameras: Sequence[Camera], images: Sequence[np.ndarray], device: DeviceLike = None
+    ) -> GreyPhotos:
+        """Photos ``(H, W, 3)`` in [0, 1] at the sizes of ``cameras``."""
+        pixels = []
+        for camera, photo in zip(cameras, images, strict=True):
+            grey, size = np.asarray(photo, dtype=np.float32) @ LUMA, (camera.width, camera.height)
+            if grey.shape != size[::-1]:
+                image = require("PIL.Image", extra="photos")
+                grey = np.asarray(image.fromarray(grey).resize(size, image.BOX))
+            pixels.append(grey)
+        first = np.cumsum([0, *(grey.size for grey in pixels)])[:-1]
+        sizes = np.array(
+            [(start, c.width, c.height) for start, c in zip(first, cameras, strict=True)], dtype=np.int32
+        )
+        flat = np.concatenate([grey.ravel() for grey in pixels])
+        return cls(cameras, pixels, sizes, wp.array(flat, dtype=wp.float32, device=resolve(device)))
+
+    @property
+    def device(self) -> wp.Device:
+        """Where they lie."""
+        return self.flat.device
+
+
+def lens_matrix(camera: Camera) -> np.ndarray:
+    """Pixels ``(u, v, 1)`` of directions ``(x, y, 1)`` of a pinhole camera, shape ``(3, 3)``."""
+    return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+
+
+def projections(cameras: Sequence[Camera]) -> np.ndarray:
+    """Homogeneous pixels of places ``(x, y, z, 1)`` in pinhole cameras, shape ``(N, 3, 4)`` float32."""
+    return np.array([lens_matrix(c) @ c.world_to_camera[:3] for c in cameras], dtype=np.float32)
