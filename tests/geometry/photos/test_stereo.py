@@ -216,3 +216,11 @@ def test_one_photo_or_no_depth_mends_nothing(room, spoiled):
     for maps in (spoiled[0][:1], [np.zeros((120, 160))]):
         result = mended(maps, cameras[:1], photos.subset([0]))
         np.testing.assert_array_equal(result, maps)
+
+
+def test_maps_vote_for_a_depth_up_to_the_tolerance_and_against_one_that_they_see_through():
+    camera = views.pinhole(32, 24, focal=30)
+    depth = 2.0 / camera.directions()[..., 2]
+    for factor, expected in ((1.012, (1, 0)), (0.988, (1, 0)), (1.03, (0, 1)), (0.97, (0, 0))):
+        agreed, crossed = stereo._votes(depth, camera, [(camera, factor * depth)], 0.015)
+        assert (agreed == expected[0]).all() and (crossed == expected[1]).all(), factor

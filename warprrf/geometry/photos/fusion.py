@@ -122,9 +122,8 @@ def _flat(
     """``depths`` with the flat segments of their photos on planes."""
     progress("segments", 0, len(views))
     result = []
-    with ThreadPoolExecutor(
-        threads()
-    ) as pool:  # planes are many small steps of Python's, which threads would not speed up
+    # Planes are many small steps of Python's, which threads would not speed up.
+    with ThreadPoolExecutor(threads()) as pool:
         cut = pool.map(segments_of, photos.images, views)
         for k, (depth, sure, segment, view) in enumerate(zip(depths, proved, cut, views, strict=True)):
             result.append(with_segments(depth, sure, kept_pixels(photos, k, view), segment, view))

@@ -30,10 +30,7 @@ CONTRAST = 0.012  # patches flatter than this part of white prove nothing
 STEP_M = 0.03  # between heights of the sweep; a patch shows a shift of that much
 REACH_M, LARGE_M2 = 2.5, 3.0  # a plane of this area is extended at most so far
 MIN_CELLS = 15  # of a plane found by the sweep
-SAME_PLANE_M, SAME_PLANE_DEG = (
-    0.02,
-    3.0,
-)  # a piece this close to a larger plane is one with it: poses are no better
+SAME_PLANE_M, SAME_PLANE_DEG = 0.02, 3.0  # what lies this close to a larger plane is part of it
 UP_M2, DOWN_M2 = 0.3, 2.0  # least area of a new plane that faces up, or down
 FINE_M = 0.005  # a plane's height is settled in steps of this length
 
