@@ -7,7 +7,6 @@ rendered from. Everything is compared where reference rays meet a surface, after
 from __future__ import annotations
 
 import importlib
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from benchmarks.lobby.pipeline import photos as lobby_photos
 from benchmarks.report import Report, columns_table
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.device import Progress
+from warprrf.files import read_json
 from warprrf.geometry import pipeline as stage_1
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.config import ReconstructionConfig
@@ -138,18 +138,14 @@ def without(
     """A step that reconstructs ``room`` and scores its mesh."""
 
     def make(attempt: Attempt) -> dict[str, Any]:
-        start: list[float] = []
-
-        def progress(stage: str, done: int, total: int) -> None:
-            if stage == "planes" and not start:  # what comes before is the same for all
-                start.append(time.perf_counter())
-            attempt.progress(stage, done, total)
-
         found = wr.reconstruct(
             room.files, workspace=out / "workspace", known_positions=room.known, held_out=room.held_out,
-            config=config, seed=job.seed, progress=progress, device=job.device,
+            config=config, seed=job.seed, progress=attempt.progress, device=job.device,
         )  # fmt: skip
-        seconds = time.perf_counter() - start[0] if start else None
+        records = [
+            read_json(file) for file in (out / "workspace/.steps").glob("*.json")
+        ]  # those after structure from motion
+        seconds = sum(record["seconds"] for record in records)
         mesh = found.mesh.transformed(**laid_on(found.mesh, room.reference, room.rays))
         figures = score(mesh, room.reference, room.rays)
         holes = 1 - figures["covered"]

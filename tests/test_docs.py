@@ -113,10 +113,10 @@ def test_geometry_is_counted_up_with_its_steps():
             "matches": 2,
             "model": 4,
             "photos": 1,
-            "initial": 3,
+            "initial": 4,
             "refined": 2,
             "depth": 3,
-            "surface": 9,
+            "surface": 10,
         },
     )
 

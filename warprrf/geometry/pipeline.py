@@ -56,7 +56,7 @@ from warprrf.geometry.report.sight import how_seen
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.steps import Attempt, Steps
 
-VERSIONS = {**sfm.VERSIONS, "initial": 3, "refined": 2, "depth": 3, "surface": 9}
+VERSIONS = {**sfm.VERSIONS, "initial": 4, "refined": 2, "depth": 3, "surface": 10}
 """Of all steps: counted up by whoever changes what a step computes."""
 
 MUCH_UNKNOWN = 0.25  # share of a surface that is worth a warning
@@ -309,8 +309,8 @@ def _steps(
 def _said_of_surface(unseen: float, plain: float, skipped: float) -> tuple[str, ...]:
     """What no photo shows of the surface, a sentence each; a warning where it is much."""
     holes = (
-        "holes: they stay open; closing them wants half of the surface on planes along three perpendicular directions, and "
-        "most of it in photos"
+        "holes: gaps of single planes were closed, the rest stays open; closing all of them wants half of the surface on "
+        "planes along three perpendicular directions, and most of it in photos"
     )
     open_ones = (holes,) if skipped else ()
     if max(unseen, plain) < 0.005:

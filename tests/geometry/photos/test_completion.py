@@ -10,7 +10,9 @@ from trimesh.remesh import subdivide_to_size
 from views import look
 
 import warprrf as wr
+from warprrf.geometry.photos.completion.gaps import without_gaps
 from warprrf.geometry.photos.config import ReconstructionConfig
+from warprrf.geometry.scans import find_patches
 from warprrf.geometry.splats.gaussians import discs_on_mesh
 
 pytest.importorskip("open3d")
@@ -106,5 +108,28 @@ def test_a_slope_and_a_ball_are_kept(tmp_path):
 def test_a_place_seen_in_part_only_is_not_guessed(tmp_path):
     hall = wr.Mesh(*box_mesh([0, 0, 0], [9, 6, 5], inward=True))
     end = without(hall, ([1, -1, 0.05], [10, 7, 6]))  # its far end, and the floor
-    mesh = made(tmp_path, end, [np.array([8.0, 3, 2])]).mesh
-    assert np.isinf(mesh.cast([8, 3, 2], np.vstack([np.eye(3), -np.eye(3)])).t).all()
+    rec = made(tmp_path, end, [np.array([8.0, 3, 2])])
+    *rest, down = rec.mesh.cast([8, 3, 2], np.vstack([np.eye(3), -np.eye(3)])).t
+    assert np.isinf(rest).all() and down == pytest.approx(
+        2, abs=0.01
+    )  # the floor's gap beneath the cameras alone
+
+
+def test_gaps_of_a_plane_are_closed_unless_they_are_wide_or_a_photo_looks_through():
+    turn = np.linalg.qr([[1.0, 0.3, 0.2], [0.1, 1, 0.4], [-0.2, 0.3, 1]])[0]
+    floor = [[0, 0, 0], [9, 0, 0], [9, 4, 0], [0, 4, 0]]
+    shelf = [[5.2, 1.5, -0.5], [6.2, 1.5, -0.5], [6.2, 2.5, -0.5], [5.2, 2.5, -0.5]]
+    quads = np.array([[0, 1, 2], [0, 2, 3]])
+    holes = [([1, 1, -1], [2.4, 2.4, 1]), ([5, 1.3, -0.1], [6.4, 2.7, 1]), ([7.3, -1, -1], [10, 2.5, 1])]
+    mesh = without(joined((np.array(floor), quads), (np.array(shelf), quads))[0], *holes)
+    mesh = wr.Mesh(mesh.vertices @ turn.T, mesh.faces)
+    cameras = [look(turn @ [x, 2, 2], turn @ [x, 2.1, 0]) for x in (1.7, 5.7, 8)]
+    before = find_patches(mesh)
+    after = without_gaps(before, cameras)
+    at = np.array([[1.7, 1.7], [5.7, 2.0], [8.3, 1.0], [8.0, 3.5], [1.1, 1.1]])
+    eyes = np.c_[at, np.full(len(at), 1.0)] @ turn.T
+    met = after.mesh.cast(eyes, turn @ [0, 0, -1.0])
+    np.testing.assert_allclose(met.t, [1, 1.5, np.inf, 1, 1], atol=1e-9)
+    assert (after.face_patch[met.face[[0, 3, 4]]] == after.face_patch[met.face[3]]).all()
+    facing = (after.mesh.face_normals * after.normal[after.face_patch]).sum(axis=1)
+    assert facing[len(mesh.faces) :].min() > 0.99

@@ -153,11 +153,13 @@ def fuse_maps(
     report("surface", 1, 4)
     patches = snapped(mesh, planes, config.surface)
     report("surface", 2, 4)
-    whole = complete(patches, views, depths, planes=planes) if config.completion else patches
+    whole = False
+    if config.completion:
+        patches, whole = complete(patches, views, depths, planes=planes)
     report("surface", 3, 4)
-    result = largest_first(simplified(whole), MIN_PATCH_M2)
+    result = largest_first(simplified(patches), MIN_PATCH_M2)
     report("surface", 4, 4)
-    return result, whole is not patches
+    return result, whole
 
 
 def _with_voxels(

@@ -5,8 +5,8 @@ mesh is planar along three perpendicular directions, its planes cut space into b
 the surfaces they end on prove the boxes behind solid, and for the rest the surface between free and solid is made as
 small as it can be, along known planes rather than elsewhere (Chauve, Labatut and Pons, "Robust piecewise-planar 3D
 reconstruction and completion from large-scale unstructured point data", 2010; a minimum cut, found by SciPy). That
-surface has no holes and lies exactly on the planes. Faces that no plane explains stay as they are, and a mesh that is
-no such place stays whole as it is. Lengths in metres.
+surface has no holes and lies exactly on the planes. Faces that no plane explains stay as they are. Of a mesh that is no
+such place every plane is closed by itself (:mod:`~warprrf.geometry.photos.completion.gaps`). Lengths in metres.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from warprrf.geometry.mesh import Mesh, connected_pieces
 from warprrf.geometry.photos.completion.boxes import divide, least_surface, surface_of
 from warprrf.geometry.photos.completion.evidence import closed_sides, seen_share, vote_proven, votes
+from warprrf.geometry.photos.completion.gaps import without_gaps
 from warprrf.geometry.photos.completion.room_planes import (
     FaceLevels,
     claim_proven,
@@ -39,7 +40,7 @@ def complete(
     depths: Sequence[np.ndarray],
     *,
     planes: Sequence[Plane] = (),
-) -> PlanarPatches:
+) -> tuple[PlanarPatches, bool]:
     """The mesh of ``patches`` with holes closed, borders straightened and islands in the air removed.
 
     Args:
@@ -48,8 +49,9 @@ def complete(
         planes: planes known beforehand; their occupied cells are evidence of their own.
 
     Returns:
-        The mesh with its patches, one for each plane and side; what was given when most of the mesh lies on no planes
-        along three perpendicular directions, or the photos show so little of the place that most would be a guess.
+        The mesh with its patches, one for each plane and side; and whether that is all. It is not where most of the mesh
+        lies on no planes along three perpendicular directions, or the photos show so little of the place that most would
+        be a guess: then gaps of single planes are closed.
 
     Raises:
         ValueError: when the numbers of cameras and depth maps differ.
@@ -58,8 +60,8 @@ def complete(
         raise ValueError(f"depths: got {len(depths)} maps for {len(cameras)} cameras, expected one for each")
     mesh = patches.mesh
     axes = directions(patches.normal, patches.area, float(mesh.areas.sum()))
-    if axes is None or not len(cameras):
-        return patches
+    if axes is None:
+        return without_gaps(patches, cameras), False
     levels, faces = known_levels(patches, planes, axes)
     proven = proven_levels(planes, axes, levels)
     claim_proven(mesh, faces, axes, proven)
@@ -72,12 +74,12 @@ def complete(
 
     filled = least_surface(grid, free, solid, closed_sides(grid, mesh, faces))
     if filled.all():
-        return patches
+        return without_gaps(patches, cameras), False
     whole, known = surface_of(grid, filled, patches.tolerance_m)
     # 0.7: of the surface must be seen; else the photos cover too little for the rest to be inferred
     if seen_share(grid, whole, solid) < 0.7:
-        return patches
-    return _with_rest(whole, known, patches, faces)
+        return without_gaps(patches, cameras), False
+    return _with_rest(whole, known, patches, faces), True
 
 
 def _with_rest(
