@@ -46,7 +46,7 @@ STAGES: Mapping[str, tuple[ReconstructionConfig, tuple[str, ...]]] = {
     "stereo": (replace(FULL, stereo=False), ("photos.stereo",)),
     "completion": (
         replace(FULL, completion=False),
-        tuple(f"photos.completion{name}" for name in ("", ".boxes", ".evidence", ".room_planes")),
+        tuple(f"photos.completion{name}" for name in ("", ".boxes", ".room_planes")),
     ),
 }
 """What is off: the configuration without it, and the modules below ``warprrf.geometry`` that it takes."""

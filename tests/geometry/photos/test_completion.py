@@ -10,7 +10,7 @@ from trimesh.remesh import subdivide_to_size
 from views import look
 
 import warprrf as wr
-from warprrf.geometry.photos.completion.gaps import without_gaps
+from warprrf.geometry.photos import completion
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.scans import find_patches
 from warprrf.geometry.splats.gaussians import discs_on_mesh
@@ -125,7 +125,7 @@ def test_gaps_of_a_plane_are_closed_unless_they_are_wide_or_a_photo_looks_throug
     mesh = wr.Mesh(mesh.vertices @ turn.T, mesh.faces)
     cameras = [look(turn @ [x, 2, 2], turn @ [x, 2.1, 0]) for x in (1.7, 5.7, 8)]
     before = find_patches(mesh)
-    after = without_gaps(before, cameras)
+    after = completion._without_gaps(before, cameras)
     at = np.array([[1.7, 1.7], [5.7, 2.0], [8.3, 1.0], [8.0, 3.5], [1.1, 1.1]])
     eyes = np.c_[at, np.full(len(at), 1.0)] @ turn.T
     met = after.mesh.cast(eyes, turn @ [0, 0, -1.0])
