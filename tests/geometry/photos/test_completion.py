@@ -115,21 +115,26 @@ def test_a_place_seen_in_part_only_is_not_guessed(tmp_path):
     )  # the floor's gap beneath the cameras alone
 
 
-def test_gaps_of_a_plane_are_closed_unless_they_are_wide_or_a_photo_looks_through():
+def test_gaps_of_planes_are_closed_unless_they_are_wide_or_a_photo_looks_through():
     turn = np.linalg.qr([[1.0, 0.3, 0.2], [0.1, 1, 0.4], [-0.2, 0.3, 1]])[0]
-    floor = [[0, 0, 0], [9, 0, 0], [9, 4, 0], [0, 4, 0]]
-    shelf = [[5.2, 1.5, -0.5], [6.2, 1.5, -0.5], [6.2, 2.5, -0.5], [5.2, 2.5, -0.5]]
-    quads = np.array([[0, 1, 2], [0, 2, 3]])
-    holes = [([1, 1, -1], [2.4, 2.4, 1]), ([5, 1.3, -0.1], [6.4, 2.7, 1]), ([7.3, -1, -1], [10, 2.5, 1])]
-    mesh = without(joined((np.array(floor), quads), (np.array(shelf), quads))[0], *holes)
+    floor, shelf, table = (
+        (np.array([[x, y, z] for x, y in zip((a, b, b, a), (c, c, d, d), strict=True)]), np.array([[0, 1, 2], [0, 2, 3]]))
+        for a, b, c, d, z in ((0, 12, 0, 4, 0), (5.2, 6.2, 1.5, 2.5, -0.5), (0.8, 2.6, 0.8, 2.6, 0.6))
+    )  # fmt: skip
+    beneath, seen_through, wide, corner, of_table = (
+        ([1, 1, -0.1], [2.4, 2.4, 0.1]), ([5, 1.3, -0.1], [6.4, 2.7, 0.1]), ([7.5, 0.8, -0.1], [9.9, 3.2, 0.1]),
+        ([10.8, -1, -0.1], [13, 2.5, 0.1]), ([1.5, 1.5, 0.5], [1.9, 1.9, 0.7]),
+    )  # fmt: skip
+    mesh = without(joined(floor, shelf, table)[0], beneath, seen_through, wide, corner, of_table)
     mesh = wr.Mesh(mesh.vertices @ turn.T, mesh.faces)
-    cameras = [look(turn @ [x, 2, 2], turn @ [x, 2.1, 0]) for x in (1.7, 5.7, 8)]
-    before = find_patches(mesh)
-    after = completion._without_gaps(before, cameras)
-    at = np.array([[1.7, 1.7], [5.7, 2.0], [8.3, 1.0], [8.0, 3.5], [1.1, 1.1]])
-    eyes = np.c_[at, np.full(len(at), 1.0)] @ turn.T
-    met = after.mesh.cast(eyes, turn @ [0, 0, -1.0])
-    np.testing.assert_allclose(met.t, [1, 1.5, np.inf, 1, 1], atol=1e-9)
-    assert (after.face_patch[met.face[[0, 3, 4]]] == after.face_patch[met.face[3]]).all()
+    cameras = [look(turn @ [x, 2, 2], turn @ [x, 2.1, 0]) for x in (1.7, 5.7, 8.7, 11.5)]
+    after = completion._without_gaps(find_patches(mesh), cameras)
+    eyes = np.array(
+        [[1.7, 1.7, 0.3], [1.7, 1.7, 1], [5.7, 2, 1], [8.7, 2, 1], [11.6, 1, 1], [11.6, 3.5, 1], [1, 1, 1]]
+    )
+    met = after.mesh.cast(eyes @ turn.T, turn @ [0, 0, -1.0])
+    np.testing.assert_allclose(met.t, [0.3, 0.4, 1.5, np.inf, np.inf, 1, 0.4], atol=1e-9)
+    patch = after.face_patch[met.face]
+    assert patch[0] == patch[5] != patch[1] == patch[6]
     facing = (after.mesh.face_normals * after.normal[after.face_patch]).sum(axis=1)
     assert facing[len(mesh.faces) :].min() > 0.99

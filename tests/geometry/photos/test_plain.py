@@ -6,6 +6,7 @@ import trimesh
 from helpers.views import look
 
 from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.photos import plain
 from warprrf.geometry.photos.plain import plain_surfaces, with_plain
 from warprrf.geometry.planes import Plane
 
@@ -111,3 +112,15 @@ def test_a_plain_cell_gives_way_to_points_on_a_plane_and_to_lines_of_sight():
     # Its point and what lies round it; and where the wall is seen through.
     kept[4:7, 4:7] = kept[15, 15] = True
     assert (ours.occupied == kept).all() and (plain.occupied == ~kept).all() and plain.plain
+
+
+@pytest.mark.parametrize(("share", "lines"), [(0.28, 0), (0.4, 1)])
+def test_plain_surfaces_are_looked_for_where_a_third_of_the_photos_is_plain(
+    cameras, monkeypatch, share, lines
+):
+    asked = []
+    monkeypatch.setattr(plain, "find_lines", lambda *given: asked.append(given) or [])
+    image = np.random.default_rng(0).random((240, 320, 3)).astype(np.float32)
+    image[: round(240 * share) + 6] = 0.5  # six rows more, which a texture beside them keeps from being plain
+    found = plain_surfaces(cameras[:12], [image] * 12, np.eye(3))
+    assert len(asked) == lines and not found.planes and not found.panes
