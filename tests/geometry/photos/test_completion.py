@@ -130,7 +130,7 @@ def test_gaps_of_planes_are_closed_unless_they_are_wide_or_a_photo_looks_through
     cameras = [look(turn @ [x, 2, 2], turn @ [x, 2.1, 0]) for x in (1.7, 5.7, 8.7, 11.5)]
     after = completion._without_gaps(find_patches(mesh), cameras)
     eyes = np.array(
-        [[1.7, 1.7, 0.3], [1.7, 1.7, 1], [5.7, 2, 1], [8.7, 2, 1], [11.6, 1, 1], [11.6, 3.5, 1], [1, 1, 1]]
+        [[1.2, 1.2, 0.3], [1.7, 1.7, 1], [5.7, 2, 1], [8.7, 2, 1], [11.6, 1, 1], [11.6, 3.5, 1], [1, 1, 1]]
     )
     met = after.mesh.cast(eyes @ turn.T, turn @ [0, 0, -1.0])
     np.testing.assert_allclose(met.t, [0.3, 0.4, 1.5, np.inf, np.inf, 1, 0.4], atol=1e-9)
