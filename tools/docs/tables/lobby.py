@@ -211,3 +211,31 @@ def _filmed() -> str:
             f"{psnr[2]} dB on our mesh."
         )
     return f"{markdown(('distance', 'median [cm]', '90th percentile [cm]', 'within 5 cm'), lines)}\n\n{off}"
+
+
+ROOMS = {
+    "lounge-kitchen": "filmed lounge",
+    "kitchen": "filmed kitchen",
+    "lobby": "lobby",
+    "lobby_plain": "lobby, plain",
+}
+STAGES = {
+    "nothing": "all stages",
+    "completion": "without completion",
+    "segments": "without segments",
+    "stereo": "without comparing photos (stereo)",
+    "refine": "without refinement of Gaussians",
+    "plain": "without plain surfaces",
+    "sweep": "without sweep of planes",
+}
+
+
+@entry("stage1")
+def _stage1() -> str:
+    found = {(r["room"], r["off"]): r for r in read("stage1")["rows"]}
+
+    def cell(row: Row) -> str:
+        return f"{row['f_5_cm']:.2f}, {100 * row['distance_p90_m']:.1f} cm, {row['holes']:.0%}"
+
+    lines = [[name, *(cell(found[room, off]) for room in ROOMS)] for off, name in STAGES.items()]
+    return markdown(("F at 5 cm, error (90th percentile), holes", *ROOMS.values()), lines)
