@@ -142,10 +142,8 @@ def without(
             room.files, workspace=out / "workspace", known_positions=room.known, held_out=room.held_out,
             config=config, seed=job.seed, progress=attempt.progress, device=job.device,
         )  # fmt: skip
-        records = [
-            read_json(file) for file in (out / "workspace/.steps").glob("*.json")
-        ]  # those after structure from motion
-        seconds = sum(record["seconds"] for record in records)
+        steps = (out / "workspace/.steps").glob("*.json")  # those after structure from motion
+        seconds = sum(read_json(step)["seconds"] for step in steps)
         mesh = found.mesh.transformed(**laid_on(found.mesh, room.reference, room.rays))
         figures = score(mesh, room.reference, room.rays)
         holes = 1 - figures["covered"]
