@@ -20,9 +20,8 @@ from benchmarks.report import Report, table
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.device import Progress, require
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos.cells import in_frame
-from warprrf.geometry.photos.fusion import fuse_depth
-from warprrf.geometry.photos.sparse import fit_similarity
+from warprrf.geometry.photos.posed.sparse import fit_similarity
+from warprrf.geometry.photos.surface.fusion import fuse_depth
 from warprrf.geometry.scans import SurfaceConfig, scanned_patches
 
 HELP = """\
@@ -164,7 +163,7 @@ class Film:
         through = np.zeros(len(places), dtype=np.int64)
         for index in range(0, len(self.stems), every):
             depth, camera = self.depth(index)
-            inside, pixels = in_frame(camera, places)
+            inside, pixels = camera.in_frame(places)
             seen = np.where(inside, depth[pixels[:, 0], pixels[:, 1]], 0.0)
             through += seen > np.linalg.norm(places - camera.position, axis=1) + CLEAR_M
         return places[(through >= THROUGH) & (surface.distance(places) > CLEAR_M)]

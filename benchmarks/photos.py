@@ -13,7 +13,7 @@ from benchmarks.machine import machine
 from benchmarks.report import Report, columns_table
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.geometry import pipeline as stage_1
-from warprrf.geometry.photos.photo_files import find_photos, read_photo
+from warprrf.geometry.photos.posed.photo_files import find_photos, read_photo
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import Blending

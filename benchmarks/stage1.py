@@ -39,14 +39,17 @@ examples:
 FULL = ReconstructionConfig()
 STAGES: Mapping[str, tuple[ReconstructionConfig, tuple[str, ...]]] = {
     "nothing": (FULL, ()),
-    "sweep": (replace(FULL, sweep=False), ("photos.sweep",)),
-    "segments": (replace(FULL, segments=False), ("photos.segments",)),
-    "plain": (replace(FULL, plain=False), ("photos.plain", "photos.edges")),
-    "refine": (replace(FULL, refine=replace(FULL.refine, iterations=1)), ("photos.refine", "photos.densify")),
-    "stereo": (replace(FULL, stereo=False), ("photos.stereo",)),
+    "sweep": (replace(FULL, sweep=False), ("photos.gaussians.sweep",)),
+    "segments": (replace(FULL, segments=False), ("photos.surface.segments",)),
+    "plain": (replace(FULL, plain=False), ("photos.gaussians.plain", "photos.gaussians.edges")),
+    "refine": (
+        replace(FULL, refine=replace(FULL.refine, iterations=1)),
+        ("photos.gaussians.refine", "photos.gaussians.densify"),
+    ),
+    "stereo": (replace(FULL, stereo=False), ("photos.surface.stereo",)),
     "completion": (
         replace(FULL, completion=False),
-        tuple(f"photos.completion{name}" for name in ("", ".boxes", ".room_planes")),
+        tuple(f"photos.surface.{name}" for name in ("completion", "boxes", "room_planes")),
     ),
 }
 """What is off: the configuration without it, and the modules below ``warprrf.geometry`` that it takes."""

@@ -94,8 +94,8 @@ plt.show()
 # errors well below a pixel mean a stiff model.
 
 # %%
-from warprrf.geometry.photos.sfm import structure_from_motion
-from warprrf.geometry.photos.sparse import align_to_known
+from warprrf.geometry.photos.posed.sfm import structure_from_motion
+from warprrf.geometry.photos.posed.sparse import align_to_known
 
 start = time.perf_counter()
 sparse = structure_from_motion(

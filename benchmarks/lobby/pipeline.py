@@ -30,7 +30,7 @@ from warprrf.files import write_arrays, write_atomically, write_json
 from warprrf.geometry import pipeline as stage_1
 from warprrf.geometry.mesh_files import write_mesh
 from warprrf.geometry.photos.config import ReconstructionConfig
-from warprrf.geometry.photos.photo_files import read_photo
+from warprrf.geometry.photos.posed.photo_files import read_photo
 from warprrf.rf.spectra import lookups
 from warprrf.rf.spectra.spectrum import to_db
 from warprrf.steps import Attempt, Steps

@@ -28,9 +28,9 @@ from warprrf import tensor_files
 from warprrf.cli.inputs import read_positions, read_receivers
 from warprrf.files import check_seal, read_arrays, read_json, write_arrays, write_bytes, write_json
 from warprrf.geometry.mesh_files import read_mesh
-from warprrf.geometry.photos.photo_files import check_photos, find_photos, read_photo
-from warprrf.geometry.photos.poses import DepthFile, read_depth, read_poses
-from warprrf.geometry.photos.sfm import read_colmap
+from warprrf.geometry.photos.posed.photo_files import check_photos, find_photos, read_photo
+from warprrf.geometry.photos.posed.poses import DepthFile, read_depth, read_poses
+from warprrf.geometry.photos.posed.sfm import read_colmap
 from warprrf.netcdf_files import check_heaps
 from warprrf.rf.interop.twin import write_twin
 from warprrf.steps import Steps

@@ -15,8 +15,8 @@ import warprrf as wr
 from warprrf import tensor_files
 from warprrf.geometry import pipeline as from_photos
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos.cells import plane_mesh, seen_cells, visible_from
 from warprrf.geometry.photos.config import ReconstructionConfig, RefineConfig
+from warprrf.geometry.photos.gaussians.cells import plane_mesh, seen_cells, visible_from
 from warprrf.geometry.pipeline import reconstruct
 from warprrf.geometry.planar_patches import planar_patches
 from warprrf.geometry.planes import PlaneConfig, plane_axes

@@ -5,7 +5,7 @@ import json
 import numpy as np
 from places import LOBBY
 
-from warprrf.geometry.photos.cells import occupancy
+from warprrf.geometry.photos.gaussians.cells import occupancy
 from warprrf.geometry.planes import Plane, PlaneConfig
 from warprrf.geometry.splats.camera import Camera
 

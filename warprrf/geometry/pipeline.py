@@ -22,12 +22,13 @@ from warprrf import tensor_files
 from warprrf.checks import checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh_files import UP
-from warprrf.geometry.photos import sfm
 from warprrf.geometry.photos.config import ReconstructionConfig
-from warprrf.geometry.photos.fusion import depth_maps, depth_views, fuse_maps
-from warprrf.geometry.photos.initialise import initialise
-from warprrf.geometry.photos.measured_depth import range_maps, with_points
-from warprrf.geometry.photos.photo_files import (
+from warprrf.geometry.photos.gaussians.initialise import initialise
+from warprrf.geometry.photos.gaussians.refine import refine
+from warprrf.geometry.photos.posed import sfm
+from warprrf.geometry.photos.posed.images import PosedPhotos
+from warprrf.geometry.photos.posed.measured_depth import range_maps, with_points
+from warprrf.geometry.photos.posed.photo_files import (
     Photos,
     find_photos,
     mask_beside,
@@ -36,11 +37,16 @@ from warprrf.geometry.photos.photo_files import (
     read_photo,
     turns_of,
 )
-from warprrf.geometry.photos.poses import DepthFile, KnownPoses, find_depth, match_photos, read_poses
-from warprrf.geometry.photos.refine import refine
-from warprrf.geometry.photos.sparse import SparseModel, align_to_known, assume_scale, check_scale, scaled
-from warprrf.geometry.photos.targets import PosedPhotos
-from warprrf.geometry.photos.upright import turned, upright
+from warprrf.geometry.photos.posed.poses import DepthFile, KnownPoses, find_depth, match_photos, read_poses
+from warprrf.geometry.photos.posed.sparse import (
+    SparseModel,
+    align_to_known,
+    assume_scale,
+    check_scale,
+    scaled,
+)
+from warprrf.geometry.photos.posed.upright import turned, upright
+from warprrf.geometry.photos.surface.fusion import depth_maps, depth_views, fuse_maps
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.reconstruction import (
     Arrays,
@@ -106,8 +112,8 @@ def reconstruct(
     Raises:
         ValueError: for arguments that exclude or need one another, for files of poses or depth that are damaged, and for
             bad photos or positions (see
-            :func:`~warprrf.geometry.photos.sfm.structure_from_motion` and
-            :func:`~warprrf.geometry.photos.sparse.align_to_known`).
+            :func:`~warprrf.geometry.photos.posed.sfm.structure_from_motion` and
+            :func:`~warprrf.geometry.photos.posed.sparse.align_to_known`).
         ImportError: if the extra ``photos`` is not installed.
     """
     config = config or ReconstructionConfig()

@@ -54,6 +54,7 @@ REFINED = 12  # hypotheses of a round that are refined before the best is chosen
 ECHO_M = 0.1  # a parallel plane this close is the noise of a better one,
 ECHO_CELL_M = 0.3  # where both have points in the same cells of this size
 REFITS = 8  # of a hypothesis, from its neighbourhood outwards
+ALIGNED_DEG = 4.0  # a plane this parallel to one of three perpendicular directions counts as parallel
 AROUND = np.ones((3, 3), dtype=bool)  # a cell and its eight neighbours
 
 
@@ -338,3 +339,40 @@ def aligned(planes: Sequence[Plane], points: np.ndarray) -> list[Plane]:
                 break
         result.append(best)
     return result
+
+
+def directions(normals: np.ndarray, areas: np.ndarray, whole_m2: float) -> np.ndarray | None:
+    """Three perpendicular unit rows along which planes of these normals ``(P, 3)`` and areas [m^2] face, when they make
+    up most of ``whole_m2``; None when there are none."""
+    if not len(normals):
+        return None
+    parallel = np.cos(np.radians(ALIGNED_DEG))
+    alike = (np.abs(normals @ normals.T) > parallel) @ areas
+    first = normals[alike.argmax()]
+    across = np.where(np.abs(normals @ first) < np.sqrt(1 - parallel**2), alike, 0.0)
+    if across.max() == 0:
+        return None
+    second = normals[across.argmax()]
+    second = second - (second @ first) * first
+    second /= np.linalg.norm(second)
+    axes = np.stack([first, second, np.cross(first, second)])
+    for _ in range(3):
+        # The mean of what is parallel to each direction (large planes are fitted best), and the nearest rotation.
+        fit = normals @ axes.T
+        weight = np.where(np.abs(fit) > parallel, np.sign(fit), 0.0) * areas[:, None] ** 2
+        mean = weight.T @ normals
+        length = np.linalg.norm(mean, axis=1, keepdims=True)
+        mean = np.where(length > 0, mean / np.where(length > 0, length, 1.0), axes)
+        u, _, vt = np.linalg.svd(mean)
+        axes = u @ vt
+    on = areas[(np.abs(normals @ axes.T) > parallel).any(axis=1)].sum()
+    # 0.5: of the mesh that has to lie on such planes; else it is no place of boxes
+    if on < 0.5 * whole_m2:
+        return None
+    main = np.abs(axes).argmax(axis=1)
+    if len(set(main)) == 3:  # in the order and sense of the world axes
+        axes = axes[np.argsort(main)]
+        axes = axes * np.sign(np.diag(axes))[:, None]
+    elif np.linalg.det(axes) < 0:
+        axes = -axes
+    return axes

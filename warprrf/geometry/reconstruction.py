@@ -27,10 +27,10 @@ from warprrf.checks import (
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.config import ReconstructionConfig
-from warprrf.geometry.photos.fusion import depth_maps, depth_views, fuse_maps
-from warprrf.geometry.photos.sfm import read_colmap
-from warprrf.geometry.photos.sparse import known_similarity
-from warprrf.geometry.photos.undistort import Lens, lenses_in_use
+from warprrf.geometry.photos.posed.sfm import read_colmap
+from warprrf.geometry.photos.posed.sparse import known_similarity
+from warprrf.geometry.photos.posed.undistort import Lens, lenses_in_use
+from warprrf.geometry.photos.surface.fusion import depth_maps, depth_views, fuse_maps
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.planes import Plane
 from warprrf.geometry.report import write_report
@@ -80,7 +80,7 @@ class Reconstruction:
         photos: image files of the cameras, by name, as the Gaussians were fitted to them.
         held_out: names of photos that the Gaussians were not fitted to.
         guessed: what nobody measured and the photos do not show, a sentence each.
-        lenses: photo name to the :class:`~warprrf.geometry.photos.undistort.Lens` that took it; ``cameras`` are those of the
+        lenses: photo name to the :class:`~warprrf.geometry.photos.posed.undistort.Lens` that took it; ``cameras`` are those of the
             photos undistorted, turned upright and reduced.
     """
 

@@ -17,7 +17,7 @@ LENSES = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENC
 
 @dataclass(frozen=True)
 class RefineConfig:
-    """Settings of :func:`warprrf.geometry.photos.refine.refine`; for about 100 photos on two CPU cores.
+    """Settings of :func:`warprrf.geometry.photos.gaussians.refine.refine`; for about 100 photos on two CPU cores.
 
     Attributes:
         iterations: steps, one photo each.

@@ -16,8 +16,8 @@ import numpy as np
 from warprrf.device import DeviceLike, Progress, require
 from warprrf.files import write_text
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos.photo_files import read_photo, spread
-from warprrf.geometry.photos.undistort import Lens
+from warprrf.geometry.photos.posed.photo_files import read_photo, spread
+from warprrf.geometry.photos.posed.undistort import Lens
 from warprrf.geometry.report.sight import CLASSES, colours_of, from_outside, how_seen, painted
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos.cells import PARALLEL, in_frame
+from warprrf.geometry.photos.gaussians.cells import PARALLEL
 from warprrf.geometry.planes import Plane
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Y00, Gaussians
@@ -75,7 +75,7 @@ def how_seen(mesh: Mesh, cameras: Sequence[Camera], *, device: DeviceLike = None
     for camera in cameras:
         towards = camera.position - points
         distance = np.linalg.norm(towards, axis=1)
-        inside, _ = in_frame(camera, points)
+        inside, _ = camera.in_frame(points)
         facing = np.einsum("si,si->s", towards, normals) > GRAZING * distance
         some = np.flatnonzero(inside & facing & (distance < FARTHEST_M))
         photos[some] += mesh.visible(camera.position, points[some], clearance=1e-3, device=device)

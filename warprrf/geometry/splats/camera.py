@@ -119,6 +119,16 @@ class Camera:
             [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1
         )
 
+    def in_frame(self, points: np.ndarray, nearest_m: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Which points ``(N, 3)`` have a pixel and lie deeper than ``nearest_m``, shape ``(N,)`` bool; and the row and column
+        of each, shape ``(N, 2)`` int, 0 for the others."""
+        uv, depth = self.project(points)
+        with np.errstate(invalid="ignore"):
+            inside = (
+                (depth > nearest_m) & (uv >= 0).all(axis=1) & (uv < (self.width, self.height)).all(axis=1)
+            )
+        return inside, np.where(inside[:, None], uv[:, ::-1], 0).astype(int)
+
     def resized(self, width: int, height: int) -> Camera:
         """The same view at another resolution; pinhole intrinsics scale along."""
         sx = check_count("width", width) / self.width

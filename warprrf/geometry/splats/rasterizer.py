@@ -1,7 +1,7 @@
 """One rasteriser for photos and panoramas: exact on every ray, differentiable through Warp's tape.
 
 :class:`Rasterizer` works on Warp arrays, in float32 or float64, and records its hand-written adjoint on an active
-``wp.Tape``; it is what :mod:`warprrf.geometry.photos.refine` trains with. :mod:`warprrf.geometry.splats.render` is its
+``wp.Tape``; it is what :mod:`warprrf.geometry.photos.gaussians.refine` trains with. :mod:`warprrf.geometry.splats.render` is its
 NumPy face.
 """
 

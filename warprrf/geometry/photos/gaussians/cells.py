@@ -1,0 +1,171 @@
+"""Which cells of a plane hold a surface: where its points lie, where nobody looks through, where planes meet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+
+from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.planes import Plane, PlaneConfig, dilate
+from warprrf.geometry.splats.camera import Camera
+
+BEHIND_M = 0.1  # a line of sight empties a cell when its target is more than this behind the plane
+CONTESTED_M = 0.25  # of parallel planes closer than this, such as a sign and its wall, only one has a cell
+PARALLEL = np.cos(np.radians(10.0))  # planes that face alike
+REACH_CELLS = 3  # a gap at an inner corner up to this wide is closed, an overhang of any width cut
+NEAR_M = 0.5  # cells this close to the other plane tell on which side of it they stand
+INNER, OUTER = 0.8, 0.6  # share of them that has to be on one side
+
+
+def occupancy(
+    planes: Sequence[Plane],
+    points: np.ndarray,
+    eyes: np.ndarray,
+    targets: np.ndarray,
+    *,
+    config: PlaneConfig | None = None,
+) -> list[Plane]:
+    """``planes`` with the cells where a surface may be.
+
+    A cell is a candidate inside the convex hull of the plane's own points, widened by a margin, and empty where a
+    line of sight passes through it to a point that lies well behind.
+
+    Args:
+        points: the points that the planes' ``inliers`` index, shape ``(P, 3)`` [m].
+        eyes, targets: lines of sight, from a camera to a point it sees, shape ``(L, 3)`` each [m].
+        config: size of the cells, margin, and what "well behind" means.
+    """
+    config = config or PlaneConfig()
+    result = []
+    for plane in planes:
+        uv = plane.to_plane(points[plane.inliers])
+        rim = config.margin_m + config.cell_m
+        corner = uv.min(axis=0) - rim
+        shape = np.ceil((uv.max(axis=0) + rim - corner) / config.cell_m).astype(int)
+        grid = replace(plane, corner=corner, cell_m=config.cell_m, occupied=np.ones(shape, dtype=bool))
+        inside = _in_hull(grid.to_plane(grid.cells()), uv, config.margin_m).reshape(shape)
+        supported = grid.count(points[plane.inliers]) > 0
+        lines = grid.seen_through(eyes, targets, BEHIND_M)
+        empty = dilate(lines > 0, 2) & ~dilate(supported, 1)
+        empty |= (lines > 2) & ~supported
+        result.append(replace(grid, occupied=inside & ~empty))
+    return [_uncontested(k, result, points, CONTESTED_M) for k in range(len(result))]
+
+
+def _uncontested(k: int, planes: Sequence[Plane], points: np.ndarray, contested_m: float) -> Plane:
+    """Plane ``k`` without the cells that belong to a parallel plane close by, such as the wall behind a sign.
+
+    Lines of sight cannot tell the two apart; of two planes the one with the nearest point of its own has the cell.
+    """
+    plane = planes[k]
+    cells = plane.cells()
+    uv = plane.to_plane(cells)
+    own = cKDTree(plane.to_plane(points[plane.inliers])).query(uv)[0] if len(uv) else np.zeros(0)
+    lost = np.zeros(len(cells), dtype=bool)
+    for other in [*planes[:k], *planes[k + 1 :]]:
+        if other.normal @ plane.normal < PARALLEL:
+            continue
+        contested = (np.abs(other.distance(cells)) < contested_m) & other.covers(cells)
+        if contested.any():
+            theirs = cKDTree(plane.to_plane(points[other.inliers])).query(uv[contested])[0]
+            lost[contested] |= theirs < own[contested]
+    occupied = plane.occupied.copy()
+    occupied[plane.occupied] = ~lost
+    return replace(plane, occupied=occupied)
+
+
+def _in_hull(queries: np.ndarray, points: np.ndarray, margin: float) -> np.ndarray:
+    """Whether 2D ``queries`` lie within ``margin`` of the convex hull of ``points``."""
+    try:
+        sides = ConvexHull(points).equations
+    except (QhullError, ValueError):  # points on one line
+        return np.asarray(cKDTree(points).query(queries)[0] <= margin)
+    return np.asarray((queries @ sides[:, :2].T + sides[:, 2] <= margin).all(axis=1))
+
+
+def plane_mesh(planes: Sequence[Plane]) -> Mesh | None:
+    """The occupied cells of all planes as one mesh of squares; None when there are none."""
+    corners = []
+    for plane in planes:
+        cells = np.argwhere(plane.occupied)
+        square = cells[:, None, :] + np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+        corners.append(plane.to_world(plane.corner + square.reshape(-1, 2) * plane.cell_m))
+    vertices = np.concatenate(corners) if corners else np.zeros((0, 3))
+    first = np.arange(0, len(vertices), 4)[:, None]
+    return Mesh(vertices, np.concatenate([first + [0, 1, 2], first + [0, 2, 3]])) if len(vertices) else None
+
+
+def visible_from(
+    surface: Mesh | None,
+    points: np.ndarray,
+    normal: np.ndarray,
+    cameras: Sequence[Camera],
+    *,
+    clearance_m: float = 0.05,
+) -> np.ndarray:
+    """Which cameras see which points, shape ``(P, cameras)`` bool: in the frame, from the front, nothing between.
+
+    The line of sight starts ``clearance_m`` above the surface, along ``normal`` (of all, shape ``(3,)``, or of each
+    point, ``(P, 3)``).
+    """
+    normals = np.broadcast_to(normal, points.shape)
+    seen = np.zeros((len(points), len(cameras)), dtype=bool)
+    for c, camera in enumerate(cameras):
+        inside, _ = camera.in_frame(points, 0.05)
+        seen[:, c] = inside & (((camera.position - points) * normals).sum(axis=1) > 0)
+    if surface is not None and seen.any():
+        positions = np.array([camera.position for camera in cameras])
+        point, eye = np.nonzero(seen)
+        seen[point, eye] = surface.visible(points[point] + clearance_m * normals[point], positions[eye])
+    return seen
+
+
+def seen_cells(planes: Sequence[Plane], cameras: Sequence[Camera]) -> list[Plane]:
+    """``planes`` with only those occupied cells that at least two cameras see past all the others."""
+    surface = plane_mesh(planes)
+    result = []
+    for plane in planes:
+        occupied = plane.occupied.copy()
+        seen = visible_from(surface, plane.cells(), plane.normal, cameras)
+        occupied[plane.occupied] = seen.sum(axis=1) >= 2
+        result.append(replace(plane, occupied=occupied))
+    return result
+
+
+def meeting(planes: Sequence[Plane]) -> list[Plane]:
+    """``planes`` with cells added at inner corners and removed beyond outer ones.
+
+    Photos prove little right at an edge. Two planes that stand on each other's front side form an inner corner (wall
+    and floor), and both reach up to their common line. Two that stand on each other's back side form an outer corner
+    (the faces of a pillar), and neither goes past it.
+    """
+    wide = [plane.widened(REACH_CELLS) for plane in planes]
+    grown = [dilate(plane.occupied, REACH_CELLS) for plane in wide]
+    result = []
+    for a, plane in enumerate(wide):
+        occupied, beyond = plane.occupied.copy(), np.zeros_like(plane.occupied)
+        centres = plane.cells(np.ones_like(occupied))
+        for b, other in enumerate(wide):
+            if a == b or abs(other.normal @ plane.normal) > 0.5:
+                continue
+            height = other.distance(centres).reshape(occupied.shape)
+            along = other.covers(centres, grown[b]).reshape(occupied.shape)
+            cells = other.cells()
+            mine = height[occupied & along & (np.abs(height) < NEAR_M)]
+            theirs = plane.distance(cells[plane.covers(cells, grown[a])])
+            theirs = theirs[np.abs(theirs) < NEAR_M]
+            if len(mine) < 3 or len(theirs) < 3:
+                continue
+            if min((mine > 0).mean(), (theirs > 0).mean()) > INNER:
+                strip = along & (height > -0.25 * plane.cell_m) & (height < REACH_CELLS * plane.cell_m)
+                for _ in range(REACH_CELLS):  # towards the other plane only
+                    higher = ndimage.maximum_filter(np.where(occupied, height, -np.inf), 3, mode="nearest")
+                    occupied |= strip & (higher > height + 0.02)
+            elif min((mine < 0).mean(), (theirs < 0).mean()) > OUTER:
+                beyond |= along & (height > 0.25 * plane.cell_m) & (height < NEAR_M)
+        result.append(replace(plane, occupied=occupied & ~beyond))
+    return result

@@ -1,0 +1,247 @@
+"""Before the refinement: sparse points cleaned, their planes found, completed and covered with Gaussians.
+
+Gaussians start as flat discs on the sparse points, and on the planes where photos see them.
+
+The photos' colours decide how finely a plane is covered: blocks whose colour varies are cut into smaller ones, the
+worst first, until the wanted number is reached. So bare walls take few Gaussians and posters many.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from warprrf.checks import check_array
+from warprrf.device import DeviceLike, Progress
+from warprrf.geometry.photos.config import ReconstructionConfig
+from warprrf.geometry.photos.gaussians.cells import meeting, occupancy, plane_mesh, seen_cells, visible_from
+from warprrf.geometry.photos.gaussians.plain import plain_surfaces, with_plain
+from warprrf.geometry.photos.gaussians.sweep import choose_views, joined, level_planes, proven_cells, united
+from warprrf.geometry.photos.posed.images import GreyPhotos
+from warprrf.geometry.photos.posed.points import clean_points, detect_room_planes, estimate_normals
+from warprrf.geometry.photos.posed.sparse import SparseModel
+from warprrf.geometry.planes import Plane, aligned, directions, plane_axes
+from warprrf.geometry.splats.camera import Camera
+from warprrf.geometry.splats.gaussians import Y00, Gaussians, quaternions_of
+
+OPACITY = 0.95
+SPREAD = 0.65  # standard deviation of a disc in units of the spacing: little light leaks between neighbours
+MIN_SCALE, MAX_SCALE = 0.004, 0.12  # of a disc on a sparse point [m]
+
+
+def initial_gaussians(
+    points: ArrayLike,
+    colors: ArrayLike,
+    normals: ArrayLike,
+    planes: Sequence[Plane] = (),
+    cameras: Sequence[Camera] = (),
+    images: Sequence[np.ndarray] = (),
+    *,
+    count: int = 32_000,
+) -> Gaussians:
+    """Flat Gaussians to start the photometric optimisation from, degree 0 colours.
+
+    Args:
+        points: sparse points [m], shape ``(P, 3)``.
+        colors: in [0, 1], shape ``(P, 3)``.
+        normals: unit normals, shape ``(P, 3)``.
+        planes: planes with occupied cells (see :func:`~warprrf.geometry.photos.gaussians.cells.occupancy`); cells that no camera
+            sees are left out.
+        cameras, images: the photos, ``(H, W, 3)`` in [0, 1].
+        count: Gaussians wanted in all (about).
+
+    Raises:
+        ValueError: when shapes or numbers do not fit, or nothing is there to start from.
+    """
+    points = check_array("points", points, (None, 3))
+    colors = check_array("colors", colors, (len(points), 3))
+    normals = check_array("normals", normals, (len(points), 3))
+    if len(cameras) != len(images):
+        raise ValueError(f"images: got {len(images)} for {len(cameras)} cameras, expected one for each")
+    free = np.ones(len(points), dtype=bool)
+    for plane in planes if len(cameras) else ():
+        # 0.02: a sparse point this close to an occupied cell gives way to the plane's own discs
+        free &= ~((np.abs(plane.distance(points)) < 0.02) & plane.covers(points))
+    radius = np.full(len(points), MAX_SCALE)
+    if len(points) > 3:
+        gap = cKDTree(points).query(points[free], k=4)[0][:, 1:]
+        radius[free] = np.clip(gap.mean(axis=1), MIN_SCALE, MAX_SCALE)
+    parts = [(points[free], normals[free], radius[free], colors[free])]
+    if len(planes) and len(cameras):
+        parts += _blocks(planes, cameras, images, max(count - int(free.sum()), 1))
+    centres, facing, sizes, shades = (np.concatenate(p) for p in zip(*parts, strict=True))
+    if not len(centres):
+        raise ValueError("points: got none, and no plane that a photo sees; nothing to start from")
+    return discs(centres, facing, sizes, shades)
+
+
+def discs(centres: np.ndarray, normals: np.ndarray, radius: np.ndarray, colors: np.ndarray) -> Gaussians:
+    """Flat discs of degree 0: centres and unit normals ``(N, 3)``, radii ``(N,)`` [m], colours ``(N, 3)`` in [0, 1]."""
+    kinds, which = np.unique(normals, axis=0, return_inverse=True)
+    axes = np.array([plane_axes(n) for n in kinds])[which.ravel()]
+    rotation = np.stack([axes[:, 0], axes[:, 1], normals], axis=2)
+    # 0.05: thickness over radius
+    scales = np.stack([radius, radius, np.maximum(0.05 * radius, 1e-4)], axis=1)
+    sh = ((colors - 0.5) / Y00)[:, None, :]
+    return Gaussians(centres, quaternions_of(rotation), scales, np.full(len(centres), OPACITY), sh)
+
+
+def _blocks(
+    planes: Sequence[Plane], cameras: Sequence[Camera], images: Sequence[np.ndarray], count: int
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """Centres, normals, radii and colours of discs for blocks of two, one or half a cell, about ``count`` in all."""
+    surface = plane_mesh(planes)
+    cells = []
+    for k, plane in enumerate(planes):
+        centres = plane.cells()
+        seen = visible_from(surface, centres, plane.normal, cameras)
+        some = seen.any(axis=1)
+        quarter = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]]) * plane.cell_m
+        fine = centres[some, None, :] + quarter @ plane.axes
+        views = choose_views(centres[some], plane.normal, seen[some], cameras)
+        color = _median_colors(fine.reshape(-1, 3), np.repeat(views, 4, axis=0), cameras, images)
+        key = np.insert(np.argwhere(plane.occupied)[some] // 2, 0, k, axis=1)
+        cells.append((key, fine, color.reshape(-1, 4, 3)))
+    key, fine, color = (np.concatenate(c) for c in zip(*cells, strict=True))
+    _, parent, members = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    parent, whole = parent.ravel(), len(members)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(parent, v, whole) for v in values.T], axis=1) / members[:, None]
+
+    middle = color.mean(axis=1)
+    coarse = mean(middle)
+    # To cut a block costs 3 Gaussians and removes about the variance between its parts, with a share of what lies
+    # within them; the largest gains first, half of the room for either size.
+    within = ((color - middle[:, None]) ** 2).sum(axis=2).mean(axis=1)
+    between = np.bincount(parent, within + ((middle - coarse[parent]) ** 2).sum(axis=1), whole)
+    room = count - whole
+    cut = _largest(between, int(0.5 * room / 3))
+    room -= 3 * int(cut.sum())
+    cut_again = _largest(np.where(cut[parent], within, 0.0), room // 3)
+    kept = cut[parent] & ~cut_again
+    normal, side = np.array([p.normal for p in planes]), np.array([p.cell_m for p in planes])
+    plane_of, parent_plane = key[:, 0], np.zeros(whole, dtype=int)
+    parent_plane[parent] = plane_of
+    quarters = np.repeat(plane_of[cut_again], 4)
+    return [
+        (mean(fine.mean(axis=1))[~cut], normal[parent_plane[~cut]], 2 * SPREAD * side[parent_plane[~cut]], coarse[~cut]),
+        (fine.mean(axis=1)[kept], normal[plane_of[kept]], SPREAD * side[plane_of[kept]], middle[kept]),
+        (fine[cut_again].reshape(-1, 3), normal[quarters], 0.5 * SPREAD * side[quarters],
+         color[cut_again].reshape(-1, 3)),
+    ]  # fmt: skip
+
+
+def _largest(values: np.ndarray, count: int) -> np.ndarray:
+    """Mask of the ``count`` largest positive ``values``."""
+    chosen = np.zeros(len(values), dtype=bool)
+    chosen[np.argsort(-values, kind="stable")[: max(0, count)]] = True
+    return chosen & (values > 0)
+
+
+def _median_colors(
+    points: np.ndarray, views: np.ndarray, cameras: Sequence[Camera], images: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Median colour of each point over its ``views`` (camera indices, shape ``(N, V)``, -1 padded), shape ``(N, 3)``."""
+    taken = np.full((*views.shape, 3), np.nan)
+    for c, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+        rows, slots = np.nonzero(views == c)
+        if len(rows):
+            at = camera.project(points[rows])[0].T[::-1] - 0.5
+            for channel in range(3):
+                taken[rows, slots, channel] = ndimage.map_coordinates(
+                    image[..., channel], at, order=1, mode="nearest"
+                )
+    return np.nan_to_num(np.nanmedian(taken, axis=1), nan=0.5)
+
+
+def initialise(
+    sparse: SparseModel,
+    cameras: Mapping[str, Camera],
+    images: Sequence[np.ndarray],
+    *,
+    config: ReconstructionConfig,
+    seed: int = 0,
+    progress: Progress | None = None,
+    device: DeviceLike = None,
+) -> tuple[list[Plane], Gaussians]:
+    """Planes of the sparse points, and the Gaussians that refinement starts from.
+
+    Args:
+        sparse: posed cameras and points [m], those of held-out photos among them.
+        cameras: of the photos that the Gaussians are fitted to.
+        images: these photos, shape ``(H, W, 3)`` each, in [0, 1].
+        config: settings.
+        seed: of the plane detection.
+        progress: called with ``"planes"``.
+        device: Warp device of the sweeps.
+
+    Raises:
+        ValueError: for fewer than three points.
+    """
+    report = progress or (lambda stage, done, total: None)
+    report("planes", 0, 6)
+    if len(sparse.points) < 3:
+        raise ValueError(
+            f"photos: only {len(sparse.points)} points were reconstructed; more overlap is needed"
+        )
+    keep = clean_points(
+        sparse.points,
+        reprojection_error=sparse.reprojection_error,
+        track_length=sparse.track_length,
+    )
+    if keep.sum() < 3:  # a handful of photos: few points are seen three times
+        keep[:] = True
+    sparse = sparse.subset(keep)
+    points, viewpoints = sparse.points, sparse.viewpoints()
+    normals = estimate_normals(points, viewpoints)
+    planes = detect_room_planes(points, normals, viewpoints, config=config.planes, seed=seed)
+    level = sparse.metric and sparse.upright
+    planes = aligned(planes, points) if level else planes
+    eyes = np.array([c.position for c in sparse.cameras.values()])[sparse.track_camera]
+    lines = eyes, np.repeat(points, sparse.track_length, axis=0)
+    planes = occupancy(planes, points, *lines, config=config.planes)
+    report("planes", 1, 6)
+    if config.sweep and len(cameras) > 2 and planes:
+        photos = GreyPhotos.upload(list(cameras.values()), images, device)
+        planes = proven_cells(planes, points, photos)
+        report("planes", 2, 6)
+        if level:
+            levels = []
+            for k, up in enumerate((True, False)):
+                levels += level_planes(planes, points, photos, lines, cell_m=config.planes.cell_m, up=up)
+                report("planes", 3 + k, 6)
+            planes = joined(planes, levels)
+    real = np.ones(len(points), dtype=bool)
+    axes = _axes(planes) if config.plain else None
+    if axes is not None:
+        plain = plain_surfaces(list(cameras.values()), images, axes)
+        reflected = plain.reflected(*lines)
+        sight = lines[0][~reflected], lines[1][~reflected]
+        planes = with_plain(planes, plain.planes, points, sight)
+        real = np.add.reduceat(reflected, sparse.track_start[:-1]) < 0.5 * sparse.track_length
+    report("planes", 5, 6)
+    planes = seen_cells(meeting(united((), planes)), list(sparse.cameras.values()))
+    gaussians = initial_gaussians(
+        points[real],
+        sparse.colors[real],
+        normals[real],
+        planes,
+        list(cameras.values()),
+        images,
+        count=config.gaussians,
+    )
+    report("planes", 6, 6)
+    return planes, gaussians
+
+
+def _axes(planes: Sequence[Plane]) -> np.ndarray | None:
+    """The three directions that most of the planes face along, shape ``(3, 3)``; None when there are none."""
+    known = [plane for plane in planes if plane.occupied.any()]
+    areas = np.array([plane.area() for plane in known])
+    normals = np.array([plane.normal for plane in known])
+    return directions(normals, areas, float(areas.sum()))

@@ -1,0 +1,310 @@
+"""Planes that photos prove though few features lie on them: by sweeping patches through space and comparing photos.
+
+Features are rare on surfaces seen at a grazing angle: floors, seats, table tops. A small patch at the right height
+shows the same texture in all photos that see it, at a wrong height it does not (Collins, "A space-sweep approach to
+true multi-image matching", 1996). The same test extends a known plane beyond its features and cuts it where it ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import warp as wp
+from scipy import ndimage
+
+from warprrf.device import launch
+from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.photos.gaussians.cells import CONTESTED_M, PARALLEL, plane_mesh, visible_from
+from warprrf.geometry.photos.posed.images import GreyPhotos, projections
+from warprrf.geometry.planes import AROUND, Plane, dilate, plane_axes
+from warprrf.geometry.splats.camera import Camera
+from warprrf.kernels.photo_consistency import SIDE, patch_agreement
+
+VIEWS = 5  # photos compared
+MIN_ANGLE_DEG = 6.0  # between any two of them, seen from the patch: without parallax every height fits
+PATCH_M = 0.12  # side of a patch
+AGREES, DISAGREES = 0.6, 0.25  # mean correlation of a true patch, and of one that is certainly not
+CONTRAST = 0.012  # patches flatter than this part of white prove nothing
+STEP_M = 0.03  # between heights of the sweep; a patch shows a shift of that much
+REACH_M, LARGE_M2 = 2.5, 3.0  # a plane of this area is extended at most so far
+MIN_CELLS = 15  # of a plane found by the sweep
+SAME_PLANE_M, SAME_PLANE_DEG = 0.02, 3.0  # what lies this close to a larger plane is part of it
+UP_M2, DOWN_M2 = 0.3, 2.0  # least area of a new plane that faces up, or down
+FINE_M = 0.005  # a plane's height is settled in steps of this length
+
+
+def agreement_of(
+    photos: GreyPhotos, centres: np.ndarray, axes: np.ndarray, views: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Correlation in [-1, 1] and contrast of the patches at ``centres`` (N, 3) over ``views`` (N, V), -1 padded."""
+    n, device = len(centres), photos.device
+    result, contrast = (wp.zeros(n, dtype=wp.float32, device=device) for _ in range(2))
+    launch(
+        patch_agreement,
+        n,
+        [
+            wp.array(centres, dtype=wp.vec3, device=device), wp.vec3(*axes[0]), wp.vec3(*axes[1]), PATCH_M / (SIDE - 1),
+            wp.array(views, dtype=wp.int32, device=device),
+            wp.array(projections(photos.cameras), dtype=wp.vec4, device=device), photos.flat,
+            wp.array(photos.sizes, dtype=wp.vec3i, device=device), result, contrast,
+        ],
+        device=device,
+    )  # fmt: skip
+    return result.numpy(), contrast.numpy()
+
+
+def choose_views(
+    points: np.ndarray, normal: np.ndarray, seen: np.ndarray, cameras: Sequence[Camera]
+) -> np.ndarray:
+    """For each point on a plane of this ``normal`` the photos that show it largest among those that see it, no two from
+    nearly the same direction.
+
+    Returns:
+        Camera indices, shape ``(N, VIEWS)`` int32, -1 padded.
+    """
+    line = np.array([c.position for c in cameras])[None] - points[:, None]
+    distance = np.linalg.norm(line, axis=2)
+    line /= np.maximum(distance, 1e-9)[..., None]
+    worth = np.where(seen, line @ normal / distance**2, -1.0)  # pixels on a square metre
+    chosen = np.full((len(points), VIEWS), -1, dtype=np.int32)
+    rows = np.arange(len(points))
+    for k in range(VIEWS):
+        best = worth.argmax(axis=1)
+        good = worth[rows, best] > 0
+        chosen[good, k] = best[good]
+        close = np.einsum("nci,ni->nc", line, line[rows, best]) > np.cos(np.radians(MIN_ANGLE_DEG))
+        worth = np.where(close, -1.0, worth)
+    return chosen
+
+
+@dataclass(frozen=True)
+class _Scored:
+    """A plane with all cells that might be its own, and for each of them, on the grid: whether it was occupied before,
+    how well photos agree on it (NaN: nothing proved), whether any sees it, and whether a point of the plane lies there.
+    """
+
+    plane: Plane
+    before: np.ndarray
+    score: np.ndarray
+    visible: np.ndarray
+    own: np.ndarray
+
+
+def proven_cells(planes: Sequence[Plane], points: np.ndarray, photos: GreyPhotos) -> list[Plane]:
+    """``planes`` with their cells corrected by the photos: extended (large planes far, others little) where the photos
+    agree, emptied where they disagree and no point of the plane is near. Of two parallel planes close to each other,
+    such as a sign and its wall, the one that the photos agree on more has the cell."""
+    surface = plane_mesh(planes)
+    scored = [_scored(plane, surface, points, photos) for plane in planes]
+    result = []
+    for k, this in enumerate(scored):
+        with np.errstate(invalid="ignore"):
+            yes, no = this.score > AGREES, this.score < DISAGREES
+        lost, taken = _rivals(this, scored[:k] + scored[k + 1 :])
+        grown = _majority(yes, 5) & ~this.before & ~taken
+        kept = this.before & ~(_majority(no, 3) & ~dilate(this.own, 1)) & ~lost
+        attached = _pieces(grown | kept, 6) & grown
+        result.append(replace(this.plane, occupied=(kept | attached) & this.visible))
+    return result
+
+
+def _scored(plane: Plane, surface: Mesh | None, points: np.ndarray, photos: GreyPhotos) -> _Scored:
+    reach = int(round(REACH_M / plane.cell_m)) if plane.area() >= LARGE_M2 else 2
+    wide = plane.widened(reach)
+    full = replace(wide, occupied=dilate(wide.occupied, reach))
+    # Photos are chosen once for every 2 x 2 cells.
+    index = np.argwhere(full.occupied)
+    key, group = np.unique(index // 2, axis=0, return_inverse=True)
+    middle = full.to_world(full.corner + (2 * key + 1.0) * full.cell_m)
+    seen = visible_from(surface, middle, full.normal, photos.cameras)
+    views = choose_views(middle, full.normal, seen, photos.cameras)[group.ravel()]
+    agreement, contrast = agreement_of(photos, full.cells(), full.axes, views)
+    score = np.full(full.occupied.shape, np.nan)
+    score[full.occupied] = np.where((contrast > CONTRAST) & (views[:, 1] >= 0), agreement, np.nan)
+    visible = np.zeros_like(full.occupied)
+    visible[full.occupied] = np.asarray(seen.any(axis=1))[group.ravel()]
+    return _Scored(full, wide.occupied, score, visible, full.count(points[plane.inliers]) > 0)
+
+
+def _rivals(this: _Scored, others: Sequence[_Scored]) -> tuple[np.ndarray, np.ndarray]:
+    """Cells that a parallel plane close by has the better claim to, and cells that one holds already."""
+    plane = this.plane
+    lost, taken = (np.zeros_like(this.before) for _ in range(2))
+    unproven = 0.3  # what photos that prove nothing count as, between agreement and disagreement
+    cells, mine = plane.cells(), np.nan_to_num(this.score[plane.occupied], nan=unproven)
+    for other in others:
+        if other.plane.normal @ plane.normal < PARALLEL:
+            continue
+        place, inside = other.plane.cell_of(cells)
+        held = inside & (np.abs(other.plane.distance(cells)) < CONTESTED_M) & other.before[place]
+        better = (np.nan_to_num(other.score[place], nan=unproven) > mine) | other.own[place]
+        lost[plane.occupied] |= held & better
+        taken[plane.occupied] |= held
+    return lost & ~this.own, taken
+
+
+def level_planes(
+    planes: Sequence[Plane],
+    points: np.ndarray,
+    photos: GreyPhotos,
+    lines: tuple[np.ndarray, np.ndarray],
+    *,
+    cell_m: float = 0.1,
+    up: bool = True,
+) -> list[Plane]:
+    """Horizontal planes (z is up) that photos prove and ``planes`` lack: seats, table tops, platforms, soffits.
+
+    Args:
+        points: sparse points; the sweep spans their extent.
+        lines: lines of sight from cameras to points, shape ``(L, 3)`` each: what they cross is no surface.
+        cell_m: side of a cell.
+        up: surfaces that face up; else those that face down.
+    """
+    low, high = np.percentile(points, [0.5, 99.5], axis=0)
+    eyes = np.array([c.position[2] for c in photos.cameras])
+    bottom, top = (low[2], min(high[2], eyes.max())) if up else (max(low[2], eyes.min()), high[2])
+    levels = np.arange(bottom - 0.06, top + 0.06, STEP_M)
+    if len(levels) < 3:
+        return []
+    normal = np.array([0.0, 0.0, 1.0 if up else -1.0])
+    shape = np.ceil(np.abs(plane_axes(normal)[:, :2] @ (high - low)[:2]) / cell_m).astype(int) + 1
+    corner = np.minimum(plane_axes(normal)[:, :2] @ low[:2], plane_axes(normal)[:, :2] @ high[:2])
+    nothing = np.zeros(0, dtype=np.int64)
+    whole = Plane(normal, 0.0, nothing, FINE_M, corner, cell_m, np.ones(shape, dtype=bool))
+    surface = plane_mesh(planes)
+    agreement = _swept(whole, levels, surface, photos)
+    peak = _peaks(agreement, AGREES) & ~_known(whole, levels, planes)
+    found: list[Plane] = []
+    while True:
+        votes = ndimage.convolve1d(peak.sum(axis=(1, 2)), [1, 1, 1], mode="constant")
+        k = int(votes.argmax())
+        if votes[k] < MIN_CELLS:
+            return found
+        band = slice(max(0, k - 1), k + 2)
+        mask = peak[band].any(axis=0)
+        peak[max(0, k - 2) : k + 3] &= ~mask
+        mask |= dilate(mask, 1) & (agreement[band].max(axis=0) > 0.8 * AGREES)
+        pieces, count = ndimage.label(_pieces(mask, MIN_CELLS))
+        for number in range(1, count + 1):  # every connected piece has a height of its own
+            piece = replace(whole, offset=float(levels[k] * normal[2]), occupied=pieces == number)
+            level = _settled(piece, surface, photos)
+            if level is not None:
+                crossed = (level.seen_through(*lines, 0.05) > 0) & level.occupied
+                if crossed.sum() < 0.2 * level.occupied.sum():
+                    found.append(level)
+
+
+def _swept(whole: Plane, levels: np.ndarray, surface: Mesh | None, photos: GreyPhotos) -> np.ndarray:
+    """Agreement of the photos at every level and cell, shape ``(levels, A, B)``; -1 where nothing is proved.
+
+    Photos are chosen once for blocks of 3 x 3 cells and 3 levels.
+    """
+    index = np.argwhere(whole.occupied)
+    key, group = np.unique(index // 3, axis=0, return_inverse=True)
+    middle = whole.to_world(whole.corner + (key + 0.5) * 3 * whole.cell_m)
+    cells = whole.cells()
+    agreement = np.full((len(levels), len(cells)), -1.0, dtype=np.float32)
+    for k, z in enumerate(levels):
+        if k % 3 == 0:
+            middle[:, 2] = levels[min(k + 1, len(levels) - 1)]
+            seen = visible_from(surface, middle, whole.normal, photos.cameras, clearance_m=0.03)
+            views = choose_views(middle, whole.normal, seen, photos.cameras)[group.ravel()]
+            some = np.flatnonzero(views[:, 2] >= 0)  # three photos at least
+        cells[:, 2] = z
+        value, contrast = agreement_of(photos, cells[some], whole.axes, views[some])
+        agreement[k, some] = np.where(contrast > CONTRAST, value, -1.0)
+    return agreement.reshape(len(levels), *whole.occupied.shape)
+
+
+def _peaks(agreement: np.ndarray, least: float) -> np.ndarray:
+    """Where a surface shows as a clear peak along the vertical."""
+
+    def around(*steps: int) -> np.ndarray:
+        footprint = np.isin(np.arange(-4, 5), steps)[:, None, None]
+        return np.asarray(ndimage.maximum_filter(agreement, footprint=footprint, mode="constant", cval=-1.0))
+
+    return (agreement > least) & (agreement >= around(-1, 1)) & (agreement > around(-4, -3, 3, 4) + 0.15)
+
+
+def _known(whole: Plane, levels: np.ndarray, planes: Sequence[Plane]) -> np.ndarray:
+    """Which cells of which levels lie on planes that are known, shape ``(levels, A, B)``."""
+    known = np.zeros((len(levels), *whole.occupied.shape), dtype=bool)
+    cells = whole.cells()
+    for plane in planes:
+        if plane.normal @ whole.normal > 0.99:
+            for k, z in enumerate(levels):
+                cells[:, 2] = z
+                near = (np.abs(plane.distance(cells)) < 0.05) & plane.covers(cells)
+                known[k] |= near.reshape(whole.occupied.shape)
+    return known
+
+
+def _settled(piece: Plane, surface: Mesh | None, photos: GreyPhotos) -> Plane | None:
+    """A horizontal piece moved to the height where its photos agree best; None where no height within 5 cm does."""
+    centres = piece.cells()
+    z = piece.offset * piece.normal[2]
+    seen = visible_from(surface, centres, piece.normal, photos.cameras)
+    views = choose_views(centres, piece.normal, seen, photos.cameras)
+    steps = np.arange(-0.05, 0.0501, FINE_M)
+    scores = [
+        float(agreement_of(photos, centres + [0, 0, step], piece.axes, views)[0].mean()) for step in steps
+    ]
+    best = int(np.argmax(scores))
+    if best in (0, len(steps) - 1) or scores[best] < 0.5:
+        return None
+    a, b, c = scores[best - 1 : best + 2]
+    z += steps[best] + FINE_M * 0.5 * (a - c) / min(a - 2 * b + c, -1e-9)  # top of the parabola
+    return replace(piece, offset=float(z * piece.normal[2]), occupied=_closed(piece.occupied))
+
+
+def joined(planes: Sequence[Plane], levels: Sequence[Plane]) -> list[Plane]:
+    """``planes`` and ``levels`` with pieces of one plane united; new planes need a least area, a larger one where they
+    face down (seen from below, stripes on a wall pass for a soffit)."""
+    result = united(planes, levels)
+    least = [UP_M2 if p.normal[2] > 0 else DOWN_M2 for p in result[len(planes) :]]
+    large = [p for p, area in zip(result[len(planes) :], least, strict=True) if p.area() >= area]
+    return result[: len(planes)] + large
+
+
+def united(planes: Sequence[Plane], others: Sequence[Plane]) -> list[Plane]:
+    """``planes`` and ``others``, the largest first; those that one before them describes as well only add cells to it."""
+    result = list(planes)
+    for other in sorted(others, key=lambda p: -p.area()):
+        cells = other.cells()
+        for k, plane in enumerate(result):
+            near = np.abs(plane.distance(cells)).sum() < SAME_PLANE_M * len(cells)
+            if near and plane.normal @ other.normal > np.cos(np.radians(SAME_PLANE_DEG)):
+                result[k] = _united(plane, other)
+                break
+        else:
+            result.append(other)
+    return result
+
+
+def _united(plane: Plane, other: Plane) -> Plane:
+    """``plane`` with the cells of ``other`` too."""
+    centres = np.concatenate([plane.cells(), other.cells()])
+    index = np.round((plane.to_plane(centres) - plane.corner) / plane.cell_m - 0.5).astype(int)
+    low = index.min(axis=0)
+    occupied = np.zeros(index.max(axis=0) - low + 1, dtype=bool)
+    occupied[tuple((index - low).T)] = True
+    return replace(plane, corner=plane.corner + low * plane.cell_m, occupied=_closed(occupied))
+
+
+def _majority(mask: np.ndarray, of_nine: int) -> np.ndarray:
+    """Cells of ``mask`` that belong to at least so many with their neighbours, themselves counted."""
+    return mask & (ndimage.convolve(mask.astype(int), AROUND.astype(int), mode="constant") >= of_nine)
+
+
+def _closed(mask: np.ndarray) -> np.ndarray:
+    """``mask`` with gaps of up to two cells closed."""
+    grown = np.pad(mask, 2)
+    return np.asarray(ndimage.binary_closing(grown, AROUND)[2:-2, 2:-2]) | mask
+
+
+def _pieces(mask: np.ndarray, smallest: int) -> np.ndarray:
+    """``mask`` without connected pieces (four neighbours) of fewer cells than ``smallest``."""
+    label, _ = ndimage.label(mask)
+    return mask & (np.bincount(label.ravel())[label] >= smallest)

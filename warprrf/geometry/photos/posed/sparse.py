@@ -1,0 +1,239 @@
+"""Posed cameras with a sparse point cloud, and the similarity that brings them to metres.
+
+Structure from motion leaves units and axes of its own. A similarity fitted to surveyed camera positions brings both to
+the world; without a survey a plausible one is assumed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from warprrf.checks import check_array, check_positive
+from warprrf.geometry.photos.posed.photo_files import match_names, some
+from warprrf.geometry.photos.posed.undistort import Lens
+from warprrf.geometry.splats.camera import Camera
+
+# Without surveyed positions the scale is unknown: the median distance from a camera to a point it sees becomes this.
+ASSUMED_DISTANCE_M = 3.0
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """Posed cameras and a sparse point cloud.
+
+    Attributes:
+        cameras: photo name to :class:`Camera`, for the photos that were posed.
+        points: 3D points, shape ``(P, 3)`` float64; metres once aligned, arbitrary units before.
+        colors: colour of each point in [0, 1], shape ``(P, 3)``.
+        reprojection_error: mean reprojection error of each point [pixels of ``cameras``], shape ``(P,)``.
+        track_length: number of photos that see each point, shape ``(P,)`` int64.
+        track_start: where each point's photos begin in ``track_camera``, shape ``(P + 1,)`` int64.
+        track_camera: photos (position in ``list(cameras)``) that see the points, shape ``(sum of track lengths,)``.
+        unposed: names of the photos that no pose was found for, or that lie in a smaller, separate model.
+        causes: why each of these has no pose, by name, where that is known.
+        pieces: names of the photos of each model that too few features join to the others; ``cameras`` are those of the first.
+        metric: whether lengths are metres.
+        upright: whether z is up.
+        scale_rms_m: rms distance between surveyed and reconstructed camera positions after alignment [m], else NaN.
+        guessed: what nobody measured and the photos do not show, a sentence each.
+        photos: the files that ``cameras`` show: undistorted, upright, reduced; by photo name.
+        lenses: of the photos as they were taken, by photo name.
+    """
+
+    cameras: dict[str, Camera]
+    points: np.ndarray
+    colors: np.ndarray
+    reprojection_error: np.ndarray
+    track_length: np.ndarray
+    track_start: np.ndarray
+    track_camera: np.ndarray
+    unposed: tuple[str, ...] = ()
+    causes: Mapping[str, str] = field(default_factory=dict)
+    pieces: tuple[tuple[str, ...], ...] = ()
+    metric: bool = False
+    upright: bool = False
+    scale_rms_m: float = float("nan")
+    guessed: tuple[str, ...] = ()
+    photos: dict[str, Path] = field(default_factory=dict)
+    lenses: dict[str, Lens] = field(default_factory=dict)
+
+    def viewpoints(self) -> np.ndarray:
+        """Mean position of the cameras that see each point, shape ``(P, 3)``: normals are turned towards it."""
+        positions = np.array([camera.position for camera in self.cameras.values()])
+        total = np.add.reduceat(positions[self.track_camera], self.track_start[:-1], axis=0)
+        return total / self.track_length[:, None]
+
+    def subset(self, keep: np.ndarray) -> SparseModel:
+        """The model with only the points where ``keep`` (boolean, shape ``(P,)``) is True."""
+        seen = np.repeat(keep, self.track_length)
+        length = self.track_length[keep]
+        return replace(
+            self,
+            points=self.points[keep],
+            colors=self.colors[keep],
+            reprojection_error=self.reprojection_error[keep],
+            track_length=length,
+            track_start=np.concatenate([[0], np.cumsum(length)]),
+            track_camera=self.track_camera[seen],
+        )
+
+
+def posed_in_words(sparse: SparseModel) -> str:
+    """How many photos were posed, between which more are missing, and which are in no piece; empty where all were posed."""
+    if not sparse.unposed:
+        return ""
+    order = sorted((*sparse.cameras, *sparse.unposed))
+    said = f"photos: {len(sparse.cameras)} of {len(order)} posed"
+    main, gaps = [order.index(name) for name in sparse.cameras], []
+    for piece in sparse.pieces[1:]:
+        near = min((abs(k - m), m, k) for k in map(order.index, piece) for m in main)
+        gaps.append(" and ".join(order[k] for k in sorted(near[1:])))
+    if gaps:
+        said += (
+            f" in the largest of {len(sparse.pieces)} pieces that too few features join: "
+            f"add photos between {'; between '.join(gaps)}"
+        )
+    alone = [name for name in sparse.unposed if not any(name in piece for piece in sparse.pieces[1:])]
+    return f"{said}; without a pose: {some(alone)}" if alone else said
+
+
+def align_to_known(sparse: SparseModel, known_positions: Mapping[str, ArrayLike]) -> SparseModel:
+    """``sparse`` in metres and world axes, by the similarity that best meets surveyed camera positions.
+
+    Args:
+        known_positions: photo name (or its file name, where that is unique) to camera position (3,) [m].
+
+    Returns:
+        The transformed model; its ``scale_rms_m`` is the rms distance left at the surveyed cameras [m].
+
+    Raises:
+        ValueError: for fewer than three positions, positions on one line, a name that is no photo, or a surveyed
+            photo that could not be posed.
+    """
+    scale, rotation, shift, rms_m = known_similarity(sparse.cameras, sparse.unposed, known_positions)
+    moved = transformed(sparse, scale, rotation, shift)
+    return replace(moved, metric=True, upright=True, scale_rms_m=rms_m)
+
+
+def known_similarity(
+    cameras: Mapping[str, Camera], unposed: Sequence[str], known_positions: Mapping[str, ArrayLike]
+) -> tuple[float, np.ndarray, np.ndarray, float]:
+    """Scale, rotation and shift that bring ``cameras``, by photo name, to surveyed positions, and the rms distance that is
+    left there [m]; see :func:`align_to_known` for both and errors."""
+    if len(known_positions) < 3:
+        raise ValueError(
+            f"known_positions: got {len(known_positions)}, expected at least 3 camera positions that are not on a line"
+        )
+    names = match_names("known_positions", known_positions, (*cameras, *unposed))
+    lost = [n for n in names if n not in cameras]
+    usable = {n: p for n, p in zip(names, known_positions.values(), strict=True) if n in cameras}
+    if len(usable) < 3:
+        raise ValueError(
+            f"known_positions: {len(cameras)} of {len(cameras) + len(unposed)} photos were posed, but only {len(usable)} of "
+            "the surveyed ones, expected at least 3; "
+            f"without pose: {some(lost)}"
+        )
+    source = np.array([cameras[n].position for n in usable])
+    target = np.array([check_array(f"known_positions[{n!r}]", p, (3,)) for n, p in usable.items()])
+    try:
+        scale, rotation, shift = fit_similarity(source, target)
+    except ValueError as error:
+        raise ValueError(f"known_positions: {error}") from error
+    rms = float(np.sqrt(((scale * source @ rotation.T + shift - target) ** 2).sum(axis=1).mean()))
+    return scale, rotation, shift, rms
+
+
+Scale = float | tuple[str, str, float]
+"""Metres for each unit of a model, or two photos and the distance between their cameras [m]."""
+
+
+def check_scale(scale: Scale, names: Sequence[str]) -> Scale:
+    """``scale`` with the full names of two of the photos ``names``.
+
+    Raises:
+        ValueError: for a distance or factor that is not positive, names of no photo, or twice the same.
+    """
+    if not isinstance(scale, (tuple, list)):
+        return check_positive("scale", scale, "number of metres for each unit")
+    if len(scale) != 3:
+        raise ValueError(
+            f'scale: got {scale!r}, expected ("a.jpg", "b.jpg", metres): two photos and how far apart their cameras were'
+        )
+    first, second = match_names("scale", scale[:2], names)
+    if first == second:
+        raise ValueError(f"scale: got {first} twice, expected two photos")
+    return first, second, check_positive("scale", scale[2], "distance in metres between two cameras")
+
+
+def scaled(sparse: SparseModel, scale: Scale) -> SparseModel:
+    """``sparse`` in metres, axes as they are.
+
+    Raises:
+        ValueError: as :func:`check_scale`, for a photo without a pose, or cameras at one place.
+    """
+    scale = check_scale(scale, (*sparse.cameras, *sparse.unposed))
+    if isinstance(scale, tuple):
+        lost = [name for name in scale[:2] if name not in sparse.cameras]
+        if lost:
+            raise ValueError(f"scale: no pose was found for {some(lost)}; name two photos that have one")
+        positions = np.array([c.position for c in sparse.cameras.values()])
+        gap = float(np.linalg.norm(sparse.cameras[scale[0]].position - sparse.cameras[scale[1]].position))
+        if gap <= 1e-3 * float(np.ptp(positions, axis=0).max()):
+            raise ValueError(
+                f"scale: {scale[0]} and {scale[1]} were taken at one place; name two photos that are far apart"
+            )
+        scale = scale[2] / gap
+    return replace(transformed(sparse, scale, np.eye(3), np.zeros(3)), metric=True)
+
+
+def assume_scale(sparse: SparseModel) -> SparseModel:
+    """``sparse`` in a plausible size, axes as they are, where nobody measured any."""
+    positions = np.array([c.position for c in sparse.cameras.values()])
+    gap = np.linalg.norm(
+        np.repeat(sparse.points, sparse.track_length, axis=0) - positions[sparse.track_camera], axis=1
+    )
+    scale = ASSUMED_DISTANCE_M / float(np.median(gap)) if len(gap) else 1.0
+    said = f"scale: nobody measured one; the median distance that photos look is taken for {ASSUMED_DISTANCE_M:g} m"
+    moved = transformed(sparse, scale, np.eye(3), np.zeros(3))
+    return replace(moved, guessed=(*sparse.guessed, said))
+
+
+def fit_similarity(source: ArrayLike, target: ArrayLike) -> tuple[float, np.ndarray, np.ndarray]:
+    """Scale ``s``, rotation ``R`` (3, 3) and shift ``t`` (3,) that minimise ``sum |s R source + t - target|^2``.
+
+    Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 13(4),
+    1991, eqs. (40) to (43). Float64 throughout.
+
+    Raises:
+        ValueError: for fewer than three points, or points on one line.
+    """
+    source = check_array("source", source, (None, 3))
+    target = check_array("target", target, (len(source), 3))
+    if len(source) < 3:
+        raise ValueError(f"source: got {len(source)} points, expected at least 3")
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    for name, centred in (("source", a), ("target", b)):
+        spread = np.linalg.svd(centred, compute_uv=False)
+        if spread[1] <= 1e-6 * spread[0] or spread[0] == 0:
+            raise ValueError(
+                f"{name}: the points lie on one line (or coincide), so that the rotation is not fixed"
+            )
+    u, d, vt = np.linalg.svd(b.T @ a)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = (u * sign) @ vt
+    scale = float((d * sign).sum() / (a**2).sum())
+    return scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
+
+
+def transformed(sparse: SparseModel, scale: float, rotation: np.ndarray, shift: np.ndarray) -> SparseModel:
+    """``sparse`` with every point ``x`` at ``scale rotation x + shift``; cameras move along."""
+    cameras = {
+        name: camera.transformed(scale=scale, rotation=rotation, shift=shift)
+        for name, camera in sparse.cameras.items()
+    }
+    return replace(sparse, cameras=cameras, points=scale * sparse.points @ rotation.T + shift)

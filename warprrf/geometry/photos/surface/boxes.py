@@ -1,0 +1,282 @@
+"""Space divided into boxes by planes, what lines of sight prove of them, and the surface between free and solid ones that
+costs least."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import ndimage, sparse
+from scipy.sparse import csgraph
+
+from warprrf.cache import cached_property
+from warprrf.geometry.mesh import Mesh, connected_pieces
+from warprrf.geometry.photos.surface.room_planes import FaceLevels, Level
+from warprrf.geometry.planar_patches import PlanarPatches
+from warprrf.geometry.planes import Plane
+from warprrf.geometry.splats.camera import Camera
+
+CELL_M, MARGIN_M = 0.1, 0.3  # largest side of a box, and space kept around the mesh
+SURE_VOTES = 10.0  # votes that make half a certainty
+BEHIND = 2.0  # votes that a hit on a plane is worth: far more certain than a line of sight through a box
+CAPACITY = 10_000  # the flow is in whole numbers: so many for a square metre
+FINE_M = 0.002  # boxes are looked up in tables of this step: much faster than a search, and fine enough for evidence
+STRIDE = 5  # every so many-th row and column of the depth maps is used
+SNAP_M = 0.12  # a depth agrees with the mesh when both are this close
+STEP_M = 0.06  # spacing of samples along lines of sight
+BESIDE_M = 0.006  # a hit votes for the boxes this far before and behind its plane: within the thinnest board
+RIM_M, RIM_SHARE = 0.6, 0.25  # a side is closed when planes this near to it cover so much of it
+RAYS_AT_ONCE = 20_000
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Boxes between planes across three perpendicular directions.
+
+    Attributes:
+        axes: the directions, unit rows, shape ``(3, 3)``.
+        heights: for each direction where its dividing planes lie, ascending [m], shape ``(N,)``.
+        normals, offsets: the exact equations of the planes, ``normal . x = offset``, shapes ``(N, 3)`` and ``(N,)``.
+        known: whether a dividing plane is a surface (else it only makes boxes smaller), shape ``(N,)`` bool.
+    """
+
+    axes: np.ndarray
+    heights: list[np.ndarray]
+    normals: list[np.ndarray] = field(repr=False)
+    offsets: list[np.ndarray] = field(repr=False)
+    known: list[np.ndarray] = field(repr=False)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Number of boxes along each direction."""
+        a, b, c = (len(h) - 1 for h in self.heights)
+        return a, b, c
+
+    @cached_property
+    def _tables(self) -> list[np.ndarray]:
+        """Box at every ``FINE_M`` of each direction, with one entry for what lies beyond either end."""
+        tables = []
+        for heights in self.heights:
+            middles = np.arange(heights[0] + FINE_M / 2, heights[-1], FINE_M)
+            box = np.clip(np.searchsorted(heights, middles, side="right") - 1, 0, len(heights) - 2)
+            tables.append(np.concatenate([[-(2**40)], box, [-(2**40)]]))  # stays negative when added to
+        return tables
+
+    def locate(self, points: np.ndarray) -> np.ndarray:
+        """Flat indices of the boxes that points ``(N, 3)`` lie in, to 2 mm; negative outside."""
+        index = np.zeros(len(points), dtype=np.int64)
+        for a, table in enumerate(self._tables):
+            slot = (points @ self.axes[a] - self.heights[a][0]) / FINE_M + 1
+            index = index * self.shape[a] + table[np.clip(slot, 0, len(table) - 1).astype(np.int64)]
+        return index
+
+    def count(self, points: np.ndarray) -> np.ndarray:
+        """Number of points in each box, shape ``shape``."""
+        index = self.locate(points)
+        return np.bincount(index[index >= 0], minlength=int(np.prod(self.shape))).reshape(self.shape)
+
+
+def divide(mesh: Mesh, axes: np.ndarray, levels: Sequence[Level]) -> Grid:
+    """Boxes between ``levels``, and between further planes where those are more than a cell apart."""
+    corners = mesh.vertices[np.unique(mesh.faces)] @ axes.T
+    grid = Grid(axes, [], [], [], [])
+    for axis in range(3):
+        own = sorted((level for level in levels if level.axis == axis), key=lambda level: level.height)
+        # A few stray vertices must not blow up the space.
+        low, high = np.quantile(corners[:, axis], [0.002, 0.998])
+        stops = [level.height for level in own]
+        stops = [min([low, *stops]) - MARGIN_M, *stops, max([high, *stops]) + MARGIN_M]
+        steps = np.maximum(1, np.ceil(np.diff(stops) / CELL_M).astype(int))
+        between = zip(stops[:-1], stops[1:], steps, strict=True)
+        parts = [np.linspace(a, b, n + 1)[:-1] for a, b, n in between]
+        height = np.append(np.concatenate(parts), stops[-1])
+        normal, offset, known = np.tile(axes[axis], (len(height), 1)), height.copy(), height < -np.inf
+        for k, level in zip(np.cumsum(steps), own, strict=False):
+            normal[k], offset[k], known[k] = level.normal, level.offset, True
+        grid.heights.append(height)
+        grid.normals.append(normal)
+        grid.offsets.append(offset)
+        grid.known.append(known)
+    return grid
+
+
+def least_surface(grid: Grid, free: np.ndarray, solid: np.ndarray, closed: np.ndarray) -> np.ndarray:
+    """Which boxes are solid, shape ``grid.shape`` bool: the labels of least cost.
+
+    Args:
+        free, solid: votes for each box, shape ``grid.shape``.
+        closed: whether all beyond the lower and upper end of each direction is solid (else it is free), shape
+            ``(3, 2)`` bool.
+    """
+    x, y, z = (np.diff(h) for h in grid.heights)
+    sides = [  # area of a box's side across each direction
+        np.broadcast_to(side, grid.shape)
+        for side in (y[None, :, None] * z, x[:, None, None] * z, (x[:, None] * y)[:, :, None])
+    ]
+    around = 2 * (sides[0] + sides[1] + sides[2])
+    volume = x[:, None, None] * y[None, :, None] * z
+    cross = ndimage.generate_binary_structure(3, 1)
+    cross[1, 1, 1] = False
+    beside = ndimage.maximum_filter(free / volume, footprint=cross, mode="constant")
+    # 0.3: votes by which a box that nobody saw leans to solid
+    # 0.05: share of the lines of sight that go astray: so many votes of a neighbour count for nothing
+    against = BEHIND * solid + 0.3 + 0.05 * beside * volume
+    # 0.6: cost of a box that goes against all its votes, per square metre of its sides
+    cost = 0.6 * around * (free - against) / (free + against + SURE_VOTES)
+    for a in range(3):
+        for end, is_closed in zip((0, -1), closed[a], strict=True):
+            rim = np.moveaxis(cost, a, 0)
+            rim[end] = (-10 if is_closed else 10) * np.moveaxis(around, a, 0)[end]
+    return _minimum_cut(grid, cost, sides)
+
+
+def _minimum_cut(grid: Grid, cost: np.ndarray, sides: Sequence[np.ndarray]) -> np.ndarray:
+    """Solid boxes of the cut between what costs to be solid (``cost`` > 0) and to be free (``cost`` < 0)."""
+    size = cost.size
+    number = np.arange(size).reshape(grid.shape)
+    rows, columns, capacity = [], [], []
+    for a in range(3):
+        box, side = np.moveaxis(number, a, 0), np.moveaxis(sides[a], a, 0)
+        # 0.4: cost of a square metre of surface on a known plane; one where no plane is known costs 1
+        weight = np.where(grid.known[a][1:-1], 0.4, 1.0)[:, None, None]
+        rows.append(box[:-1].ravel())
+        columns.append(box[1:].ravel())
+        capacity.append(np.maximum(CAPACITY * weight * side[:-1], 1).ravel())
+    i, j, ways = np.concatenate(rows), np.concatenate(columns), np.concatenate(capacity)
+    flat = np.clip(np.rint(CAPACITY * cost.ravel()), -1e8, 1e8)
+    up, down = np.flatnonzero(flat > 0), np.flatnonzero(flat < 0)
+    source, sink = size, size + 1
+    begin = np.concatenate([i, j, np.full(len(up), source), down])
+    finish = np.concatenate([j, i, up, np.full(len(down), sink)])
+    flow = np.concatenate([ways, ways, flat[up], -flat[down]]).astype(np.int32)
+    matrix = sparse.csr_matrix((flow, (begin, finish)), shape=(size + 2, size + 2))
+    left = matrix - csgraph.maximum_flow(matrix, source, sink).flow
+    left.data[left.data < 0] = 0
+    left.eliminate_zeros()
+    filled = np.ones(size + 2, dtype=bool)
+    filled[csgraph.breadth_first_order(left, source, return_predecessors=False)] = False
+    return filled[:size].reshape(grid.shape)
+
+
+def surface_of(grid: Grid, filled: np.ndarray, tolerance_m: float) -> tuple[PlanarPatches, np.ndarray]:
+    """The faces between free and solid boxes, a patch for each plane and side, and for each face whether its plane is
+    known, shape ``(F,)`` bool."""
+    nodes = tuple(s + 1 for s in filled.shape)
+    faces, tags = [], []
+    for a in range(3):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        step = np.diff(filled.astype(np.int8), axis=a)
+        for sign in (1, -1):
+            index = np.argwhere(step == -sign)
+            index[:, a] += 1
+            quad = []
+            for along in ((0, 0), (1, 0), (1, 1), (0, 1)):
+                corner = index.copy()
+                corner[:, [b, c]] += along
+                quad.append(np.ravel_multi_index(tuple(corner.T), nodes))
+            corners = np.stack(quad[::sign], axis=1)
+            faces += [corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]]
+            tags += [np.stack([np.full(len(index), a), index[:, a], np.full(len(index), sign)], axis=1)] * 2
+    used, face = np.unique(np.concatenate(faces), return_inverse=True)
+    node = np.unravel_index(used, nodes)
+    normal = np.stack([grid.normals[a][node[a]] for a in range(3)], axis=1)
+    offset = np.stack([grid.offsets[a][node[a]] for a in range(3)], axis=1)
+    vertices = np.linalg.solve(normal, offset[..., None])[..., 0]
+    kinds, which = np.unique(np.concatenate(tags), axis=0, return_inverse=True)
+    patches = PlanarPatches.from_planes(
+        Mesh(vertices, face.reshape(-1, 3)),
+        which.ravel(),
+        [sign * grid.normals[a][k] for a, k, sign in kinds],
+        [sign * grid.offsets[a][k] for a, k, sign in kinds],
+        tolerance_m=tolerance_m,
+    )
+    known = np.array([grid.known[a][k] for a, k, _ in kinds])
+    return patches, known[which.ravel()]
+
+
+def votes(
+    grid: Grid,
+    mesh: Mesh,
+    faces: FaceLevels,
+    cameras: Sequence[Camera],
+    depths: Sequence[np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Votes for free and for solid, shape ``grid.shape`` each.
+
+    A line of sight counts where its depth agrees with the mesh. It votes free at samples along it, and where it ends on
+    a plane also right before the plane, and solid right behind.
+    """
+    o, d, ranges = _lines_of_sight(cameras, depths, STRIDE)
+    hit = mesh.cast(o, d)
+    agree = hit.valid & (np.abs(np.where(hit.valid, hit.t, 0.0) - ranges) < SNAP_M)
+    o, d, ranges, t, face = o[agree], d[agree], ranges[agree], hit.t[agree], hit.face[agree]
+    axis, sign, height = faces.axis[face], faces.sign[face], faces.height[face]
+    normal = sign[:, None] * grid.axes[axis]
+    cosine = -np.einsum("ni,ni->n", d, normal)
+    on = (axis >= 0) & (cosine > 0.05)
+    slope = np.where(on, cosine, 1.0)
+    t_plane = (np.einsum("ni,ni->n", o, normal) - sign * height) / slope
+    on &= np.abs(t_plane - ranges) < SNAP_M / np.maximum(slope, 0.3)
+    # 0.1: a line of sight proves nothing this close to an end that lies on no plane
+    end = np.where(on, t_plane - BESIDE_M / slope, np.minimum(ranges, t) - 0.1)
+    point = (o + t_plane[:, None] * d)[on]
+    free = grid.count(point + BESIDE_M * normal[on]).astype(float)
+    solid = grid.count(point - BESIDE_M * normal[on]).astype(float)
+    # A sample in the middle of each step along the line. Nothing is drawn: one line more or less changes one vote.
+    counts = np.ceil(np.maximum(end, 0) / STEP_M - 0.5).astype(np.int64)
+    for first in range(0, len(o), RAYS_AT_ONCE):
+        count = counts[first : first + RAYS_AT_ONCE]
+        ray = np.repeat(np.arange(first, first + len(count)), count)
+        step = np.arange(len(ray)) - np.repeat(np.cumsum(count) - count, count)
+        free += grid.count(o[ray] + ((step + 0.5) * STEP_M)[:, None] * d[ray])
+    return free, solid
+
+
+def _lines_of_sight(
+    cameras: Sequence[Camera], depths: Sequence[np.ndarray], stride: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Origins and directions, shape ``(N, 3)``, and ranges [m] of every ``stride``-th known pixel in rows and columns."""
+    parts = []
+    for camera, depth in zip(cameras, depths, strict=True):
+        some = (slice(stride // 2, None, stride),) * 2
+        ranges = np.asarray(depth, dtype=np.float64)[some].ravel()
+        seen = np.isfinite(ranges) & (ranges > 0)
+        towards = camera.directions()[some].reshape(-1, 3)[seen]
+        parts.append((np.broadcast_to(camera.position, towards.shape), towards, ranges[seen]))
+    o, d, ranges = (np.concatenate(p) for p in zip(*parts, strict=True))
+    return o, d, ranges
+
+
+def vote_proven(grid: Grid, plane: Plane, level: Level) -> tuple[np.ndarray, np.ndarray]:
+    """Four votes of each occupied cell for free space before it, and for a solid behind, shape ``grid.shape`` each."""
+    quarter = np.array([[i, j] for i in (-0.25, 0.25) for j in (-0.25, 0.25)]) * plane.cell_m
+    points = (plane.cells()[:, None] + quarter @ plane.axes).reshape(-1, 3)
+    axis = grid.axes[level.axis]
+    points += (level.height - points @ axis)[:, None] * axis
+    before = level.sign * BESIDE_M * axis
+    return grid.count(points + before), grid.count(points - before)
+
+
+def closed_sides(grid: Grid, mesh: Mesh, faces: FaceLevels) -> np.ndarray:
+    """Whether planes cover the lower and upper end of each direction, seen from within, shape ``(3, 2)`` bool."""
+    closed = np.zeros((3, 2), dtype=bool)
+    extent = [h[-1] - h[0] for h in grid.heights]
+    for a in range(3):
+        across = extent[(a + 1) % 3] * extent[(a + 2) % 3]
+        for k, (end, sign) in enumerate(((grid.heights[a][0], 1), (grid.heights[a][-1], -1))):
+            own = (faces.axis == a) & (faces.sign == sign) & (np.abs(faces.height - end) < RIM_M)
+            closed[a, k] = mesh.areas[own].sum() > RIM_SHARE * across
+    return closed
+
+
+def seen_share(grid: Grid, patches: PlanarPatches, solid: np.ndarray) -> float:
+    """Share of the surface's area in flat pieces that hits lie on, by the votes ``solid`` of the boxes behind."""
+    mesh = patches.mesh
+    behind = grid.locate(mesh.triangles.mean(axis=1) - 0.5 * BESIDE_M * mesh.face_normals)
+    hit = (behind >= 0) & (solid.ravel()[behind] > 0)
+    piece = connected_pieces(mesh, patches.face_patch)
+    area = np.bincount(piece, weights=mesh.areas)
+    # 0.1: a flat piece of surface is seen when hits lie on so much of it
+    seen = np.bincount(piece, weights=mesh.areas * hit) > 0.1 * area
+    return float(area[seen].sum() / area.sum())

@@ -1,0 +1,259 @@
+"""From Gaussians to a surface: depth maps rendered at cameras, mended by photos, fused, snapped to planes, made whole.
+
+Fusion is Open3D's truncated signed distance field (Curless and Levoy, "A volumetric method for building complex models
+from range images", 1996).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from warprrf.checks import check_array
+from warprrf.device import DeviceLike, Progress, threads
+from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.photos.config import ReconstructionConfig
+from warprrf.geometry.photos.posed.images import PosedPhotos, lens_matrix
+from warprrf.geometry.photos.posed.photo_files import spread
+from warprrf.geometry.photos.surface.completion import complete
+from warprrf.geometry.photos.surface.segments import segments_of, with_segments
+from warprrf.geometry.photos.surface.stereo import kept_pixels, mended
+from warprrf.geometry.planar_patches import PlanarPatches
+from warprrf.geometry.planes import Plane
+from warprrf.geometry.rays import open3d
+from warprrf.geometry.scans import (
+    MIN_PATCH_M2,
+    SurfaceConfig,
+    largest_first,
+    simplified,
+    snapped,
+)
+from warprrf.geometry.splats.camera import Camera
+from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.render import render
+
+VIEWS = 120  # most depth maps that are fused, spread over all cameras
+ALPHA = 0.6  # a depth counts where at least so much light is blocked,
+DEPTH_SPREAD = 0.05  # and where blended depth and dominant Gaussian differ by no more than this part
+VOXEL_PIXELS = 5.0  # widest voxel, in pixels of the depth maps at their median range
+EDGE_TOLERANCE = 8.0
+"""A pixel is left out where inverse depth bends by more than this part of itself, per focal length in pixels: on a plane
+it is linear in the image, in a corner it bends, across an occluding edge it jumps."""
+MIN_VIEWS = 2  # a surface is kept where at least this many depth maps saw it; three leave half as many holes again on films
+TOUCHED = (
+    4  # Open3D looks for blocks along every so many-th row and column, and refuses a map that shows none
+)
+BLOCK_VOXELS, BLOCKS = 16, 20_000  # voxels along a block's side; blocks set aside at first, the grid grows
+
+
+def depth_views(cameras: Sequence[Camera], config: SurfaceConfig) -> list[Camera]:
+    """Cameras of the depth maps: some of ``cameras``, spread over all, with fewer pixels."""
+    views = []
+    for camera in spread(cameras, VIEWS):
+        side = min(1.0, (config.depth_pixels / (camera.width * camera.height)) ** 0.5)
+        views.append(camera.resized(max(1, round(side * camera.width)), max(1, round(side * camera.height))))
+    return views
+
+
+def depth_maps(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    *,
+    photos: PosedPhotos | None = None,
+    planes: Sequence[Plane] = (),
+    config: ReconstructionConfig | None = None,
+    progress: Progress | None = None,
+    device: DeviceLike = None,
+) -> list[np.ndarray]:
+    """Ranges [m] that :func:`depth_views` of ``cameras`` see of Gaussians, 0 where none is reliable.
+
+    Args:
+        photos: what ``cameras`` saw, in the same order; the depth maps are mended by them.
+        planes: that Gaussians were kept on: elsewhere only what photos prove is reliable.
+    """
+    config = config or ReconstructionConfig()
+    report = progress or (lambda stage, done, total: None)
+    views, depths = depth_views(cameras, config.surface), []
+    for k, view in enumerate(views):
+        report("depth", k, len(views))
+        out = render(gaussians, view, features=np.zeros((len(gaussians), 1), dtype=np.float32), device=device)
+        with np.errstate(invalid="ignore"):
+            agree = np.abs(out.depth - out.peak) <= DEPTH_SPREAD * out.peak
+        depths.append(np.where(agree & (out.alpha >= ALPHA), out.depth, 0.0))
+    report("depth", len(views), len(views))
+    if photos is None or not config.stereo:
+        return depths
+    seen = photos.subset(spread(range(len(cameras)), VIEWS))
+    depths, proved = mended(depths, views, seen, progress=report, device=device)
+    reach = partial(_sure, planes=planes, reach_m=config.surface.patch_distance_m)
+    with ThreadPoolExecutor(threads()) as pool:
+        depths = list(pool.map(reach, depths, proved, views))
+    return _flat(depths, proved, views, seen, report) if config.segments else depths
+
+
+def _sure(
+    depth: np.ndarray, proved: np.ndarray, view: Camera, planes: Sequence[Plane], reach_m: float
+) -> np.ndarray:
+    """A depth map without what neither photos prove nor a plane within ``reach_m`` holds: Gaussians are vague there."""
+    rest = (depth > 0) & ~proved
+    points = view.position + depth[rest][:, None] * view.directions()[rest]
+    held = np.zeros(len(points), dtype=bool)
+    for plane in planes:
+        near = np.abs(plane.distance(points)) < reach_m
+        held[near] |= plane.covers(points[near])
+    result = depth.copy()
+    result[rest] = np.where(held, depth[rest], 0.0)
+    return result
+
+
+def _flat(
+    depths: Sequence[np.ndarray],
+    proved: Sequence[np.ndarray],
+    views: Sequence[Camera],
+    photos: PosedPhotos,
+    progress: Progress,
+) -> list[np.ndarray]:
+    """``depths`` with the flat segments of their photos on planes."""
+    progress("segments", 0, len(views))
+    result = []
+    # Planes are many small steps of Python's, which threads would not speed up.
+    with ThreadPoolExecutor(threads()) as pool:
+        cut = pool.map(segments_of, photos.images, views)
+        for k, (depth, sure, segment, view) in enumerate(zip(depths, proved, cut, views, strict=True)):
+            result.append(with_segments(depth, sure, kept_pixels(photos, k, view), segment, view))
+            progress("segments", len(result), len(views))
+    return result
+
+
+def fuse_maps(
+    views: Sequence[Camera],
+    depths: Sequence[np.ndarray],
+    *,
+    planes: Sequence[Plane] = (),
+    config: ReconstructionConfig | None = None,
+    progress: Progress | None = None,
+) -> tuple[PlanarPatches, bool]:
+    """Mesh of depth maps with its planar patches, the largest first; and whether its holes were closed.
+
+    Args:
+        views: pinhole cameras.
+        depths: ranges [m], 0 where unknown, each of one of ``views``.
+        planes: known beforehand; the mesh is snapped to them.
+    """
+    config = config or ReconstructionConfig()
+    report = progress or (lambda stage, done, total: None)
+    report("surface", 0, 4)
+    mesh = fuse_depth(depths, views, config=_with_voxels(config.surface, views, depths))
+    report("surface", 1, 4)
+    patches = snapped(mesh, planes, config.surface)
+    report("surface", 2, 4)
+    whole = False
+    if config.completion:
+        patches, whole = complete(patches, views, depths, planes=planes)
+    report("surface", 3, 4)
+    result = largest_first(simplified(patches), MIN_PATCH_M2)
+    report("surface", 4, 4)
+    return result, whole
+
+
+def _with_voxels(
+    config: SurfaceConfig, views: Sequence[Camera], depths: Sequence[np.ndarray]
+) -> SurfaceConfig:
+    """``config`` with smaller voxels where the views look from near by: they show finer things."""
+    pixel_m = [np.median(d[d > 0]) / v.fx for v, d in zip(views, depths, strict=True) if (d > 0).any()]
+    if not pixel_m:
+        return config
+    return replace(config, voxel_m=min(config.voxel_m, VOXEL_PIXELS * float(np.median(pixel_m))))
+
+
+def fuse_depth(
+    depths: Sequence[Any], cameras: Sequence[Camera], *, config: SurfaceConfig | None = None
+) -> Mesh:
+    """One mesh from depth maps of pinhole cameras, by a truncated signed distance field.
+
+    Args:
+        depths: Euclidean range per pixel [m], each ``(height, width)`` of its camera; inf, NaN or 0 where unknown.
+        cameras: pinhole cameras, one a depth map.
+        config: sizes and limits.
+
+    Raises:
+        ValueError: when the numbers of maps and cameras differ, a camera is not a pinhole, a map has another shape
+            than its camera, or no surface comes out.
+    """
+    config = config or SurfaceConfig()
+    o3d = open3d()
+    if len(depths) != len(cameras) or not len(depths):
+        raise ValueError(f"depths: got {len(depths)} maps for {len(cameras)} cameras, expected one for each")
+    core = o3d.core
+    grid = o3d.t.geometry.VoxelBlockGrid(
+        ("tsdf", "weight"), (core.float32, core.float32), ((1,), (1,)), config.voxel_m, BLOCK_VOXELS, BLOCKS
+    )
+    filled = False
+    for k, (given, camera) in enumerate(zip(depths, cameras, strict=True)):
+        if camera.kind != "pinhole":
+            raise ValueError(f"cameras[{k}]: got a {camera.kind} camera, expected pinhole cameras")
+        depth = check_array(f"depths[{k}]", given, (camera.height, camera.width), np.float64, finite=False)
+        z = range_to_depth(np.where(np.isfinite(depth), depth, 0.0), camera)
+        z[(depth >= config.max_range_m) | ~_smooth(z, EDGE_TOLERANCE / camera.fx)] = 0.0
+        if not (z[::TOUCHED, ::TOUCHED] > 0).any():
+            continue
+        image = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(z, dtype=np.float32)))
+        # The grid reads the pixel that a voxel's projection falls into: pixel centres at +0.5, as ours.
+        lens = core.Tensor(lens_matrix(camera))
+        pose = core.Tensor(np.array(camera.world_to_camera, dtype=np.float64))
+        limits = (1.0, config.max_range_m, config.truncation_voxels)
+        blocks = grid.compute_unique_block_coordinates(image, lens, pose, *limits)
+        grid.integrate(blocks, image, lens, pose, *limits)
+        filled = True
+    raw = grid.extract_triangle_mesh(MIN_VIEWS - 0.5).to_legacy() if filled else None
+    if raw is None or len(raw.triangles) == 0:
+        raise ValueError("depths: no surface came out; are the maps ranges in metres and the poses right?")
+    return _without_debris(_ordered(o3d, raw), config)
+
+
+def _without_debris(raw: Any, config: SurfaceConfig) -> Mesh:
+    raw.merge_close_vertices(1e-4 * config.voxel_m)
+    raw.remove_degenerate_triangles()
+    label, count, _ = raw.cluster_connected_triangles()
+    raw.remove_triangles_by_mask(np.asarray(count)[np.asarray(label)] < config.min_component_faces)
+    raw.remove_unreferenced_vertices()
+    if len(raw.triangles) == 0:
+        raise ValueError(f"min_component_faces: no connected piece has {config.min_component_faces} faces")
+    return Mesh(np.asarray(raw.vertices), np.asarray(raw.triangles))
+
+
+def _ordered(o3d: ModuleType, raw: Any) -> Any:
+    """The mesh with vertices and faces in an order of their own, not in that in which threads found them."""
+    vertices, faces = np.asarray(raw.vertices), np.asarray(raw.triangles)
+    order = np.lexsort(vertices.T[::-1])
+    faces = np.argsort(order)[faces]
+    turn = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    faces = np.take_along_axis(faces, turn, axis=1)
+    faces = faces[np.lexsort(faces.T[::-1])]
+    return o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(vertices[order]), o3d.utility.Vector3iVector(faces.astype(np.int32))
+    )
+
+
+def range_to_depth(distance: np.ndarray, camera: Camera) -> np.ndarray:
+    """Depth along the optical axis [m] of Euclidean ranges ``(H, W)`` in a pinhole image."""
+    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    return distance / np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2)
+
+
+def _smooth(z: np.ndarray, tolerance: float) -> np.ndarray:
+    """Pixels with a depth whose inverse is nearly linear towards both neighbours, along rows and columns."""
+    known = z > 0
+    inverse = np.where(known, 1 / np.where(known, z, 1.0), np.nan)
+    fine = known.copy()
+    with np.errstate(invalid="ignore"):
+        fine[1:-1] &= ~(np.abs(np.diff(inverse, n=2, axis=0)) > tolerance * inverse[1:-1])
+        fine[:, 1:-1] &= ~(np.abs(np.diff(inverse, n=2, axis=1)) > tolerance * inverse[:, 1:-1])
+    return fine

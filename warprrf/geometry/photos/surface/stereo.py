@@ -1,0 +1,231 @@
+"""Depth of every pixel by comparison of photos: a small plane for each, which several photos and their own planes confirm.
+
+Depth maps of Gaussians are exact where planes were known, and vague elsewhere. They are where the search starts
+(:mod:`warprrf.kernels.patch_match`): each photo is compared with those that show its places from aside, at every pixel;
+then once more, where a plane also costs what it contradicts the planes that the others found. A depth that two photos
+found takes the place of the old one; what one sees through is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+from scipy import ndimage
+
+from warprrf.device import DeviceLike, Progress, filled, launch
+from warprrf.geometry.photos.posed.images import GreyPhotos, PosedPhotos, lens_matrix, projections
+from warprrf.geometry.splats.camera import Camera
+from warprrf.kernels.patch_match import UNKNOWN, Others, match
+from warprrf.kernels.photo_consistency import count_votes
+
+GOOD_ANGLE_DEG = 9.0  # between two lines of sight: less tells depths badly, more changes what a window shows
+SOURCES = 3  # photos that one is compared with
+ROUNDS = ((range(3), 0.0), (range(3, 4), 0.3))
+"""Turns in which planes are handed on between pixels, finer and finer ones, and what it costs to contradict another photo's
+plane in full: first photos alone, then each knows what the others found."""
+SETTLED = 0.05  # a plane of less cost (one minus a correlation) stays as it is
+PROVED = 0.6  # planes of more cost prove nothing
+CHECKED = 8  # maps of other photos that a depth is checked against
+TOLERANCE = 0.015  # up to this part of the range two depths that photos found agree; one of Gaussians, up to twice as much
+
+
+def mended(
+    depths: Sequence[np.ndarray],
+    views: Sequence[Camera],
+    photos: PosedPhotos,
+    *,
+    progress: Progress,
+    device: DeviceLike = None,
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Depth maps of what photos prove, and elsewhere of what was there, where no photo sees through it; and the pixels that
+    photos prove.
+
+    Args:
+        depths: ranges [m], ``(height, width)`` of each of ``views``, 0 where unknown.
+        views: cameras of the photos, of any size.
+        photos: one a view, in this order.
+    """
+    known = [depth[depth > 0] for depth in depths]
+    if sum(map(len, known)) == 0:
+        return list(depths), [np.zeros(depth.shape, dtype=bool) for depth in depths]
+    near, far = np.percentile(np.concatenate(known), [0.5, 99.5])
+    bounds = 1 / (1.6 * float(far)), 1 / (0.6 * float(near))
+    comparison = _Comparison(GreyPhotos.upload(views, photos.images, device), bounds)
+    sharpness = comparison.sharpness
+    others = [_companions(k, views, depths, sharpness, SOURCES) for k in range(len(views))]
+    started = [comparison.start(k, depth) for k, depth in enumerate(depths)]
+    planes = list(started)
+    work, costs = len(ROUNDS) * len(views), [np.zeros(0)] * len(views)
+    for number, (turns, contradicting) in enumerate(ROUNDS):
+        told = comparison.upload(planes)
+        for k, others_of in enumerate(others):
+            progress("stereo", number * len(views) + k, work)
+            planes[k], costs[k] = comparison.match(k, planes[k], others_of, told, turns, contradicting)
+    progress("stereo", work, work)
+    found = []
+    for k, (view, depth, plane) in enumerate(zip(views, depths, planes, strict=True)):
+        moved = (plane[..., 0] != started[k][..., 0]) | (depth == 0)
+        there = np.where(moved, 1 / (np.maximum(plane[..., 0], 1e-6) * ahead(view)), depth)
+        found.append(np.where((costs[k] < PROVED) & kept_pixels(photos, k, view), there, 0.0))
+    result, proved = [], []
+    for k, (view, depth) in enumerate(zip(views, depths, strict=True)):
+        checked = _companions(k, views, depths, np.ones(len(views)), CHECKED)
+        maps = [(views[s], found[s]) for s in checked]
+        agreed, _ = _votes(found[k], view, maps, TOLERANCE, device)
+        _, crossed = _votes(depth, view, maps, 2 * TOLERANCE, device)
+        proved.append(agreed > 0)
+        result.append(np.where(agreed > 0, found[k], np.where(crossed > 0, 0.0, depth)))
+    return result, proved
+
+
+def ahead(camera: Camera) -> np.ndarray:
+    """Depth along the optical axis over range, shape ``(height, width)``."""
+    cosine: np.ndarray = camera.directions() @ camera.rotation[2]
+    return cosine
+
+
+def kept_pixels(photos: PosedPhotos, number: int, camera: Camera) -> np.ndarray:
+    """The pixels of a photo that are not masked, at the size of ``camera``, bool."""
+    mask = photos.masks[number] if photos.masks else None
+    if mask is None:
+        return np.full((camera.height, camera.width), True)
+    rows, columns = ((np.arange(n) + 0.5) / n for n in (camera.height, camera.width))
+    inside = (rows * mask.shape[0]).astype(int), (columns * mask.shape[1]).astype(int)
+    return np.asarray(np.asarray(mask)[np.ix_(*inside)] == 0)
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """Photos to compare, and how.
+
+    Attributes:
+        photos: at the size at which they are compared.
+        bounds: least and largest inverse depth [1/m].
+    """
+
+    photos: GreyPhotos
+    bounds: tuple[float, float]
+
+    @property
+    def sharpness(self) -> np.ndarray:
+        """Of each photo, over the median."""
+        blur = np.array([ndimage.laplace(grey).var() for grey in self.photos.pixels])
+        return np.clip(blur / max(float(np.median(blur)), 1e-12), 0.3, 1.5)
+
+    def start(self, view: int, depth: np.ndarray) -> np.ndarray:
+        """Planes along a depth map, ``(H, W, 3)``; at any depth where it is unknown."""
+        known = depth > 0
+        w = np.where(known, 1 / np.where(known, depth * ahead(self.photos.cameras[view]), 1.0), 0.0)
+        planes = np.stack([w, *np.gradient(w)[::-1]], axis=-1)
+        bent = ~known | (np.abs(planes[..., 1:]).max(axis=-1) > 0.05 * w)  # across an edge
+        planes[bent, 1:] = 0.0
+        planes[~known, 0] = np.random.default_rng(view).uniform(*self.bounds, (~known).sum())
+        return planes.astype(np.float32)
+
+    def upload(self, planes: Sequence[np.ndarray]) -> wp.array:
+        """Planes of all photos, flat."""
+        flat = np.concatenate([p.reshape(-1, 3) for p in planes])
+        return wp.array(flat, dtype=wp.vec3, device=self.photos.device)
+
+    def match(
+        self,
+        view: int,
+        first: np.ndarray,
+        others: np.ndarray,
+        told: wp.array,
+        turns: range,
+        contradicting: float,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Better planes ``(H, W, 3)`` of one photo than ``first``, by comparison with ``others``, and their costs ``(H, W)``.
+
+        Args:
+            told: planes of all photos (see :meth:`upload`).
+            turns: in which planes are handed on between pixels.
+            contradicting: cost of a plane that contradicts what is told of another photo.
+        """
+        cameras, sizes, device = self.photos.cameras, self.photos.sizes, self.photos.device
+        camera = cameras[view]
+        if len(others) < 2:
+            return first, np.full(first.shape[:2], float(UNKNOWN))
+        planes = wp.array(first.reshape(-1, 3), dtype=wp.vec3, device=device)
+        costs = wp.full(len(planes), float(UNKNOWN), dtype=wp.float32, device=device)
+        inverse = np.linalg.inv(lens_matrix(camera))
+        turn = [cameras[s].rotation @ camera.rotation.T for s in others]
+        shift = [
+            cameras[s].world_to_camera[:3, 3] - r @ camera.world_to_camera[:3, 3]
+            for s, r in zip(others, turn, strict=True)
+        ]
+        lenses = [lens_matrix(cameras[s]) for s in others]
+        rotations = np.array([k @ r @ inverse for k, r in zip(lenses, turn, strict=True)], dtype=np.float32)
+        shifts = np.array([k @ t for k, t in zip(lenses, shift, strict=True)], dtype=np.float32)
+        sources = filled(
+            Others, device, turns=rotations, shifts=shifts, sizes=sizes[others], images=self.photos.flat, told=told,
+            contradicting=contradicting,
+        )  # fmt: skip
+        for number in (-1, *turns):
+            for colour in (0, 1):
+                settings = [
+                    colour, number, view, 1 / camera.fx, wp.vec2(*self.bounds), SETTLED,
+                    wp.vec3i(*map(int, sizes[view])),
+                ]  # fmt: skip
+                count = camera.height * ((camera.width + 1) // 2)
+                launch(match, count, [*settings, sources, planes, costs], device=device, grain=32)
+        return planes.numpy().reshape(first.shape), costs.numpy().reshape(first.shape[:2])
+
+
+def _companions(
+    view: int, cameras: Sequence[Camera], depths: Sequence[np.ndarray], weight: np.ndarray, count: int
+) -> np.ndarray:
+    """Up to ``count`` photos that show best what ``view`` does, at a good angle, at a like size, and not all from one
+    place."""
+    camera, part = cameras[view], (slice(8, None, 16),) * 2
+    known = depths[view][part] > 0
+    if not known.any():
+        return np.zeros(0, dtype=np.int64)
+    points = camera.position + depths[view][part][known][:, None] * camera.directions()[part][known]
+    position = np.array([c.position for c in cameras])
+    line = points[None] - position[:, None]
+    distance = np.linalg.norm(line, axis=2)
+    line /= np.maximum(distance, 1e-9)[..., None]
+    angle = np.degrees(np.arccos(np.clip(np.einsum("cpi,pi->cp", line, line[view]), -1, 1)))
+    good = np.exp(-0.5 * (np.log(np.maximum(angle, 0.1) / GOOD_ANGLE_DEG) / 0.7) ** 2)
+    good *= np.minimum(distance / distance[view], distance[view] / np.maximum(distance, 1e-9))
+    inside = np.array([c.in_frame(points)[0] for c in cameras])
+    worth = np.where(inside.mean(axis=1) > 0.3, (good * inside).mean(axis=1), 0.0) * weight
+    worth[view] = 0.0
+    chosen: list[int] = []
+    while len(chosen) < count and worth.max() > 0.02:
+        best = int(worth.argmax())
+        chosen.append(best)
+        away = np.linalg.norm(position - position[best], axis=1)
+        worth *= np.clip(2 * away / max(float(np.linalg.norm(position[best] - camera.position)), 1e-9), 0, 1)
+        worth[best] = 0.0
+    return np.array(chosen, dtype=np.int64)
+
+
+def _votes(
+    depth: np.ndarray,
+    camera: Camera,
+    others: Sequence[tuple[Camera, np.ndarray]],
+    tolerance: float,
+    device: DeviceLike = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """How many of the ``others`` (cameras and their ranges) confirm the depth at each pixel, and how many see through."""
+    known = depth > 0
+    agreed, crossed = (np.zeros(depth.shape, dtype=np.int64) for _ in range(2))
+    cameras, ranges = [other for other, _ in others], [seen.ravel() for _, seen in others]
+    if not known.any() or not cameras:
+        return agreed, crossed
+    points = camera.position + depth[known][:, None] * camera.directions()[known]
+    first = np.cumsum([0, *map(len, ranges)])[:-1]
+    sizes = np.array([(at, c.width, c.height) for at, c in zip(first, cameras, strict=True)], dtype=np.int32)
+    found = [wp.zeros(len(points), dtype=wp.int32, device=device) for _ in range(2)]
+    maps = [
+        np.concatenate(ranges).astype(np.float32), projections(cameras), np.array([c.position for c in cameras]), sizes
+    ]  # fmt: skip
+    launch(count_votes, len(points), [points, *maps, tolerance, *found], device=device)
+    agreed[known], crossed[known] = (votes.numpy() for votes in found)
+    return agreed, crossed
