@@ -16,8 +16,6 @@ from warprrf.geometry.splats.camera import Camera
 BEHIND_M = 0.1  # a line of sight empties a cell when its target is more than this behind the plane
 CONTESTED_M = 0.25  # of parallel planes closer than this, such as a sign and its wall, only one has a cell
 PARALLEL = np.cos(np.radians(10.0))  # planes that face alike
-REACH_CELLS = 3  # a gap at an inner corner up to this wide is closed, an overhang of any width cut
-NEAR_M = 0.5  # cells this close to the other plane tell on which side of it they stand
 INNER, OUTER = 0.8, 0.6  # share of them that has to be on one side
 
 
@@ -143,9 +141,11 @@ def meeting(planes: Sequence[Plane]) -> list[Plane]:
     and floor), and both reach up to their common line. Two that stand on each other's back side form an outer corner
     (the faces of a pillar), and neither goes past it.
     """
-    wide = [plane.widened(REACH_CELLS) for plane in planes]
-    grown = [dilate(plane.occupied, REACH_CELLS) for plane in wide]
+    reach_cells = 3  # a gap at an inner corner up to this wide is closed, an overhang of any width cut
+    wide = [plane.widened(reach_cells) for plane in planes]
+    grown = [dilate(plane.occupied, reach_cells) for plane in wide]
     result = []
+    near_m = 0.5  # cells this close to the other plane tell on which side of it they stand
     for a, plane in enumerate(wide):
         occupied, beyond = plane.occupied.copy(), np.zeros_like(plane.occupied)
         centres = plane.cells(np.ones_like(occupied))
@@ -155,17 +155,17 @@ def meeting(planes: Sequence[Plane]) -> list[Plane]:
             height = other.distance(centres).reshape(occupied.shape)
             along = other.covers(centres, grown[b]).reshape(occupied.shape)
             cells = other.cells()
-            mine = height[occupied & along & (np.abs(height) < NEAR_M)]
+            mine = height[occupied & along & (np.abs(height) < near_m)]
             theirs = plane.distance(cells[plane.covers(cells, grown[a])])
-            theirs = theirs[np.abs(theirs) < NEAR_M]
+            theirs = theirs[np.abs(theirs) < near_m]
             if len(mine) < 3 or len(theirs) < 3:
                 continue
             if min((mine > 0).mean(), (theirs > 0).mean()) > INNER:
-                strip = along & (height > -0.25 * plane.cell_m) & (height < REACH_CELLS * plane.cell_m)
-                for _ in range(REACH_CELLS):  # towards the other plane only
+                strip = along & (height > -0.25 * plane.cell_m) & (height < reach_cells * plane.cell_m)
+                for _ in range(reach_cells):  # towards the other plane only
                     higher = ndimage.maximum_filter(np.where(occupied, height, -np.inf), 3, mode="nearest")
                     occupied |= strip & (higher > height + 0.02)
             elif min((mine < 0).mean(), (theirs < 0).mean()) > OUTER:
-                beyond |= along & (height > 0.25 * plane.cell_m) & (height < NEAR_M)
+                beyond |= along & (height > 0.25 * plane.cell_m) & (height < near_m)
         result.append(replace(plane, occupied=occupied & ~beyond))
     return result

@@ -28,9 +28,7 @@ from warprrf.geometry.planes import Plane, aligned, directions, plane_axes
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Y00, Gaussians, quaternions_of
 
-OPACITY = 0.95
 SPREAD = 0.65  # standard deviation of a disc in units of the spacing: little light leaks between neighbours
-MIN_SCALE, MAX_SCALE = 0.004, 0.12  # of a disc on a sparse point [m]
 
 
 def initial_gaussians(
@@ -66,10 +64,11 @@ def initial_gaussians(
     for plane in planes if len(cameras) else ():
         # 0.02: a sparse point this close to an occupied cell gives way to the plane's own discs
         free &= ~((np.abs(plane.distance(points)) < 0.02) & plane.covers(points))
-    radius = np.full(len(points), MAX_SCALE)
+    min_scale, max_scale = 0.004, 0.12  # of a disc on a sparse point [m]
+    radius = np.full(len(points), max_scale)
     if len(points) > 3:
         gap = cKDTree(points).query(points[free], k=4)[0][:, 1:]
-        radius[free] = np.clip(gap.mean(axis=1), MIN_SCALE, MAX_SCALE)
+        radius[free] = np.clip(gap.mean(axis=1), min_scale, max_scale)
     parts = [(points[free], normals[free], radius[free], colors[free])]
     if len(planes) and len(cameras):
         parts += _blocks(planes, cameras, images, max(count - int(free.sum()), 1))
@@ -87,7 +86,8 @@ def discs(centres: np.ndarray, normals: np.ndarray, radius: np.ndarray, colors: 
     # 0.05: thickness over radius
     scales = np.stack([radius, radius, np.maximum(0.05 * radius, 1e-4)], axis=1)
     sh = ((colors - 0.5) / Y00)[:, None, :]
-    return Gaussians(centres, quaternions_of(rotation), scales, np.full(len(centres), OPACITY), sh)
+    opacity = 0.95
+    return Gaussians(centres, quaternions_of(rotation), scales, np.full(len(centres), opacity), sh)
 
 
 def _blocks(

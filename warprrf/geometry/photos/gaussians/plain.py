@@ -38,13 +38,9 @@ from warprrf.geometry.splats.camera import Camera
 
 SURE_VIEWS, LINE_M = 4, 0.4  # photos and length from which on an edge counts
 FLAT, PLAIN_PX = 0.006, 7  # a pixel is plain where none in a square of this side changes by more than this
-REGION_PX, VOTES_PX = 150, 25.0  # fewest pixels of a plain region, and of its border on a plane
 SAME_M = 0.04  # an edge this close to a plane lies on it
 BEHIND_M = 0.15  # an edge, or a surface, this far behind a plane is behind it
 STRIDE, CELL_M = 4, 0.1  # cells, of this side, look up every so many-th pixel
-AGREEING, PIECE_M2 = 2, 0.1  # fewest photos that put a cell on its plane, and least area of a piece of one
-MIRROR_SHARE = 0.5  # a pane is a mirror when so much of what is seen through it alone has its twin before it,
-MIRROR_M = 10.0  # by length times views, which must come to this [m]
 
 
 class Height(NamedTuple):
@@ -177,6 +173,9 @@ def _mirrors(lines: list[Line], cameras: Sequence[Camera]) -> tuple[list[Pane], 
     """Panes that show a reflection, and the lines that are none."""
     positions = np.array([camera.position for camera in cameras])
     panes: list[Pane] = []
+    # a pane is a mirror when so much of what is seen through it alone has its twin before it,
+    mirror_share = 0.5
+    mirror_m = 10.0  # by length times views, which must come to this [m]
     for axis, height, _, (low, high) in _heights(lines):
         if np.delete(high - low, axis).min() < LINE_M:  # a pane has edges on several sides
             continue
@@ -189,7 +188,7 @@ def _mirrors(lines: list[Line], cameras: Sequence[Camera]) -> tuple[list[Pane], 
             twins = sum(x.weight for x in shown if _has_twin(pane, x, parts))
             behind = sum(x.weight for x in parts if _is_behind(pane, x))
             # A mirror bounds the room: what lies behind it is seen through it alone.
-            if total > max(MIRROR_M, 0.8 * behind) and twins > MIRROR_SHARE * total:
+            if total > max(mirror_m, 0.8 * behind) and twins > mirror_share * total:
                 panes.append(pane)
                 lines = [x for x, only in zip(parts, through, strict=True) if not only]
     return panes, lines
@@ -253,12 +252,13 @@ def _regions_on(
     region, count = ndimage.label(plain & ~ndimage.binary_dilation(barrier, np.ones((3, 3))))
     size = np.bincount(region.ravel(), minlength=count + 1)
     size[0] = 0
-    region = np.where(size[region] >= REGION_PX, region, 0)
+    region_px, votes_px = 150, 25.0  # fewest pixels of a plain region, and of its border on a plane
+    region = np.where(size[region] >= region_px, region, 0)
     votes, weight = _votes(heights, lines, camera, edgels, of_line, region)
     some = slice(STRIDE // 2, None, STRIDE)
     region, rays = region[some, some], camera.directions()[some, some]
     plane, ranges = np.full(region.shape, -1), np.zeros(region.shape)
-    for k in np.flatnonzero(votes.max(axis=1) >= VOTES_PX):
+    for k in np.flatnonzero(votes.max(axis=1) >= votes_px):
         own = region == k
         if not own.any():
             continue
@@ -406,10 +406,12 @@ def _agreed(
         away = np.linalg.norm(cells[own] - camera.position, axis=1)
         yes[own] += here
         no[own] += ~here & (view.range_m[y, x] > away + BEHIND_M)
-    occupied = ((yes >= AGREEING) & (yes > no)).reshape(shape)
+    # fewest photos that put a cell on its plane, and least area of a piece of one
+    agreeing, piece_m2 = 2, 0.1
+    occupied = ((yes >= agreeing) & (yes > no)).reshape(shape)
     label, _ = ndimage.label(occupied)
     size = np.bincount(label.ravel())
-    occupied &= size[label] * CELL_M**2 >= PIECE_M2
+    occupied &= size[label] * CELL_M**2 >= piece_m2
     return [replace(plane, occupied=occupied)] if occupied.any() else []
 
 

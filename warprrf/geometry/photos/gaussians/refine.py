@@ -44,15 +44,10 @@ CHECKPOINT = "warprrf refinement 2"
 
 FINE_FROM, COARSE_PIXELS = 0.8, 100_000
 """Until this share of the iterations squares are twice as wide, and twice again, as long as photos would have more pixels."""
-FULL_FROM = 0.9  # share of the iterations after which photos are taken as they are
-FULL_PIXELS = 400_000  # of larger photos fewer iterations see all, so that they take as long
 SCALE_RATE, QUATERNION_RATE, OPACITY_RATE, COLOR_RATE = 5e-3, 2e-3, 3e-2, 5e-3
 """Of the logarithms of scales, quaternions, logits of opacities and constant colours."""
-PLANE_DISTANCE_M, PLANE_ANGLE_RAD = 0.04, 0.6  # a Gaussian this close to a plane belongs to it
-PLANE_STRENGTH = 0.1  # share of the deviation from its plane removed after every step
 
 PARTS = 1000  # of the work: what progress counts, as iterations become slower when photos are compared larger
-OVERHEAD = 30_000  # pixels that would take as long as what every iteration does besides
 
 
 def refine(
@@ -118,13 +113,14 @@ class _Refinement:
 
     def on_planes(self, arrays: Arrays) -> Arrays:
         """``arrays`` with ``plane_of``, the nearest plane that each Gaussian lies on, -1 for none."""
-        best = np.full(len(arrays["means"]), PLANE_DISTANCE_M)
+        plane_distance_m, plane_angle_rad = 0.04, 0.6  # a Gaussian this close to a plane belongs to it
+        best = np.full(len(arrays["means"]), plane_distance_m)
         owner = np.full(len(best), -1, np.int32)
         means = arrays["means"].astype(np.float64)
         axis = rotations_of(arrays["quaternions"])[:, :, 2]
         for k, plane in enumerate(self.planes):
             distance = np.abs(plane.distance(means))
-            nearer = (distance < best) & (np.abs(axis @ plane.normal) > np.cos(PLANE_ANGLE_RAD))
+            nearer = (distance < best) & (np.abs(axis @ plane.normal) > np.cos(plane_angle_rad))
             nearer[nearer] = plane.covers(means[nearer])
             best[nearer], owner[nearer] = distance[nearer], k
         return {**arrays, "plane_of": owner}
@@ -181,7 +177,9 @@ class _Refinement:
     def scale(self, iteration: int) -> int:
         """Side in pixels of the squares that photos are averaged over."""
         c, scale = self.config, self.config.downscale
-        in_full = (1 - FULL_FROM) * min(1.0, FULL_PIXELS / self.targets.pixels)
+        full_from = 0.9  # share of the iterations after which photos are taken as they are
+        full_pixels = 400_000  # of larger photos fewer iterations see all, so that they take as long
+        in_full = (1 - full_from) * min(1.0, full_pixels / self.targets.pixels)
         if iteration >= c.iterations - round(in_full * c.iterations):
             return 1
         if iteration < FINE_FROM * c.iterations:
@@ -192,7 +190,8 @@ class _Refinement:
     def done(self) -> int:
         """Parts of the work that are behind."""
         sizes = np.array([self.scale(k) for k in range(self.config.iterations)])
-        work = np.cumsum(self.targets.pixels / sizes**2 + OVERHEAD)
+        overhead = 30_000  # pixels that would take as long as what every iteration does besides
+        work = np.cumsum(self.targets.pixels / sizes**2 + overhead)
         return int(PARTS * work[self.iteration - 1] / work[-1]) if self.iteration else 0
 
     def differentiate(self, target: Target) -> wp.array:
@@ -239,7 +238,8 @@ class _Refinement:
             moments = [self.state[f"first.{name}"], self.state[f"second.{name}"]]
             inputs = [width, rate, *optimize.corrections(t), None, None, self.gradients[name], *moments]
             launch(adam, self.count, [*inputs, self.state[name]], device=self.device)
-        strength = PLANE_STRENGTH if t < c.iterations else 1.0  # in the end exactly flat
+        plane_strength = 0.1  # share of the deviation from its plane removed after every step
+        strength = plane_strength if t < c.iterations else 1.0  # in the end exactly flat
         plane = [self.state["plane_of"], self.plane_table, strength, c.thickness_m]
         shape = [self.means, self.quaternions, self.log_scales]
         launch(optimize.pull_to_planes, self.count, [*plane, *shape], device=self.device)

@@ -24,14 +24,8 @@ from warprrf.kernels.photo_consistency import SIDE, patch_agreement
 
 VIEWS = 5  # photos compared
 MIN_ANGLE_DEG = 6.0  # between any two of them, seen from the patch: without parallax every height fits
-PATCH_M = 0.12  # side of a patch
 AGREES, DISAGREES = 0.6, 0.25  # mean correlation of a true patch, and of one that is certainly not
 CONTRAST = 0.012  # patches flatter than this part of white prove nothing
-STEP_M = 0.03  # between heights of the sweep; a patch shows a shift of that much
-REACH_M, LARGE_M2 = 2.5, 3.0  # a plane of this area is extended at most so far
-MIN_CELLS = 15  # of a plane found by the sweep
-SAME_PLANE_M, SAME_PLANE_DEG = 0.02, 3.0  # what lies this close to a larger plane is part of it
-UP_M2, DOWN_M2 = 0.3, 2.0  # least area of a new plane that faces up, or down
 FINE_M = 0.005  # a plane's height is settled in steps of this length
 
 
@@ -41,11 +35,12 @@ def agreement_of(
     """Correlation in [-1, 1] and contrast of the patches at ``centres`` (N, 3) over ``views`` (N, V), -1 padded."""
     n, device = len(centres), photos.device
     result, contrast = (wp.zeros(n, dtype=wp.float32, device=device) for _ in range(2))
+    patch_m = 0.12  # side of a patch
     launch(
         patch_agreement,
         n,
         [
-            wp.array(centres, dtype=wp.vec3, device=device), wp.vec3(*axes[0]), wp.vec3(*axes[1]), PATCH_M / (SIDE - 1),
+            wp.array(centres, dtype=wp.vec3, device=device), wp.vec3(*axes[0]), wp.vec3(*axes[1]), patch_m / (SIDE - 1),
             wp.array(views, dtype=wp.int32, device=device),
             wp.array(projections(photos.cameras), dtype=wp.vec4, device=device), photos.flat,
             wp.array(photos.sizes, dtype=wp.vec3i, device=device), result, contrast,
@@ -111,7 +106,8 @@ def proven_cells(planes: Sequence[Plane], points: np.ndarray, photos: GreyPhotos
 
 
 def _scored(plane: Plane, surface: Mesh | None, points: np.ndarray, photos: GreyPhotos) -> _Scored:
-    reach = int(round(REACH_M / plane.cell_m)) if plane.area() >= LARGE_M2 else 2
+    reach_m, large_m2 = 2.5, 3.0  # a plane of this area is extended at most so far
+    reach = int(round(reach_m / plane.cell_m)) if plane.area() >= large_m2 else 2
     wide = plane.widened(reach)
     full = replace(wide, occupied=dilate(wide.occupied, reach))
     # Photos are chosen once for every 2 x 2 cells.
@@ -165,7 +161,8 @@ def level_planes(
     low, high = np.percentile(points, [0.5, 99.5], axis=0)
     eyes = np.array([c.position[2] for c in photos.cameras])
     bottom, top = (low[2], min(high[2], eyes.max())) if up else (max(low[2], eyes.min()), high[2])
-    levels = np.arange(bottom - 0.06, top + 0.06, STEP_M)
+    step_m = 0.03  # between heights of the sweep; a patch shows a shift of that much
+    levels = np.arange(bottom - 0.06, top + 0.06, step_m)
     if len(levels) < 3:
         return []
     normal = np.array([0.0, 0.0, 1.0 if up else -1.0])
@@ -177,16 +174,17 @@ def level_planes(
     agreement = _swept(whole, levels, surface, photos)
     peak = _peaks(agreement, AGREES) & ~_known(whole, levels, planes)
     found: list[Plane] = []
+    min_cells = 15  # of a plane found by the sweep
     while True:
         votes = ndimage.convolve1d(peak.sum(axis=(1, 2)), [1, 1, 1], mode="constant")
         k = int(votes.argmax())
-        if votes[k] < MIN_CELLS:
+        if votes[k] < min_cells:
             return found
         band = slice(max(0, k - 1), k + 2)
         mask = peak[band].any(axis=0)
         peak[max(0, k - 2) : k + 3] &= ~mask
         mask |= dilate(mask, 1) & (agreement[band].max(axis=0) > 0.8 * AGREES)
-        pieces, count = ndimage.label(_pieces(mask, MIN_CELLS))
+        pieces, count = ndimage.label(_pieces(mask, min_cells))
         for number in range(1, count + 1):  # every connected piece has a height of its own
             piece = replace(whole, offset=float(levels[k] * normal[2]), occupied=pieces == number)
             level = _settled(piece, surface, photos)
@@ -263,7 +261,8 @@ def joined(planes: Sequence[Plane], levels: Sequence[Plane]) -> list[Plane]:
     """``planes`` and ``levels`` with pieces of one plane united; new planes need a least area, a larger one where they
     face down (seen from below, stripes on a wall pass for a soffit)."""
     result = united(planes, levels)
-    least = [UP_M2 if p.normal[2] > 0 else DOWN_M2 for p in result[len(planes) :]]
+    up_m2, down_m2 = 0.3, 2.0  # least area of a new plane that faces up, or down
+    least = [up_m2 if p.normal[2] > 0 else down_m2 for p in result[len(planes) :]]
     large = [p for p, area in zip(result[len(planes) :], least, strict=True) if p.area() >= area]
     return result[: len(planes)] + large
 
@@ -271,11 +270,12 @@ def joined(planes: Sequence[Plane], levels: Sequence[Plane]) -> list[Plane]:
 def united(planes: Sequence[Plane], others: Sequence[Plane]) -> list[Plane]:
     """``planes`` and ``others``, the largest first; those that one before them describes as well only add cells to it."""
     result = list(planes)
+    same_plane_m, same_plane_deg = 0.02, 3.0  # what lies this close to a larger plane is part of it
     for other in sorted(others, key=lambda p: -p.area()):
         cells = other.cells()
         for k, plane in enumerate(result):
-            near = np.abs(plane.distance(cells)).sum() < SAME_PLANE_M * len(cells)
-            if near and plane.normal @ other.normal > np.cos(np.radians(SAME_PLANE_DEG)):
+            near = np.abs(plane.distance(cells)).sum() < same_plane_m * len(cells)
+            if near and plane.normal @ other.normal > np.cos(np.radians(same_plane_deg)):
                 result[k] = _united(plane, other)
                 break
         else:

@@ -19,8 +19,6 @@ from warprrf.geometry.splats.photo_loss import PhotoLoss
 from warprrf.kernels import exposure as kernels
 from warprrf.kernels.ssim import stride_of
 
-MOST_KEPT = 60_000_000  # numbers of photos kept on the device: with their moments 720 MB
-
 
 @dataclass(frozen=True)
 class Target:
@@ -61,7 +59,8 @@ class Targets:
         if view in self.made:
             return self.made[view]
         made = self.make(view, scale)
-        if len(self.made) * made.pixels.size < MOST_KEPT:
+        most_kept = 60_000_000  # numbers of photos kept on the device: with their moments 720 MB
+        if len(self.made) * made.pixels.size < most_kept:
             self.made[view] = made
         return made
 
@@ -85,9 +84,7 @@ class Targets:
         return Target(view, smaller, pixels, weights, self.loss.moments(pixels, (height, width)))
 
 
-KNEE = 0.03  # of the Huber loss, in display values: what differs more is no matter of exposure
 PRIOR = 1e-3  # weight of a gain of one, in squared display values per pixel
-LEAST_STEP = 0.1  # share of the way to the best gain that is taken at least; the first time all of it
 
 
 class Exposures:
@@ -127,10 +124,12 @@ class Exposures:
             return
         height, width, _ = image.shape
         sums = [wp.empty(height, dtype=wp.vec3, device=image.device) for _ in range(2)]
-        inputs = [*self._inputs(image, target), KNEE, *sums]
+        knee = 0.03  # of the Huber loss, in display values: what differs more is no matter of exposure
+        inputs = [*self._inputs(image, target), knee, *sums]
         launch(kernels.gain_sums, height, inputs, device=image.device, grain=16)
         of_photo, of_image = (array.numpy().sum(axis=0, dtype=np.float64) for array in sums)
         prior = PRIOR * height * width
         wanted = np.log((of_photo + prior) / (of_image + prior))
-        share = max(LEAST_STEP, 1 / (1 + visits))
+        least_step = 0.1  # share of the way to the best gain that is taken at least; the first time all of it
+        share = max(least_step, 1 / (1 + visits))
         self.log_gains[target.view] += share * (wanted - self.log_gains[target.view])

@@ -14,10 +14,6 @@ from warprrf.geometry.photos.posed.sparse import SparseModel
 from warprrf.geometry.photos.posed.undistort import stored_pixels
 from warprrf.geometry.splats.camera import Camera
 
-VIEWS = 120  # most maps that are used, spread over all
-NEAR_M = 0.02  # a map shows a point that it measures this near to,
-NEAR_SHARE = 0.02  # or within this part of its range
-
 
 def range_maps(sparse: SparseModel, files: Mapping[str, DepthFile]) -> dict[str, tuple[Camera, np.ndarray]]:
     """Cameras of about the size of their depth images, and Euclidean ranges [m], 0 where unknown; by photo.
@@ -30,7 +26,8 @@ def range_maps(sparse: SparseModel, files: Mapping[str, DepthFile]) -> dict[str,
         ValueError: if a file does not read, or has another shape than its photo.
     """
     found = {}
-    for name in spread((name for name in sparse.cameras if name in files), VIEWS):
+    views = 120  # most maps that are used, spread over all
+    for name in spread((name for name in sparse.cameras if name in files), views):
         depth, camera, lens = read_depth(files[name]), sparse.cameras[name], sparse.lenses[name]
         height, width = depth.shape
         if abs(width / height / (lens.width / lens.height) - 1) > 0.02:
@@ -64,13 +61,15 @@ def with_points(sparse: SparseModel, files: Mapping[str, DepthFile]) -> SparseMo
     points, colors = _cloud(maps, sparse.photos)
     seen = np.zeros((len(points), len(maps)), dtype=bool)
     shown = through = 0
+    near_m = 0.02  # a map shows a point that it measures this near to,
+    near_share = 0.02  # or within this part of its range
     for k, (view, measured) in enumerate(maps.values()):
         here, there = _compared(points, view, measured)
         known = there > 0
         off = there - here
-        seen[:, k] = known & (np.abs(off) < NEAR_M + NEAR_SHARE * here)
+        seen[:, k] = known & (np.abs(off) < near_m + near_share * here)
         shown += int(seen[:, k].sum())
-        through += int((known & (off > NEAR_M + NEAR_SHARE * here)).sum())
+        through += int((known & (off > near_m + near_share * here)).sum())
     shown -= len(points)  # by the map that it comes from
     # 0.5: least share of the points in a map's sight that it shows, over those that it looks through
     if shown < 0.5 * (shown + through):

@@ -11,10 +11,7 @@ from scipy.spatial import cKDTree
 from warprrf.checks import check_array
 from warprrf.geometry.planes import Plane, PlaneConfig, detect_planes
 
-SMALL_POINTS = 16  # fewest points of a small plane, looked for among those that the large ones leave
 NEIGHBOURS = 16  # that a point is compared with
-MIN_TRACK_LENGTH = 3  # photos that see a point which is kept
-DEVIATIONS = 2.5  # by which an outlier is farther from its neighbours than others
 
 
 def neighbours(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -32,7 +29,7 @@ def clean_points(
     """Which points to keep, shape ``(P,)`` bool: seen often enough, reprojected well, not far from all others.
 
     A point is an outlier when its mean distance to its neighbours exceeds the average of that figure over all points
-    by :data:`DEVIATIONS` standard deviations (Rusu et al., "Towards 3D point cloud based object maps", 2008).
+    by 2.5 standard deviations (Rusu et al., "Towards 3D point cloud based object maps", 2008).
 
     Args:
         points: shape ``(P, 3)``.
@@ -45,12 +42,14 @@ def clean_points(
         error = check_array("reprojection_error", reprojection_error, (len(points),))
         # 1.0: of a sparse point that is kept [pixels]
         keep &= error <= 1.0
+    min_track_length = 3  # photos that see a point which is kept
     if track_length is not None:
-        keep &= check_array("track_length", track_length, (len(points),)) >= MIN_TRACK_LENGTH
+        keep &= check_array("track_length", track_length, (len(points),)) >= min_track_length
     chosen = np.flatnonzero(keep)
+    deviations = 2.5  # by which an outlier is farther from its neighbours than others
     if len(chosen) > NEIGHBOURS:
         spacing = neighbours(points[chosen], NEIGHBOURS)[1].mean(axis=1)
-        keep[chosen[spacing > spacing.mean() + DEVIATIONS * spacing.std()]] = False
+        keep[chosen[spacing > spacing.mean() + deviations * spacing.std()]] = False
     return keep
 
 
@@ -102,14 +101,15 @@ def detect_room_planes(
         near = cKDTree(points[plane.inliers]).query(points)[0] < 0.3
         free &= ~(on & near & (plane.distance(viewpoints) > 0))
     rest = np.flatnonzero(free)
-    if len(rest) < SMALL_POINTS:
+    small_points = 16  # fewest points of a small plane, looked for among those that the large ones leave
+    if len(rest) < small_points:
         return large
     again = estimate_normals(points[rest], viewpoints[rest], neighbour_count=10)
-    small = detect_planes(points[rest], again, config=replace(config, min_points=SMALL_POINTS), seed=seed)
+    small = detect_planes(points[rest], again, config=replace(config, min_points=small_points), seed=seed)
     compact = []
     for plane in small:
         own = points[rest[plane.inliers]]
         close = np.linalg.norm(own - np.median(own, axis=0), axis=1) < 1.5
-        if close.sum() >= SMALL_POINTS and close.mean() > 0.6:
+        if close.sum() >= small_points and close.mean() > 0.6:
             compact.append(replace(plane, inliers=rest[plane.inliers[close]]))
     return large + compact

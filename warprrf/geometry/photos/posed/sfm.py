@@ -56,16 +56,13 @@ from warprrf.tensor_files import named as naming
 VERSIONS = {"features": 3, "matches": 2, "model": 4, "photos": 1}
 """Of the steps: counted up by whoever changes what a step computes."""
 
-LEAST_PIXELS = 10_000  # of max_pixels
 
 # Above this many pairs matching them all takes minutes; a coarse comparison then picks the pairs worth matching.
 MAX_EXHAUSTIVE_PAIRS = 2000
-COARSE_FEATURES = 300  # the largest features of a photo take part in the coarse comparison
 COARSE_NEIGHBOURS = 16  # pairs kept for a photo; on the lobby 24 takes half as long again for the same errors
 PEAK_THRESHOLD = 0.002
 """COLMAP's 0.0067 finds too little on bare and dark walls: of a walk through a dim lounge, 125 frames of 540 x 360, 0.004 poses 116
 whose depths differ by 7 cm between distant photos, this 119 and 3 cm; 0.001 is as good and dearer."""
-IN_ORDER = (1, 2, 4, 8)  # photos so many places apart by name, as a film has them, are always matched
 FEWEST_FEATURES = 8  # of a photo that can be matched
 FEWEST_MATCHES = 15  # of a pair that COLMAP counts as matched
 LENIENT = {
@@ -75,8 +72,6 @@ LENIENT = {
 """Of COLMAP's mapper, where its own limits leave photos without a pose: of a film of monitors and desks they pose 7 of 25, these
 22; the largest model of 125 frames of a walk through a lounge has 44 photos by them, 118 by these. Taken alone, these put a
 photo of ten into a wrong place where COLMAP's own leave it out."""
-EXTRACT_BATCH = 12
-MATCH_BATCH = 400
 
 
 def structure_from_motion(
@@ -115,7 +110,8 @@ def structure_from_motion(
     lens = config.lens
     check_choice("lens", lens, LENSES)
     max_features = check_count("max_features", config.max_features, 100)
-    max_pixels = check_count("max_pixels", config.max_pixels, LEAST_PIXELS)
+    least_pixels = 10_000  # of max_pixels
+    max_pixels = check_count("max_pixels", config.max_pixels, least_pixels)
     everything = named = find_photos(photos)
     colmap = load_colmap()
     known: Any = None
@@ -341,12 +337,13 @@ def _extract(
     extraction = colmap.FeatureExtractionOptions(use_gpu=False, max_image_size=1600)
     extraction.sift.max_num_features = max_features
     extraction.sift.peak_threshold = PEAK_THRESHOLD
-    for start in range(0, len(names), EXTRACT_BATCH):
+    extract_batch = 12
+    for start in range(0, len(names), extract_batch):
         attempt.progress("features", start, len(names))
         colmap.extract_features(
             working,
             images,
-            image_names=names[start : start + EXTRACT_BATCH],
+            image_names=names[start : start + extract_batch],
             camera_mode=colmap.CameraMode.AUTO,
             reader_options=reader,
             extraction_options=extraction,
@@ -390,9 +387,10 @@ def _match(colmap: ModuleType, folder: Path, names: list[str], seed: int, attemp
     matching = colmap.FeatureMatchingOptions(use_gpu=False)
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
-    for start in range(0, len(chosen), MATCH_BATCH):
+    match_batch = 400
+    for start in range(0, len(chosen), match_batch):
         attempt.progress("matching", start, len(chosen))
-        listing.write_text("".join(f"{a} {b}\n" for a, b in chosen[start : start + MATCH_BATCH]))
+        listing.write_text("".join(f"{a} {b}\n" for a, b in chosen[start : start + match_batch]))
         colmap.match_image_pairs(
             working,
             matching_options=matching,
@@ -412,22 +410,23 @@ def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[
     """
     ids = {i.name: i.image_id for i in database.read_all_images()}
     descriptors = []
+    coarse_features = 300  # the largest features of a photo take part in the coarse comparison
     for name in names:
         d = np.asarray(database.read_descriptors(ids[name]).data, dtype=np.float32)
         k = database.read_keypoints(ids[name])  # x, y and the 2x2 shape
         area = np.abs(k[:, 2] * k[:, 5] - k[:, 3] * k[:, 4])
-        d = d[np.argsort(-area, kind="stable")[:COARSE_FEATURES]]
+        d = d[np.argsort(-area, kind="stable")[:coarse_features]]
         descriptors.append(d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-9))
     votes = np.zeros((len(names), len(names)))
     fewest = min(len(d) for d in descriptors)
-    if fewest < COARSE_FEATURES:  # pad, so that all photos go through one product; zeros match nothing
-        descriptors = [np.pad(d, ((0, COARSE_FEATURES - len(d)), (0, 0))) for d in descriptors]
+    if fewest < coarse_features:  # pad, so that all photos go through one product; zeros match nothing
+        descriptors = [np.pad(d, ((0, coarse_features - len(d)), (0, 0))) for d in descriptors]
     stack = np.stack(descriptors)
     for i in range(len(names) - 1):
         report("comparing", i, len(names))
         # One product of photo i with all later ones, shape (features of i, photos, features of j).
         cosine = (stack[i] @ stack[i + 1 :].reshape(-1, stack.shape[2]).T).reshape(
-            COARSE_FEATURES, -1, COARSE_FEATURES
+            coarse_features, -1, coarse_features
         )
         back = cosine.argmax(axis=0)
         first = cosine.argmax(axis=2)[..., None]
@@ -435,7 +434,7 @@ def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[
         np.put_along_axis(cosine, first, -1.0, axis=2)
         distinct = (1 - top) < 0.64 * (1 - cosine.max(axis=2))  # Lowe's ratio 0.8, on squared distances
         first = first[..., 0]
-        mutual = np.take_along_axis(back, first.T, axis=1).T == np.arange(COARSE_FEATURES)[:, None]
+        mutual = np.take_along_axis(back, first.T, axis=1).T == np.arange(coarse_features)[:, None]
         votes[i, i + 1 :] = (distinct & mutual & (top > 0.5)).sum(axis=0)
     votes += votes.T
     report("comparing", len(names), len(names))
@@ -443,7 +442,8 @@ def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[
     order = np.argsort(-votes, axis=1, kind="stable")[:, :COARSE_NEIGHBOURS]
     np.put_along_axis(keep, order, True, axis=1)
     keep &= votes >= 4
-    for apart in IN_ORDER:
+    in_order = (1, 2, 4, 8)  # photos so many places apart by name, as a film has them, are always matched
+    for apart in in_order:
         step = np.arange(len(names) - apart)
         keep[step, step + apart] = True
     keep |= keep.T

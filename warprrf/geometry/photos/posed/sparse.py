@@ -18,9 +18,6 @@ from warprrf.geometry.photos.posed.photo_files import match_names, some
 from warprrf.geometry.photos.posed.undistort import Lens
 from warprrf.geometry.splats.camera import Camera
 
-# Without surveyed positions the scale is unknown: the median distance from a camera to a point it sees becomes this.
-ASSUMED_DISTANCE_M = 3.0
-
 
 @dataclass(frozen=True)
 class SparseModel:
@@ -197,8 +194,10 @@ def assume_scale(sparse: SparseModel) -> SparseModel:
     gap = np.linalg.norm(
         np.repeat(sparse.points, sparse.track_length, axis=0) - positions[sparse.track_camera], axis=1
     )
-    scale = ASSUMED_DISTANCE_M / float(np.median(gap)) if len(gap) else 1.0
-    said = f"scale: nobody measured one; the median distance that photos look is taken for {ASSUMED_DISTANCE_M:g} m"
+    # Without surveyed positions the scale is unknown: the median distance from a camera to a point it sees becomes this.
+    assumed_distance_m = 3.0
+    scale = assumed_distance_m / float(np.median(gap)) if len(gap) else 1.0
+    said = f"scale: nobody measured one; the median distance that photos look is taken for {assumed_distance_m:g} m"
     moved = transformed(sparse, scale, np.eye(3), np.zeros(3))
     return replace(moved, guessed=(*sparse.guessed, said))
 

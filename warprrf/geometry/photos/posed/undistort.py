@@ -32,8 +32,6 @@ COEFFICIENTS = {
 }  # fmt: skip
 """COLMAP's lens models that are known here, and how many distortion coefficients each has."""
 
-JPEG_QUALITY = 95
-
 
 @checked
 @dataclass(frozen=True)
@@ -147,7 +145,8 @@ def load_colmap() -> Any:
 
 def _save(picture: Any, target: Path) -> None:
     jpeg = target.suffix.lower() in (".jpg", ".jpeg")
-    picture.save(target, **({"quality": JPEG_QUALITY, "subsampling": 0} if jpeg else {}))
+    jpeg_quality = 95
+    picture.save(target, **({"quality": jpeg_quality, "subsampling": 0} if jpeg else {}))
 
 
 def colmap_camera(lens: Lens, number: int = 1) -> Any:
@@ -215,8 +214,6 @@ FREE_MODEL = "SIMPLE_RADIAL"  # of the mapping where it is free: one coefficient
 CANDIDATES = (("SIMPLE_PINHOLE", False), ("SIMPLE_RADIAL", False), ("RADIAL", True), ("OPENCV", True))
 """Models tried, the simplest first, and whether the principal point is estimated with them."""
 
-WORTH = 0.01  # of the reprojection error: on photos without distortion the richest model gains 0.0001
-
 
 def choose_lens(colmap: ModuleType, model: Path, lens: str) -> Any:
     """The COLMAP model in the folder ``model``, adjusted with the lens that its photos need.
@@ -227,7 +224,8 @@ def choose_lens(colmap: ModuleType, model: Path, lens: str) -> Any:
     tried: Sequence[tuple[str, bool]] = CANDIDATES if lens == "auto" else ((lens, False), (lens, True))
     *simpler, richest = tried
     best = _adjusted(colmap, model, *richest)
-    enough = (1 + WORTH) * best.compute_mean_reprojection_error()
+    worth = 0.01  # of the reprojection error: on photos without distortion the richest model gains 0.0001
+    enough = (1 + worth) * best.compute_mean_reprojection_error()
     for kind, principal_point in simpler:
         found = _adjusted(colmap, model, kind, principal_point)
         if found.compute_mean_reprojection_error() <= enough:

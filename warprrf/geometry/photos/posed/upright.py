@@ -22,17 +22,7 @@ from warprrf.geometry.photos.posed.sparse import SparseModel, transformed
 from warprrf.geometry.planes import Plane, PlaneConfig
 from warprrf.geometry.splats.camera import Camera
 
-PHOTOS = 40  # looked at for edges, spread over all
-EDGE_PIXELS = 480  # about the longer side of a photo while its edges are looked for
-STRAIGHT = 0.9  # least coherence of gradients round a pixel of an edge
-CONTRAST = 0.01  # least slope there [white/pixel]
 NEAR_DEG = 25.0  # the vertical is this near to the photos' own up
-WINDOWS_DEG = (12, 8, 5, 3, 2, 1.5, 1, 0.7, 0.5, 0.5, 0.5)  # standard deviations of the window, in turn
-PROVEN = 1.3  # density of edges within 1 degree of the vertical over that from 4 to 10 degrees; of clutter: 1
-PLANE_DEG = (4.0, 2.0, 1.0, 0.7, 0.7)  # of the window for planes, in turn
-FLOOR_M = 0.05  # thickness of a level surface
-FLOOR_SHARE = 0.1  # least points of a floor, over those of the largest level
-BELOW_SHARE = 0.01  # of all points may lie beneath a floor
 
 
 def upright(sparse: SparseModel, photo: Callable[[str], np.ndarray], *, seed: int = 0) -> SparseModel:
@@ -96,31 +86,38 @@ def vertical_of_edges(
         photo: reads a photo by its name, ``(H, W, 3)`` in [0, 1].
     """
     held = held_up(list(cameras.values()))
-    normals = np.concatenate([_edge_planes(photo(name), cameras[name]) for name in spread(cameras, PHOTOS)])
+    photos = 40  # looked at for edges, spread over all
+    normals = np.concatenate([_edge_planes(photo(name), cameras[name]) for name in spread(cameras, photos)])
     normals = normals[np.abs(normals @ held) < np.sin(np.radians(NEAR_DEG))]
     if len(normals) < 100:
         return held, False
     up = held
-    for window in WINDOWS_DEG:
+    windows_deg = (12, 8, 5, 3, 2, 1.5, 1, 0.7, 0.5, 0.5, 0.5)  # standard deviations of the window, in turn
+    for window in windows_deg:
         weight = np.exp(-0.5 * (normals @ up / np.sin(np.radians(window))) ** 2)
         found = np.linalg.eigh((normals * weight[:, None]).T @ normals)[1][:, 0]
         up = found if found @ up > 0 else -found
     off = np.degrees(np.arcsin(np.minimum(np.abs(normals @ up), 1.0)))
-    sharp = (off < 1).sum() > PROVEN * ((off > 4) & (off < 10)).sum() / 6
+    # density of edges within 1 degree of the vertical over that from 4 to 10 degrees; of clutter: 1
+    proven = 1.3
+    sharp = (off < 1).sum() > proven * ((off > 4) & (off < 10)).sum() / 6
     near = up @ held > np.cos(np.radians(NEAR_DEG))
     return (up, True) if sharp and near else (held, False)
 
 
 def _edge_planes(photo: np.ndarray, camera: Camera) -> np.ndarray:
     """Unit normals in the world of the planes that a photo's straight edges span with its centre, shape ``(E, 3)``."""
-    step = max(1, round(max(photo.shape[:2]) / EDGE_PIXELS))
+    edge_pixels = 480  # about the longer side of a photo while its edges are looked for
+    step = max(1, round(max(photo.shape[:2]) / edge_pixels))
     grey = require("skimage.measure", extra="photos").block_reduce(photo.mean(axis=2), step, np.mean)
     grey = ndimage.gaussian_filter(grey[: photo.shape[0] // step, : photo.shape[1] // step], 0.8)
     gy, gx = (ndimage.sobel(grey, axis) / 8 for axis in (0, 1))
     xx, xy, yy = (ndimage.gaussian_filter(product, 2.0) for product in (gx * gx, gx * gy, gy * gy))
     spread = np.hypot(xx - yy, 2 * xy)
     slope, across = np.hypot(gx, gy), 0.5 * np.arctan2(2 * xy, xx - yy)
-    rows, columns = np.nonzero((slope > CONTRAST) & (spread > STRAIGHT * (xx + yy)))
+    straight = 0.9  # least coherence of gradients round a pixel of an edge
+    contrast = 0.01  # least slope there [white/pixel]
+    rows, columns = np.nonzero((slope > contrast) & (spread > straight * (xx + yy)))
     nx, ny = np.cos(across[rows, columns]), np.sin(across[rows, columns])
     beside = [
         ndimage.map_coordinates(slope, [rows + s * ny, columns + s * nx], order=1, mode="nearest")
@@ -150,7 +147,8 @@ def _vertical_of_planes(up: np.ndarray, planes: Iterable[Plane]) -> np.ndarray:
     """``up`` corrected by planes that are nearly level or nearly upright, each by its number of points."""
     normals = np.array([p.normal for p in planes]).reshape(-1, 3)
     count = np.array([len(p.inliers) for p in planes], dtype=np.float64)
-    for window in PLANE_DEG:
+    plane_deg = (4.0, 2.0, 1.0, 0.7, 0.7)  # of the window for planes, in turn
+    for window in plane_deg:
         along = normals @ up
         level = np.abs(along) > 0.5
         off = np.where(level, np.sqrt(np.maximum(1 - along**2, 0.0)), along)
@@ -171,15 +169,18 @@ def floor_height(
     eyes = float(np.median([c.position @ up for c in cameras]))
     heights = points @ up
     levels: list[tuple[float, int]] = []
+    floor_m = 0.05  # thickness of a level surface
     for plane in planes:
         if plane.normal @ up > np.cos(np.radians(5.0)):
             height = float(np.median(heights[plane.inliers]))
             if height < eyes:
-                near = np.abs(heights[plane.inliers] - height) < FLOOR_M
+                near = np.abs(heights[plane.inliers] - height) < floor_m
                 levels.append((height, int(near.sum())))
     most = max((count for _, count in levels), default=0)
+    floor_share = 0.1  # least points of a floor, over those of the largest level
+    below_share = 0.01  # of all points may lie beneath a floor
     for height, count in sorted(levels):
-        beneath = (heights < height - 2 * FLOOR_M).mean()
-        if count >= FLOOR_SHARE * most:
-            return height if beneath <= BELOW_SHARE else None
+        beneath = (heights < height - 2 * floor_m).mean()
+        if count >= floor_share * most:
+            return height if beneath <= below_share else None
     return None

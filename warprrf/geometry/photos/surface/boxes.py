@@ -18,16 +18,11 @@ from warprrf.geometry.planes import Plane
 from warprrf.geometry.splats.camera import Camera
 
 CELL_M, MARGIN_M = 0.1, 0.3  # largest side of a box, and space kept around the mesh
-SURE_VOTES = 10.0  # votes that make half a certainty
 BEHIND = 2.0  # votes that a hit on a plane is worth: far more certain than a line of sight through a box
 CAPACITY = 10_000  # the flow is in whole numbers: so many for a square metre
 FINE_M = 0.002  # boxes are looked up in tables of this step: much faster than a search, and fine enough for evidence
 STRIDE = 5  # every so many-th row and column of the depth maps is used
-SNAP_M = 0.12  # a depth agrees with the mesh when both are this close
-STEP_M = 0.06  # spacing of samples along lines of sight
 BESIDE_M = 0.006  # a hit votes for the boxes this far before and behind its plane: within the thinnest board
-RIM_M, RIM_SHARE = 0.6, 0.25  # a side is closed when planes this near to it cover so much of it
-RAYS_AT_ONCE = 20_000
 
 
 @dataclass(frozen=True)
@@ -122,8 +117,9 @@ def least_surface(grid: Grid, free: np.ndarray, solid: np.ndarray, closed: np.nd
     # 0.3: votes by which a box that nobody saw leans to solid
     # 0.05: share of the lines of sight that go astray: so many votes of a neighbour count for nothing
     against = BEHIND * solid + 0.3 + 0.05 * beside * volume
+    sure_votes = 10.0  # votes that make half a certainty
     # 0.6: cost of a box that goes against all its votes, per square metre of its sides
-    cost = 0.6 * around * (free - against) / (free + against + SURE_VOTES)
+    cost = 0.6 * around * (free - against) / (free + against + sure_votes)
     for a in range(3):
         for end, is_closed in zip((0, -1), closed[a], strict=True):
             rim = np.moveaxis(cost, a, 0)
@@ -209,7 +205,8 @@ def votes(
     """
     o, d, ranges = _lines_of_sight(cameras, depths, STRIDE)
     hit = mesh.cast(o, d)
-    agree = hit.valid & (np.abs(np.where(hit.valid, hit.t, 0.0) - ranges) < SNAP_M)
+    snap_m = 0.12  # a depth agrees with the mesh when both are this close
+    agree = hit.valid & (np.abs(np.where(hit.valid, hit.t, 0.0) - ranges) < snap_m)
     o, d, ranges, t, face = o[agree], d[agree], ranges[agree], hit.t[agree], hit.face[agree]
     axis, sign, height = faces.axis[face], faces.sign[face], faces.height[face]
     normal = sign[:, None] * grid.axes[axis]
@@ -217,19 +214,21 @@ def votes(
     on = (axis >= 0) & (cosine > 0.05)
     slope = np.where(on, cosine, 1.0)
     t_plane = (np.einsum("ni,ni->n", o, normal) - sign * height) / slope
-    on &= np.abs(t_plane - ranges) < SNAP_M / np.maximum(slope, 0.3)
+    on &= np.abs(t_plane - ranges) < snap_m / np.maximum(slope, 0.3)
     # 0.1: a line of sight proves nothing this close to an end that lies on no plane
     end = np.where(on, t_plane - BESIDE_M / slope, np.minimum(ranges, t) - 0.1)
     point = (o + t_plane[:, None] * d)[on]
     free = grid.count(point + BESIDE_M * normal[on]).astype(float)
     solid = grid.count(point - BESIDE_M * normal[on]).astype(float)
+    step_m = 0.06  # spacing of samples along lines of sight
     # A sample in the middle of each step along the line. Nothing is drawn: one line more or less changes one vote.
-    counts = np.ceil(np.maximum(end, 0) / STEP_M - 0.5).astype(np.int64)
-    for first in range(0, len(o), RAYS_AT_ONCE):
-        count = counts[first : first + RAYS_AT_ONCE]
+    counts = np.ceil(np.maximum(end, 0) / step_m - 0.5).astype(np.int64)
+    rays_at_once = 20_000
+    for first in range(0, len(o), rays_at_once):
+        count = counts[first : first + rays_at_once]
         ray = np.repeat(np.arange(first, first + len(count)), count)
         step = np.arange(len(ray)) - np.repeat(np.cumsum(count) - count, count)
-        free += grid.count(o[ray] + ((step + 0.5) * STEP_M)[:, None] * d[ray])
+        free += grid.count(o[ray] + ((step + 0.5) * step_m)[:, None] * d[ray])
     return free, solid
 
 
@@ -262,11 +261,12 @@ def closed_sides(grid: Grid, mesh: Mesh, faces: FaceLevels) -> np.ndarray:
     """Whether planes cover the lower and upper end of each direction, seen from within, shape ``(3, 2)`` bool."""
     closed = np.zeros((3, 2), dtype=bool)
     extent = [h[-1] - h[0] for h in grid.heights]
+    rim_m, rim_share = 0.6, 0.25  # a side is closed when planes this near to it cover so much of it
     for a in range(3):
         across = extent[(a + 1) % 3] * extent[(a + 2) % 3]
         for k, (end, sign) in enumerate(((grid.heights[a][0], 1), (grid.heights[a][-1], -1))):
-            own = (faces.axis == a) & (faces.sign == sign) & (np.abs(faces.height - end) < RIM_M)
-            closed[a, k] = mesh.areas[own].sum() > RIM_SHARE * across
+            own = (faces.axis == a) & (faces.sign == sign) & (np.abs(faces.height - end) < rim_m)
+            closed[a, k] = mesh.areas[own].sum() > rim_share * across
     return closed
 
 

@@ -40,9 +40,6 @@ from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.planes import Plane, directions
 from warprrf.geometry.splats.camera import Camera
 
-KEEP_M = 0.12  # pieces of the old mesh this far from every known plane are kept,
-KEEP_M2 = 0.3  # if they are this large
-GAP_M = 2.0  # gaps narrower than this are closed
 CELL_M, LEAST_M2 = 0.05, 0.3  # side of a cell, and least area of a plane that is looked at
 VIEWS = 40  # photos that are asked what they see through a gap
 
@@ -105,16 +102,18 @@ def _with_rest(
     new, old = whole.mesh, patches.mesh
     centres = old.triangles.mean(axis=1)
     rest = faces.axis < 0
+    keep_m = 0.12  # pieces of the old mesh this far from every known plane are kept,
     if known.any():
-        rest[rest] = Mesh(new.vertices, new.faces[known]).distance(centres[rest]) > KEEP_M
+        rest[rest] = Mesh(new.vertices, new.faces[known]).distance(centres[rest]) > keep_m
     piece = connected_pieces(old, np.where(rest, 0, -1))
-    rest &= np.bincount(piece, weights=old.areas * rest)[piece] >= KEEP_M2
+    keep_m2 = 0.3  # if they are this large
+    rest &= np.bincount(piece, weights=old.areas * rest)[piece] >= keep_m2
     if not rest.any():
         return whole
     stays = known.copy()
     if not known.all():
         steps = new.triangles[~known].mean(axis=1)
-        stays[~known] = Mesh(old.vertices, old.faces[rest]).distance(steps) > KEEP_M
+        stays[~known] = Mesh(old.vertices, old.faces[rest]).distance(steps) > keep_m
     corners = np.concatenate([new.faces[stays], old.faces[rest] + len(new.vertices)])
     used, corners = np.unique(corners, return_inverse=True)
     own = patches.face_patch[rest]
@@ -162,8 +161,9 @@ def _gaps(patches: PlanarPatches, k: int, points: np.ndarray) -> Plane:
     """The plane of patch ``k``, on whose faces ``points`` lie, with the cells of its gaps."""
     plane = Plane(patches.normal[k], float(patches.offset[k]), np.zeros(0, dtype=np.int64), cell_m=CELL_M)
     uv = plane.to_plane(points)
-    reach = 0.5 * GAP_M / CELL_M
-    low = uv.min(axis=0) - 0.5 * GAP_M - CELL_M
+    gap_m = 2.0  # gaps narrower than this are closed
+    reach = 0.5 * gap_m / CELL_M
+    low = uv.min(axis=0) - 0.5 * gap_m - CELL_M
     shape = np.ceil((uv.max(axis=0) - low) / CELL_M + reach + 1).astype(int)
     grid = replace(plane, corner=low, occupied=np.zeros(shape, dtype=bool))
     own = grid.count(points) > 0

@@ -39,16 +39,9 @@ from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.render import render
 
 VIEWS = 120  # most depth maps that are fused, spread over all cameras
-ALPHA = 0.6  # a depth counts where at least so much light is blocked,
-DEPTH_SPREAD = 0.05  # and where blended depth and dominant Gaussian differ by no more than this part
-VOXEL_PIXELS = 5.0  # widest voxel, in pixels of the depth maps at their median range
 EDGE_TOLERANCE = 8.0
 """A pixel is left out where inverse depth bends by more than this part of itself, per focal length in pixels: on a plane
 it is linear in the image, in a corner it bends, across an occluding edge it jumps."""
-MIN_VIEWS = 2  # a surface is kept where at least this many depth maps saw it; three leave half as many holes again on films
-TOUCHED = (
-    4  # Open3D looks for blocks along every so many-th row and column, and refuses a map that shows none
-)
 BLOCK_VOXELS, BLOCKS = 16, 20_000  # voxels along a block's side; blocks set aside at first, the grid grows
 
 
@@ -80,12 +73,14 @@ def depth_maps(
     config = config or ReconstructionConfig()
     report = progress or (lambda stage, done, total: None)
     views, depths = depth_views(cameras, config.surface), []
+    alpha = 0.6  # a depth counts where at least so much light is blocked,
+    depth_spread = 0.05  # and where blended depth and dominant Gaussian differ by no more than this part
     for k, view in enumerate(views):
         report("depth", k, len(views))
         out = render(gaussians, view, features=np.zeros((len(gaussians), 1), dtype=np.float32), device=device)
         with np.errstate(invalid="ignore"):
-            agree = np.abs(out.depth - out.peak) <= DEPTH_SPREAD * out.peak
-        depths.append(np.where(agree & (out.alpha >= ALPHA), out.depth, 0.0))
+            agree = np.abs(out.depth - out.peak) <= depth_spread * out.peak
+        depths.append(np.where(agree & (out.alpha >= alpha), out.depth, 0.0))
     report("depth", len(views), len(views))
     if photos is None or not config.stereo:
         return depths
@@ -169,7 +164,8 @@ def _with_voxels(
     pixel_m = [np.median(d[d > 0]) / v.fx for v, d in zip(views, depths, strict=True) if (d > 0).any()]
     if not pixel_m:
         return config
-    return replace(config, voxel_m=min(config.voxel_m, VOXEL_PIXELS * float(np.median(pixel_m))))
+    voxel_pixels = 5.0  # widest voxel, in pixels of the depth maps at their median range
+    return replace(config, voxel_m=min(config.voxel_m, voxel_pixels * float(np.median(pixel_m))))
 
 
 def fuse_depth(
@@ -195,13 +191,15 @@ def fuse_depth(
         ("tsdf", "weight"), (core.float32, core.float32), ((1,), (1,)), config.voxel_m, BLOCK_VOXELS, BLOCKS
     )
     filled = False
+    # Open3D looks for blocks along every so many-th row and column, and refuses a map that shows none
+    touched = 4
     for k, (given, camera) in enumerate(zip(depths, cameras, strict=True)):
         if camera.kind != "pinhole":
             raise ValueError(f"cameras[{k}]: got a {camera.kind} camera, expected pinhole cameras")
         depth = check_array(f"depths[{k}]", given, (camera.height, camera.width), np.float64, finite=False)
         z = range_to_depth(np.where(np.isfinite(depth), depth, 0.0), camera)
         z[(depth >= config.max_range_m) | ~_smooth(z, EDGE_TOLERANCE / camera.fx)] = 0.0
-        if not (z[::TOUCHED, ::TOUCHED] > 0).any():
+        if not (z[::touched, ::touched] > 0).any():
             continue
         image = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(z, dtype=np.float32)))
         # The grid reads the pixel that a voxel's projection falls into: pixel centres at +0.5, as ours.
@@ -211,7 +209,8 @@ def fuse_depth(
         blocks = grid.compute_unique_block_coordinates(image, lens, pose, *limits)
         grid.integrate(blocks, image, lens, pose, *limits)
         filled = True
-    raw = grid.extract_triangle_mesh(MIN_VIEWS - 0.5).to_legacy() if filled else None
+    min_views = 2  # a surface is kept where at least this many depth maps saw it; three leave half as many holes again on films
+    raw = grid.extract_triangle_mesh(min_views - 0.5).to_legacy() if filled else None
     if raw is None or len(raw.triangles) == 0:
         raise ValueError("depths: no surface came out; are the maps ranges in metres and the poses right?")
     return _without_debris(_ordered(o3d, raw), config)

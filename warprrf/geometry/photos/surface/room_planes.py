@@ -16,7 +16,6 @@ EXACT_DEG, STRONG_M2 = 0.1, 2.0
 """A plane this parallel, with a proven area above the second, keeps its own tilt (0.1 degrees are 2 cm over 12 m): it is
 fitted better than the directions are."""
 SAME_SIDE_M = 0.035  # planes facing one way and closer than this are two fits of one surface
-GATHER_M2, GATHER_M = 0.08, 0.03  # so much area of left-over faces within so much height makes one more plane
 
 
 class Level(NamedTuple):
@@ -109,6 +108,8 @@ def _gatherings(
     """Levels on which the faces that no patch took gather, and their faces; known levels take theirs first."""
     facing = smoothed_normals(mesh, 3) @ axes.T
     heights = mesh.triangles.mean(axis=1) @ axes.T
+    # so much area of left-over faces within so much height makes one more plane
+    gather_m2, gather_m = 0.08, 0.03
     for axis in range(3):
         for sign in (1, -1):
             own = np.flatnonzero((found.axis < 0) & (sign * facing[:, axis] > np.cos(np.radians(25.0))))
@@ -118,12 +119,12 @@ def _gatherings(
                 own = own[~near]
             own = own[np.argsort(heights[own, axis], kind="stable")]
             x, area = heights[own, axis], mesh.areas[own]
-            last = np.searchsorted(x, x + GATHER_M, side="right")
+            last = np.searchsorted(x, x + gather_m, side="right")
             while len(own):
                 total = np.concatenate([[0.0], np.cumsum(area)])
                 gathered = total[last] - total[:-1]
                 k = int(gathered.argmax())
-                if gathered[k] < GATHER_M2:
+                if gathered[k] < gather_m2:
                     break
                 height = float(x[k : last[k]] @ area[k : last[k]] / gathered[k])
                 gap = np.abs(x - height)

@@ -25,8 +25,6 @@ from warprrf.kernels.segments import cut
 
 COARSENESS = 60.0  # of the segments: scikit-image's ``scale``, of colours from 0 to 255
 BLUR_PX, LEAST_PX = 0.6, 80  # before a photo is cut, and pixels of the smallest segment
-PROVED_PX, PROVED_SHARE = 15, 0.04  # so many pixels of a segment, and such a part of it, must be proved
-TOLERANCE = 0.02  # a depth that differs from a plane's by less than this part lies on it
 TRIALS, DRAWN = 48, 300  # planes through three proved pixels, and pixels that they are judged by
 UNSURE = 0.02  # where a plane's standard deviation is larger than this part of the depth, it says nothing
 NEAR = 0.12  # proved depths that differ by more than this part from the plane are something else, and stay
@@ -48,9 +46,10 @@ def with_segments(
     inverse = np.where(depth.ravel() > 0, 1 / np.maximum(depth.ravel(), 1e-9), 0.0)
     result, sure = depth.flatten(), proved.ravel()
     order = np.argsort(segment, kind="stable")
+    proved_px, proved_share = 15, 0.04  # so many pixels of a segment, and such a part of it, must be proved
     for pixels in np.split(order, np.flatnonzero(np.diff(segment[order])) + 1):
         own = pixels[sure[pixels]]
-        if len(own) < max(PROVED_PX, PROVED_SHARE * len(pixels)):
+        if len(own) < max(proved_px, proved_share * len(pixels)):
             continue
         found = _plane(rays[own], inverse[own], np.random.default_rng(int(pixels[0])))
         if found is None:
@@ -105,12 +104,13 @@ def _plane(
     volume = (corner[:, 0] * across[:, 0]).sum(axis=1)
     tried = (inverse[three][:, None] @ across)[:, 0] / np.where(volume == 0, 1.0, volume)[:, None]
     off = np.abs(tried @ rays[drawn].T / inverse[drawn] - 1)
-    plane = tried[(off < TOLERANCE).sum(axis=1).argmax()]
+    tolerance = 0.02  # a depth that differs from a plane's by less than this part lies on it
+    plane = tried[(off < tolerance).sum(axis=1).argmax()]
     for _ in range(4):
-        weighted = rays / (inverse * (1 + ((rays @ plane / inverse - 1) / TOLERANCE) ** 2))[:, None] ** 2
+        weighted = rays / (inverse * (1 + ((rays @ plane / inverse - 1) / tolerance) ** 2))[:, None] ** 2
         plane = np.linalg.solve(_regular(weighted.T @ rays), weighted.T @ inverse)
     left = rays @ plane - inverse
-    on = np.abs(left) < TOLERANCE * inverse
+    on = np.abs(left) < tolerance * inverse
     # 0.4: part of the proved depths of a segment that must lie on its plane
     if on.mean() < 0.4:
         return None

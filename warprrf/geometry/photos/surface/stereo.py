@@ -21,15 +21,11 @@ from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.patch_match import UNKNOWN, Others, match
 from warprrf.kernels.photo_consistency import count_votes
 
-GOOD_ANGLE_DEG = 9.0  # between two lines of sight: less tells depths badly, more changes what a window shows
-SOURCES = 3  # photos that one is compared with
 ROUNDS = ((range(3), 0.0), (range(3, 4), 0.3))
 """Turns in which planes are handed on between pixels, finer and finer ones, and what it costs to contradict another photo's
 plane in full: first photos alone, then each knows what the others found."""
-SETTLED = 0.05  # a plane of less cost (one minus a correlation) stays as it is
 PROVED = 0.6  # planes of more cost prove nothing
 CHECKED = 8  # maps of other photos that a depth is checked against
-TOLERANCE = 0.015  # up to this part of the range two depths that photos found agree; one of Gaussians, up to twice as much
 
 
 def mended(
@@ -55,7 +51,8 @@ def mended(
     bounds = 1 / (1.6 * float(far)), 1 / (0.6 * float(near))
     comparison = _Comparison(GreyPhotos.upload(views, photos.images, device), bounds)
     sharpness = comparison.sharpness
-    others = [_companions(k, views, depths, sharpness, SOURCES) for k in range(len(views))]
+    sources = 3  # photos that one is compared with
+    others = [_companions(k, views, depths, sharpness, sources) for k in range(len(views))]
     started = [comparison.start(k, depth) for k, depth in enumerate(depths)]
     planes = list(started)
     work, costs = len(ROUNDS) * len(views), [np.zeros(0)] * len(views)
@@ -71,11 +68,12 @@ def mended(
         there = np.where(moved, 1 / (np.maximum(plane[..., 0], 1e-6) * ahead(view)), depth)
         found.append(np.where((costs[k] < PROVED) & kept_pixels(photos, k, view), there, 0.0))
     result, proved = [], []
+    tolerance = 0.015  # up to this part of the range two depths that photos found agree; one of Gaussians, up to twice as much
     for k, (view, depth) in enumerate(zip(views, depths, strict=True)):
         checked = _companions(k, views, depths, np.ones(len(views)), CHECKED)
         maps = [(views[s], found[s]) for s in checked]
-        agreed, _ = _votes(found[k], view, maps, TOLERANCE, device)
-        _, crossed = _votes(depth, view, maps, 2 * TOLERANCE, device)
+        agreed, _ = _votes(found[k], view, maps, tolerance, device)
+        _, crossed = _votes(depth, view, maps, 2 * tolerance, device)
         proved.append(agreed > 0)
         result.append(np.where(agreed > 0, found[k], np.where(crossed > 0, 0.0, depth)))
     return result, proved
@@ -165,10 +163,11 @@ class _Comparison:
             Others, device, turns=rotations, shifts=shifts, sizes=sizes[others], images=self.photos.flat, told=told,
             contradicting=contradicting,
         )  # fmt: skip
+        settled = 0.05  # a plane of less cost (one minus a correlation) stays as it is
         for number in (-1, *turns):
             for colour in (0, 1):
                 settings = [
-                    colour, number, view, 1 / camera.fx, wp.vec2(*self.bounds), SETTLED,
+                    colour, number, view, 1 / camera.fx, wp.vec2(*self.bounds), settled,
                     wp.vec3i(*map(int, sizes[view])),
                 ]  # fmt: skip
                 count = camera.height * ((camera.width + 1) // 2)
@@ -191,7 +190,9 @@ def _companions(
     distance = np.linalg.norm(line, axis=2)
     line /= np.maximum(distance, 1e-9)[..., None]
     angle = np.degrees(np.arccos(np.clip(np.einsum("cpi,pi->cp", line, line[view]), -1, 1)))
-    good = np.exp(-0.5 * (np.log(np.maximum(angle, 0.1) / GOOD_ANGLE_DEG) / 0.7) ** 2)
+    # between two lines of sight: less tells depths badly, more changes what a window shows
+    good_angle_deg = 9.0
+    good = np.exp(-0.5 * (np.log(np.maximum(angle, 0.1) / good_angle_deg) / 0.7) ** 2)
     good *= np.minimum(distance / distance[view], distance[view] / np.maximum(distance, 1e-9))
     inside = np.array([c.in_frame(points)[0] for c in cameras])
     worth = np.where(inside.mean(axis=1) > 0.3, (good * inside).mean(axis=1), 0.0) * weight
