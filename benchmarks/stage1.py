@@ -49,7 +49,7 @@ STAGES: Mapping[str, tuple[ReconstructionConfig, tuple[str, ...]]] = {
     "stereo": (replace(FULL, stereo=False), ("photos.surface.stereo",)),
     "completion": (
         replace(FULL, completion=False),
-        tuple(f"photos.surface.{name}" for name in ("completion", "boxes", "room_planes")),
+        tuple(f"photos.surface.{name}" for name in ("completion", "boxes")),
     ),
 }
 """What is off: the configuration without it, and the modules below ``warprrf.geometry`` that it takes."""

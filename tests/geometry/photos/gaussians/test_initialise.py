@@ -11,8 +11,7 @@ from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.gaussians import sweep
 from warprrf.geometry.photos.gaussians.cells import meeting
 from warprrf.geometry.photos.gaussians.initialise import initialise
-from warprrf.geometry.photos.posed.points import detect_room_planes
-from warprrf.geometry.photos.posed.sparse import SparseModel
+from warprrf.geometry.photos.posed.sparse import SparseModel, detect_room_planes
 from warprrf.geometry.planes import Plane, aligned
 
 pytest.importorskip("open3d")

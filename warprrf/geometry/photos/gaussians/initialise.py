@@ -22,8 +22,12 @@ from warprrf.geometry.photos.gaussians.cells import meeting, occupancy, plane_me
 from warprrf.geometry.photos.gaussians.plain import plain_surfaces, with_plain
 from warprrf.geometry.photos.gaussians.sweep import choose_views, joined, level_planes, proven_cells, united
 from warprrf.geometry.photos.posed.images import GreyPhotos
-from warprrf.geometry.photos.posed.points import clean_points, detect_room_planes, estimate_normals
-from warprrf.geometry.photos.posed.sparse import SparseModel
+from warprrf.geometry.photos.posed.sparse import (
+    SparseModel,
+    clean_points,
+    detect_room_planes,
+    estimate_normals,
+)
 from warprrf.geometry.planes import Plane, aligned, directions, plane_axes
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Y00, Gaussians, quaternions_of

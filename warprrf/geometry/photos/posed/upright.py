@@ -17,8 +17,13 @@ from scipy import ndimage
 from warprrf.device import require
 from warprrf.geometry.mesh_files import UP
 from warprrf.geometry.photos.posed.photo_files import spread
-from warprrf.geometry.photos.posed.points import clean_points, detect_room_planes, estimate_normals
-from warprrf.geometry.photos.posed.sparse import SparseModel, transformed
+from warprrf.geometry.photos.posed.sparse import (
+    SparseModel,
+    clean_points,
+    detect_room_planes,
+    estimate_normals,
+    transformed,
+)
 from warprrf.geometry.planes import Plane, PlaneConfig
 from warprrf.geometry.splats.camera import Camera
 

@@ -22,19 +22,17 @@ from warprrf.geometry.mesh import Mesh, connected_pieces
 from warprrf.geometry.photos.gaussians.cells import BEHIND_M, plane_mesh
 from warprrf.geometry.photos.posed.photo_files import spread
 from warprrf.geometry.photos.surface.boxes import (
+    FaceLevels,
+    claim_proven,
     closed_sides,
     divide,
+    known_levels,
     least_surface,
+    proven_levels,
     seen_share,
     surface_of,
     vote_proven,
     votes,
-)
-from warprrf.geometry.photos.surface.room_planes import (
-    FaceLevels,
-    claim_proven,
-    known_levels,
-    proven_levels,
 )
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.planes import Plane, directions
