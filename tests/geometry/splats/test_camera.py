@@ -27,6 +27,26 @@ def test_projection_inverts_directions(camera):
     assert np.allclose(uv, np.stack([u, v], axis=-1).reshape(-1, 2), atol=1e-9)
 
 
+def test_a_point_is_in_frame_by_its_pixel_in_front_and_deep_enough():
+    c = ALONG_X
+    points = c.position + 2.5 * c.directions()
+    inside, pixel = c.in_frame(points.reshape(-1, 3))
+    assert inside.all()
+    assert np.array_equal(pixel, np.argwhere(np.ones((c.height, c.width))))
+    behind = 2 * c.position - points.reshape(-1, 3)
+    assert not c.in_frame(behind)[0].any()
+    u, v = (
+        np.array([-0.1, 0.1, c.width - 0.1, c.width + 0.1, 5.0, 5.0]),
+        np.array([9.0] * 4 + [-0.1, c.height + 0.1]),
+    )
+    local = 2.0 * np.column_stack([(u - c.cx) / c.fx, (v - c.cy) / c.fy, np.ones(6)])
+    inside, pixel = c.in_frame(local @ c.rotation + c.position)
+    assert inside.tolist() == [False, True, True, False, False, False]
+    assert pixel.tolist() == [[0, 0], [9, 0], [9, c.width - 1], [0, 0], [0, 0], [0, 0]]
+    deep = [c.in_frame(local[1:2] @ c.rotation + c.position, nearest_m)[0][0] for nearest_m in (1.9, 2.1)]
+    assert deep == [True, False]
+
+
 def test_opencv_axes_and_position():
     assert np.allclose(ALONG_X.position, [1, 2, 3])
     assert np.array_equal(ALONG_X.rotation, [[0, -1, 0], [0, 0, -1], [1, 0, 0]])
