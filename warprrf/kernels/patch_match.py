@@ -142,11 +142,15 @@ def disagreement(
     mean: float,
     variance: float,
     others: Others,
+    least: float,
 ) -> float:
-    """One minus the mean of the two best correlations: what hides a surface in some photos does not count."""
+    """One minus the mean of the two best correlations: what hides a surface in some photos does not count. The last photo is
+    not looked at where even a correlation of one would leave ``least`` or more."""
     best = float(-2.0)
     second = float(-2.0)
     for s in range(others.sizes.shape[0]):
+        if s + 1 == others.sizes.shape[0] and best < 1.0 - 2.0 * least:
+            return UNKNOWN
         a = others.turns[s]
         b = others.shifts[s]
         size = others.sizes[s]
@@ -222,7 +226,7 @@ def match(
         return
     best = planes[here]
     if turn < 0:
-        costs[here] = disagreement(best, u, v, grey, weight, mean, variance, others)
+        costs[here] = disagreement(best, u, v, grey, weight, mean, variance, others, UNKNOWN)
         return
     for k in range(4):
         y = int(-1)
@@ -245,7 +249,7 @@ def match(
             new = wp.abs(w - best[0]) + wp.static(1.0 * SIDE) * bend > SAME * best[0]
             if new and w > bounds[0] and w < bounds[1]:
                 trial = wp.vec3(w, other[1], other[2])
-                c = disagreement(trial, u, v, grey, weight, mean, variance, others)
+                c = disagreement(trial, u, v, grey, weight, mean, variance, others, cost)
                 if c < cost:
                     cost = c
                     best = trial
@@ -260,7 +264,7 @@ def match(
         dy = wp.clamp(best[2] + reach * 4.0 * slope * w * wp.randf(state, -1.0, 1.0), -limit, limit)
         if w > bounds[0] and w < bounds[1]:
             trial = wp.vec3(w, dx, dy)
-            c = disagreement(trial, u, v, grey, weight, mean, variance, others)
+            c = disagreement(trial, u, v, grey, weight, mean, variance, others, cost)
             if c < cost:
                 cost = c
                 best = trial

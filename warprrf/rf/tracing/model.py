@@ -7,7 +7,7 @@ permittivity; their weights, S^2 and 1 - S^2, are free, so that an edge in the w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
@@ -120,6 +120,12 @@ class Parameters:
         check_type("reciprocal", self.reciprocal, bool)
         check_number("roughness", self.roughness, -10.0, 10.0)
         check_number("log_gain", self.log_gain, -MOST_NEPERS, MOST_NEPERS)
+
+    @property
+    def values(self) -> tuple[Hashable, ...]:
+        """All of it, to compare by."""
+        own = vars(self).values()
+        return tuple(one.tobytes() if isinstance(one, np.ndarray) else one for one in own)
 
     @property
     def weight(self) -> np.ndarray:

@@ -69,13 +69,17 @@ class PathGains:
 
 
 def materials_of(tracer: Tracer, model: Model) -> Materials:
-    """The parameters of ``model`` under a transmitter, as kernels take them."""
-    p, surface = model.parameters, tracer.surface
-    got = irradiance(tracer, p, model.effects)
-    if got is None:
-        return Materials(p, tracer.slabs, device=tracer.grid.device)
-    radiance = got * p.scattered_share[surface.side_group] / np.pi
-    return Materials(p, tracer.slabs, None, surface.side_group, radiance, device=tracer.grid.device)
+    """The parameters of ``model`` under a transmitter, as kernels take them: the same object for the same parameters and effects."""
+    p, surface, effects = model.parameters, tracer.surface, replace(model.effects, residual=False)
+
+    def make() -> Materials:
+        got = irradiance(tracer, p, effects)
+        if got is None:
+            return Materials(p, tracer.slabs, device=tracer.grid.device)
+        radiance = got * p.scattered_share[surface.side_group] / np.pi
+        return Materials(p, tracer.slabs, None, surface.side_group, radiance, device=tracer.grid.device)
+
+    return tracer.materials.get((p.values, effects), make)
 
 
 def path_gains(view: View, model: Model, materials: Materials) -> PathGains:

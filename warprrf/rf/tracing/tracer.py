@@ -193,6 +193,7 @@ class Tracer:
     Attributes:
         wavelength_m: wavelength.
         kept: what belongs to the transmitter, by name.
+        materials: last ones that light was sent on by, see :func:`~warprrf.rf.tracing.render.materials_of`.
     """
 
     def __init__(
@@ -210,6 +211,7 @@ class Tracer:
         self.wavelength_m = SPEED_OF_LIGHT / frequency_hz
         self._first_grid = grid
         self.kept = Cache(12)  # all kinds under two bounds of slabs and of bounces
+        self.materials = Cache(2)
 
     @classmethod
     def of(

@@ -217,7 +217,7 @@ class Observation:
     robust: bool = True
     sight: np.ndarray | None = None
     rows: np.ndarray | None = None
-    _kept: Cache = field(init=False, repr=False, default_factory=lambda: Cache(2))
+    _kept: Cache = field(init=False, repr=False, default_factory=lambda: Cache(3))
 
     def part(self, index: np.ndarray) -> Observation:
         """That of some of the readings."""
@@ -267,6 +267,9 @@ class Observation:
     def further(self, effects: Effects, materials: Materials) -> tuple[np.ndarray, np.ndarray]:
         """What comes over more than one surface, by the group that scatters it last or sends it on: groups ``(C,)``, and
         readings in units of the floor, shape ``(C, N)``."""
+        return self._kept.get((effects, materials), lambda: self._further(effects, materials))
+
+    def _further(self, effects: Effects, materials: Materials) -> tuple[np.ndarray, np.ndarray]:
         own, count = self.ray_bins
         surface = self.view.tracer.surface
         group, bins, power = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0)]
