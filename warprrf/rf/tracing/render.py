@@ -217,6 +217,5 @@ def _hemispheres(normal: np.ndarray, shift: np.ndarray) -> np.ndarray:
     v = np.mod(k * 0.5698402909980532 + shift[1, :, None], 1.0)
     radius, turn = np.sqrt(u), 2.0 * np.pi * v
     a, b = vectors_across(normal)
-    x, y, z = radius * np.cos(turn), radius * np.sin(turn), np.sqrt(np.maximum(1.0 - u, 0.0))
-    d = x[..., None] * a[:, None] + y[..., None] * b[:, None] + z[..., None] * normal[:, None]
-    return d.reshape(-1, 3)
+    local = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.sqrt(1.0 - u)], axis=2)
+    return (local @ np.stack([a, b, normal], axis=1)).reshape(-1, 3)

@@ -92,7 +92,8 @@ def fit_residual(
     own_rows = [slice(*own) for own in pairwise(np.cumsum([0, *(len(s.rest) for s in shares)]))]
     # Receivers that are measured alike go through the measurement together, batches of them side by side.
     alike = [list(own) for _, own in groupby(shares, key=lambda s: s.observed.measured.alike)]
-    batches = [own[k : k + AT_ONCE] for own in alike for k in range(0, len(own), AT_ONCE)]
+    ends = [(own, np.linspace(0, len(own), max(-(-len(own) // AT_ONCE), 2) + 1).astype(int)) for own in alike]
+    batches = [own[a:b] for own, cuts in ends for a, b in pairwise(cuts) if b > a]
     powers = [vstack([s.power for s in batch], format="csr") for batch in batches]
     counts = np.cumsum([len(batch) * len(batch[0].rest) for batch in batches])
 
