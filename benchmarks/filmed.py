@@ -52,6 +52,7 @@ ROWS = (
     ("back", "reference surface to mesh"),
     ("laid_on_distance", "mesh to reference surface, laid on it"),
     ("laid_on_back", "reference surface to mesh, laid on it"),
+    ("other_frames_distance", "the reference's own noise: a mesh of the frames in between, to it"),
 )
 
 
@@ -309,11 +310,9 @@ def run(options: Options, job: Job) -> Report:
     laid = rec.transformed(**laying)
     figures |= errors | score(rec.mesh, reference, rays) | {"laid_on_scale": laying["scale"]}
     figures |= {f"laid_on_{name}": value for name, value in score(laid.mesh, reference, rays).items()}
-    between = range(1, len(film.stems), options.reference_every)
-    rooms: dict[str, Mesh | wr.Reconstruction] = {
-        "other_frames": scanned_patches(film.surface(between, job.progress)).mesh,
-        "mesh": laid,
-    }
+    other = film.surface(range(1, len(film.stems), options.reference_every), job.progress)
+    figures |= {f"other_frames_{name}": value for name, value in score(other, reference, rays).items()}
+    rooms: dict[str, Mesh | wr.Reconstruction] = {"other_frames": scanned_patches(other).mesh, "mesh": laid}
     figures["field"] = field_errors(reference, film.free(reference, options.every), rooms, job)
     return Report("filmed", figures, _text(figures))
 
@@ -330,7 +329,8 @@ def _text(figures: Mapping[str, Any]) -> str:
         f"{figures['posed']} of {figures['frames']} frames posed{took}; cameras "
         f"{100 * figures['camera_rms_m']:.1f} cm rms off, {figures['camera_rotation_median_deg']:.2f} degrees; "
         f"{100 * figures['covered']:.0f} % of the reference's pixels meet the mesh, normals "
-        f"{figures['laid_on_normal_median_deg']:.1f} degrees off, F at 5 cm {figures['laid_on_f_5_cm']:.3f}. The mesh "
+        f"{figures['laid_on_normal_median_deg']:.1f} degrees off (those of the frames in between "
+        f"{figures['other_frames_normal_median_deg']:.1f}), F at 5 cm {figures['laid_on_f_5_cm']:.3f}. The mesh "
         "is aligned by its cameras; *laid "
         f"on it*, by its surface: scale {figures['laid_on_scale']:.3f}, what is left is the error of its shape.\n\n"
         + table(("", "median [m]", "90th percentile [m]", "within 5 cm"), rows)

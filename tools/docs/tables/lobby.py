@@ -192,16 +192,23 @@ def _filmed() -> str:
     found = read("filmed")
     rows = {
         "distance": "mesh to reference", "back": "reference to mesh", "laid_on_distance": "mesh to reference, aligned by surface",
-        "laid_on_back": "reference to mesh, aligned by surface",
+        "laid_on_back": "reference to mesh, aligned by surface", "other_frames_distance": "depth frames in between to reference",
     }  # fmt: skip
+
+    def normals(key: str) -> str:
+        turned = found.get(key.replace("distance", "normal_median_deg")) if key.endswith("distance") else None
+        return "" if turned is None else f"{turned:.1f}"
+
     lines = [
         [
             name,
             *(f"{100 * found[f'{key}_{part}_m']:.1f}" for part in ("median", "p90")),
             f"{100 * found[f'{key}_within_5_cm']:.0f} %",
+            normals(key),
         ]
         for key, name in rows.items()
     ]
+    head = "distance", "median [cm]", "90th percentile [cm]", "within 5 cm", "normals, median [degrees]"
     off = f"Camera positions differ from the reference's by {100 * found['camera_rms_m']:.0f} cm rms."
     if field := found.get("field"):
         psnr = [f"{field[name]['psnr_db']:.1f}" for name in ("reference", "other_frames", "mesh")]
@@ -210,7 +217,7 @@ def _filmed() -> str:
             f"places, a PSNR of {psnr[0]} dB on the reference, {psnr[1]} dB on a mesh of the depth frames in between, and "
             f"{psnr[2]} dB on our mesh."
         )
-    return f"{markdown(('distance', 'median [cm]', '90th percentile [cm]', 'within 5 cm'), lines)}\n\n{off}"
+    return f"{markdown(head, lines)}\n\n{off}"
 
 
 ROOMS = {
