@@ -227,9 +227,10 @@ class Bins:
     @classmethod
     def of(cls, own: np.ndarray, count: int) -> Bins:
         """Those of records in the bins ``own`` (N,) of ``count``, -1 for none."""
-        few = own.astype(np.int16) if count <= np.iinfo(np.int16).max else own  # which NumPy sorts by counting
-        order = np.argsort(few, kind="stable").astype(np.int32)
-        return cls(np.searchsorted(few[order], np.arange(count + 1)).astype(np.int32), order)
+        if count <= np.iinfo(np.int16).max:
+            own = own.astype(np.int16)  # which NumPy sorts by counting
+        order = np.argsort(own, kind="stable").astype(np.int32)
+        return cls(np.searchsorted(own[order], np.arange(count + 1)).astype(np.int32), order)
 
 
 class Materials:

@@ -69,7 +69,7 @@ class PathGains:
 
 
 def materials_of(tracer: Tracer, model: Model) -> Materials:
-    """The parameters of ``model`` under a transmitter, as kernels take them: the same object for the same parameters and effects."""
+    """The parameters of ``model`` under a transmitter, as kernels take them: the same object for the same ones."""
     p, surface, effects = model.parameters, tracer.surface, replace(model.effects, residual=False)
 
     def make() -> Materials:

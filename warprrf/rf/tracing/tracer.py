@@ -512,33 +512,35 @@ def images_of(surface: Surface, transmitter: np.ndarray, device: DeviceLike) -> 
 
 
 class MirroredLight:
-    """Images of the transmitter in single mirrors that light each face, found once at the middles of the faces.
+    """Images of the transmitter in single mirrors that light pieces of the surface, found once at the middle of each: a piece
+    is what faces one way of a cell.
 
     Args:
         tracer: of the transmitter.
         walls: if any, the images are those whose light comes through some of these, before or behind the mirror.
 
     Attributes:
-        image: of each pair of a face and an image that lights it [m], shape ``(N, 3)``.
+        image: of each pair of a piece and an image that lights it [m], shape ``(N, 3)``.
         patch: its mirror, shape ``(N,)``.
-        before: what its light meets on the way to the middle of the face.
+        before: what its light meets on the way to the middle of the piece.
         onto: its light on the sides of elements: records whose ray is the side, of irradiance where the transmitter gives
             cos(theta_i) / d1^2 [1/m^2].
     """
 
     def __init__(self, tracer: Tracer, walls: Walls | None = None) -> None:
         s, transmitter, grid = tracer.surface, tracer.transmitter, tracer.grid
-        centre, image = s.mesh.triangles.mean(axis=1), s.images(transmitter)[0]
-        face, patch, point = images_of(s, transmitter, grid.device).candidates(centre, 1)
-        # Light must come from in front of the face, of either side if it has two, and not from its own patch.
-        normal = s.front_normal[face]
-        side = ((point[:, 0] - centre[face]) * normal).sum(axis=1)
+        self._piece, middle = _pieces(s)
+        centre, image = s.mesh.triangles[middle].mean(axis=1), s.images(transmitter)[0]
+        piece, patch, point = images_of(s, transmitter, grid.device).candidates(centre, 1)
+        # Light must come from in front of the piece, of either side if it has two, and not from its own patch.
+        normal = s.front_normal[middle[piece]]
+        side = ((point[:, 0] - centre[piece]) * normal).sum(axis=1)
         normal = np.where(s.two_sided & (side < 0)[:, None], -normal, normal)
-        own = np.flatnonzero((s.two_sided | (side > 0)) & (s.patch[face] != patch[:, 0]))
-        order = own[np.lexsort((patch[own, 0], face[own]))]
-        face, patch, point, normal = face[order], patch[order], point[order], normal[order]
+        own = np.flatnonzero((s.two_sided | (side > 0)) & (s.patch[middle[piece]] != patch[:, 0]))
+        order = own[np.lexsort((patch[own, 0], piece[own]))]
+        piece, patch, point, normal = piece[order], patch[order], point[order], normal[order]
         lift_m = s.position_error_m
-        ends = centre[face], patch, point, lift_m * normal
+        ends = centre[piece], patch, point, lift_m * normal
         chosen = ZoneRays(s.patches, transmitter, 0.0, lift_m, grid.device).reached(*ends)
         slabs = None
         if walls is not None:
@@ -550,23 +552,38 @@ class MirroredLight:
             )
             arrived, slabs = passed(walls, *legs)
             chosen = dark[arrived]
-        face, patch, point, normal = face[chosen], patch[chosen], point[chosen], normal[chosen]
-        found = face, patch, point, np.ones(len(face))
+        piece, patch, point, normal = piece[chosen], patch[chosen], point[chosen], normal[chosen]
+        found = piece, patch, point, np.ones(len(piece))
         paths = tracer.specular(described(s.patches, transmitter, centre, found, 1, walls, slabs))
         self.before = paths.interactions
         patch = patch[:, 0]
         self.image, self.patch = image[patch], patch
-        self._first = np.searchsorted(face, np.arange(len(s.mesh.faces) + 1))
-        way = self.image - centre[face]
+        self._first = np.searchsorted(piece, np.arange(len(middle) + 1))
+        way = self.image - centre[piece]
         length = np.linalg.norm(way, axis=1)
         toward = way / np.maximum(length, 1e-12)[:, None]
         cos_in = np.maximum((toward * normal).sum(axis=1), 0.0)
-        share = s.mesh.areas[face] / s.element_area[s.element[face]]
+        face = middle[piece]
+        share = np.bincount(self._piece, s.mesh.areas)[piece] / s.element_area[s.element[face]]
         power = share * cos_in / np.maximum(length, NEAREST_M) ** 2 * grid.transmittance(length)
         self.onto = replace(paths, power=power, ray=s.side_met(face, -normal))
 
     def pairs(self, face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows of ``face`` (N,) and images that light them, one for each pair."""
-        count = self._first[face + 1] - self._first[face]
+        first, end = self._first[self._piece[face]], self._first[self._piece[face] + 1]
+        count = end - first
         within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-        return np.repeat(np.arange(len(face)), count), np.repeat(self._first[face], count) + within
+        return np.repeat(np.arange(len(face)), count), np.repeat(first, count) + within
+
+
+def _pieces(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """Faces of one cell that face one of six ways are a piece: that of each face ``(F,)``, and the face at the middle of each."""
+    normal, centre = surface.front_normal, surface.mesh.triangles.mean(axis=1)
+    axis = np.abs(normal).argmax(axis=1)
+    way = 2 * axis + (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] < 0)
+    piece = np.unique(6 * surface.cell.astype(np.int64) + way, return_inverse=True)[1].reshape(-1)
+    area = np.maximum(np.bincount(piece, surface.mesh.areas), 1e-12)
+    sums = [np.bincount(piece, surface.mesh.areas * x) / area for x in centre.T]
+    gap = ((centre - np.stack(sums, axis=1)[piece]) ** 2).sum(axis=1)
+    order = np.lexsort((gap, piece))
+    return piece, order[np.searchsorted(piece[order], np.arange(len(area)))]
