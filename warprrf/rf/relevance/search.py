@@ -24,7 +24,7 @@ from warprrf.geometry.mesh import as_mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.needs import RARE
+from warprrf.rf.fields.bistatic.options import RARE
 from warprrf.rf.positions import check_positions, check_receivers, question_unit
 from warprrf.rf.relevance.model import FullModel, effects_of, full_field, lobe_name
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape

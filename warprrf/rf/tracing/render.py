@@ -17,7 +17,6 @@ from warprrf.geometry.mesh import vectors_across
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.tracing.model import Effects, Model, Parameters
 from warprrf.rf.tracing.records import Materials, Records
-from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import SPECULAR, Rays, Tracer, View
 
 ELEMENT_RAYS = 128  # from each element, over its hemisphere
@@ -135,7 +134,8 @@ class Interreflection:
 
     def __init__(self, tracer: Tracer, most: int) -> None:
         surface, grid = tracer.surface, tracer.grid
-        point, normal = _sample_points(surface)
+        middle = surface.middles(surface.element)
+        point, normal = surface.mesh.triangles[middle].mean(axis=1), surface.side_normal[middle]
         known = np.arange(len(point))
         if surface.two_sided:
             point, normal = np.tile(point, (2, 1)), np.concatenate([normal, -normal])
@@ -199,15 +199,6 @@ def irradiance(tracer: Tracer, p: Parameters, effects: Effects) -> np.ndarray | 
     for _ in range(2, effects.scatterings):
         got = first + light.between @ (share * got)
     return np.asarray(got)
-
-
-def _sample_points(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """A place on each element, and its first side's normal: the centre of the face nearest to its middle."""
-    centre = surface.mesh.triangles.mean(axis=1)
-    gap = np.linalg.norm(centre - surface.element_centre[surface.element], axis=1)
-    order = np.lexsort((gap, surface.element))
-    first = order[np.searchsorted(surface.element[order], np.arange(len(surface.element_area)))]
-    return centre[first], surface.side_normal[first]
 
 
 def _hemispheres(normal: np.ndarray, shift: np.ndarray) -> np.ndarray:

@@ -143,11 +143,16 @@ class Surface:
         """Area of each element [m^2], shape ``(E,)``."""
         return np.maximum(np.bincount(self.element, self.mesh.areas), 1e-12)
 
-    @cached_property
-    def element_centre(self) -> np.ndarray:
-        """Centre of each element [m], shape ``(E, 3)``."""
-        sums = [np.bincount(self.element, self.mesh.areas * x) for x in self.mesh.triangles.mean(axis=1).T]
-        return np.stack(sums, axis=1) / self.element_area[:, None]
+    def middles(self, piece: np.ndarray) -> np.ndarray:
+        """Of each piece of the surface, ``piece`` (F,) of each face, the face nearest to its middle."""
+        centre, area = (
+            self.mesh.triangles.mean(axis=1),
+            np.maximum(np.bincount(piece, self.mesh.areas), 1e-12),
+        )
+        sums = [np.bincount(piece, self.mesh.areas * x) / area for x in centre.T]
+        gap = np.linalg.norm(centre - np.stack(sums, axis=1)[piece], axis=1)
+        order = np.lexsort((gap, piece))
+        return order[np.searchsorted(piece[order], np.arange(len(area)))]
 
     @cached_property
     def element_group(self) -> np.ndarray:

@@ -513,7 +513,7 @@ def images_of(surface: Surface, transmitter: np.ndarray, device: DeviceLike) -> 
 
 class MirroredLight:
     """Images of the transmitter in single mirrors that light pieces of the surface, found once at the middle of each: a piece
-    is what faces one way of a cell.
+    is what faces one of six ways of a cell.
 
     Args:
         tracer: of the transmitter.
@@ -529,7 +529,10 @@ class MirroredLight:
 
     def __init__(self, tracer: Tracer, walls: Walls | None = None) -> None:
         s, transmitter, grid = tracer.surface, tracer.transmitter, tracer.grid
-        self._piece, middle = _pieces(s)
+        largest = np.abs(s.front_normal).argmax(axis=1)
+        way = 2 * largest + (np.take_along_axis(s.front_normal, largest[:, None], axis=1)[:, 0] < 0)
+        self._piece = np.unique(6 * s.cell + way, return_inverse=True)[1]
+        middle = s.middles(self._piece)
         centre, image = s.mesh.triangles[middle].mean(axis=1), s.images(transmitter)[0]
         piece, patch, point = images_of(s, transmitter, grid.device).candidates(centre, 1)
         # Light must come from in front of the piece, of either side if it has two, and not from its own patch.
@@ -574,16 +577,3 @@ class MirroredLight:
         count = end - first
         within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
         return np.repeat(np.arange(len(face)), count), np.repeat(first, count) + within
-
-
-def _pieces(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """Faces of one cell that face one of six ways are a piece: that of each face ``(F,)``, and the face at the middle of each."""
-    normal, centre = surface.front_normal, surface.mesh.triangles.mean(axis=1)
-    axis = np.abs(normal).argmax(axis=1)
-    way = 2 * axis + (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] < 0)
-    piece = np.unique(6 * surface.cell.astype(np.int64) + way, return_inverse=True)[1].reshape(-1)
-    area = np.maximum(np.bincount(piece, surface.mesh.areas), 1e-12)
-    sums = [np.bincount(piece, surface.mesh.areas * x) / area for x in centre.T]
-    gap = ((centre - np.stack(sums, axis=1)[piece]) ** 2).sum(axis=1)
-    order = np.lexsort((gap, piece))
-    return piece, order[np.searchsorted(piece[order], np.arange(len(area)))]

@@ -17,7 +17,7 @@ import numpy as np
 from warprrf.checks import check_type, warn
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.em.materials import ITU_BANDS, Material, is_name_alone, library_material
-from warprrf.rf.fields.bistatic.needs import assumed
+from warprrf.rf.fields.bistatic.options import assumed
 from warprrf.rf.tracing.edits import Called, Room, edited
 from warprrf.rf.tracing.model import ARRAYS, MOST_NEPERS, Parameters
 from warprrf.rf.tracing.surface import Surface

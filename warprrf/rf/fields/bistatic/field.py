@@ -50,7 +50,6 @@ from warprrf.rf.fields.bistatic import edited, files
 from warprrf.rf.fields.bistatic.fit import fit
 from warprrf.rf.fields.bistatic.locate import locate
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, read
-from warprrf.rf.fields.bistatic.needs import assumed, evenly
 from warprrf.rf.fields.bistatic.observations import (
     Observation,
     Place,
@@ -60,7 +59,7 @@ from warprrf.rf.fields.bistatic.observations import (
     kinds_of,
     places_of,
 )
-from warprrf.rf.fields.bistatic.options import SUB_PIXELS, FitOptions
+from warprrf.rf.fields.bistatic.options import SUB_PIXELS, FitOptions, assumed, evenly
 from warprrf.rf.fields.bistatic.paths import (
     LINK_SHAPE,
     RAYS_AT_A_TIME,

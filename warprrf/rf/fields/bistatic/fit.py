@@ -23,9 +23,8 @@ from warprrf.rf.fields.base import Data, Measured
 from warprrf.rf.fields.bistatic.gauss_newton import Solution, gauss_newton
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, read
 from warprrf.rf.fields.bistatic.merging import merge
-from warprrf.rf.fields.bistatic.needs import RARE, evenly
 from warprrf.rf.fields.bistatic.observations import Place, Seen, as_list, frame_of, places_of
-from warprrf.rf.fields.bistatic.options import FitOptions
+from warprrf.rf.fields.bistatic.options import RARE, FitOptions, evenly
 from warprrf.rf.fields.bistatic.placing import moved, position_offset, with_zeros
 from warprrf.rf.fields.bistatic.report import covariance_of, left_out, report_of, warn_of
 from warprrf.rf.fields.bistatic.residual import fit_residual, shares_of

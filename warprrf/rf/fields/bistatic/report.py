@@ -13,8 +13,8 @@ from warprrf.checks import some_of, warn
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import Measured
 from warprrf.rf.fields.bistatic.gauss_newton import THROUGH_STD, Solution, layout_of
-from warprrf.rf.fields.bistatic.needs import MOST_BLOCKED, RARE, RAYS, evenly, total
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, frame_of, huber, observe
+from warprrf.rf.fields.bistatic.options import MOST_BLOCKED, RARE, RAYS, evenly, total
 from warprrf.rf.fields.bistatic.training import Training
 from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.tracing.model import Layout, Model

@@ -28,7 +28,6 @@ from warprrf.rf.fields.bistatic.gauss_newton import (
     gauss_newton,
 )
 from warprrf.rf.fields.bistatic.measured import WeighedPaths
-from warprrf.rf.fields.bistatic.needs import evenly, needed
 from warprrf.rf.fields.bistatic.observations import (
     NOISE_DB,
     Observation,
@@ -40,7 +39,7 @@ from warprrf.rf.fields.bistatic.observations import (
     observe,
     places_of,
 )
-from warprrf.rf.fields.bistatic.options import SUB_PIXELS, FitOptions
+from warprrf.rf.fields.bistatic.options import SUB_PIXELS, FitOptions, evenly, needed
 from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.tracing.model import SETS, Effects, Model, Parameters
 from warprrf.rf.tracing.records import Materials
