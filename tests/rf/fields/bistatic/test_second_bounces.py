@@ -20,7 +20,9 @@ from warprrf.rf.fields.bistatic.training import trace
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.spectrum import to_db
 from warprrf.rf.tracing.model import SETS, Effects, Parameters
+from warprrf.rf.tracing.render import materials_of
 from warprrf.rf.tracing.surface import Surface
+from warprrf.rf.tracing.tracer import Tracer
 
 WAVELENGTH = SPEED_OF_LIGHT / F
 RECEIVERS = RECEIVERS[:6]
@@ -33,6 +35,50 @@ def test_facets_too_small_for_mirrors_leave_line_of_sight_alone():
     )
     assert len(surface.plane_offset) == 0
     assert len(mirror_paths(surface, TX, np.array([[1.0, 1, 1]]), WAVELENGTH, 3)) == 1
+
+
+def test_a_mirror_lights_the_sides_of_a_thin_board_that_face_it():
+    """All of the board lies in one cell of one group; what faces another way is lit apart."""
+    mirror = np.array([[0.0, -2, -2], [0, 2, -2], [0, 2, 2], [0, -2, 2]]), np.array([[0, 1, 2], [0, 2, 3]])
+    low = np.array([3.04, 0.2, 0.2])  # off the cells' borders
+    board = box_mesh(low, low + [0.02, 0.1, 0.1])
+    mesh, _ = joined(mirror, board)
+    surface = Surface.of(RadioScene(mesh, np.zeros(len(mesh.faces), int), [SlabMaterial()]), element_m=0.9)
+    tracer = Tracer.of(surface, np.array([1.0, 0.8, 0.5]), F, SHAPE, 1)
+    of_board = np.flatnonzero(surface.mesh.triangles[:, :, 0].min(axis=1) > 1)
+    assert len(np.unique(surface.cell[of_board])) == 1
+    lit = np.zeros(len(surface.mesh.faces), bool)
+    rows, images = tracer.mirrored().pairs(of_board)
+    lit[of_board[rows]] = True
+    np.testing.assert_allclose(tracer.mirrored().image[images], np.tile([-1.0, 0.8, 0.5], (len(images), 1)))
+    normal = surface.mesh.face_normals
+    toward = np.array([-1.0, 0.8, 0.5]) - surface.mesh.triangles.mean(axis=1)
+    np.testing.assert_array_equal(lit[of_board], ((normal * toward).sum(axis=1) > 0)[of_board])
+    assert 0 < lit[of_board].sum() < len(of_board)
+
+
+def test_materials_under_a_transmitter_are_made_once(scene):
+    """The same for equal parameters and effects, others for any that differ."""
+    field = BistaticField.prior(scene, spectra(scene, RECEIVERS[:1]), effects=EVERYTHING)
+    tracer, model = field.view(RECEIVERS[0]).tracer, field.state
+    first = materials_of(tracer, model)
+    p = model.parameters
+    alike = replace(p, log_weight=p.log_weight.copy(), log_mirror=p.log_mirror.copy())
+    for same in (
+        replace(model, parameters=alike),
+        replace(model, effects=replace(EVERYTHING, residual=True)),
+    ):
+        assert materials_of(tracer, same) is first
+    changed = [
+        replace(p, **{name: getattr(p, name) + 0.1}) for name in ("log_weight", "log_excess", "log_mirror")
+    ]
+    changed += [replace(p, log_gain=0.1), replace(p, log_through=p.log_through - 0.1)]
+    others = [replace(model, parameters=q) for q in changed]
+    others += [replace(model, effects=replace(EVERYTHING, scatterings=2))]
+    for other in others:
+        assert materials_of(tracer, other) is not materials_of(tracer, model), other
+    radiance = [materials_of(tracer, m)._radiance for m in (model, others[0])]
+    assert not np.allclose(*radiance)
 
 
 @pytest.mark.usefixtures("device")
