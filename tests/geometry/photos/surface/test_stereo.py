@@ -8,6 +8,7 @@ import views
 import warp as wp
 from scipy import ndimage
 
+from warprrf.device import filled
 from warprrf.geometry.photos.posed.images import PosedPhotos
 from warprrf.geometry.photos.surface import stereo
 from warprrf.kernels import patch_match
@@ -50,6 +51,22 @@ def correlations(
     m = moments[k]
     found[k] = patch_match.correlation(
         planes[k], 20.5, 15.5, greys[k], weights[k], m[0], m[1], turn, shift, images, size
+    )
+
+
+@wp.kernel
+def disagreements(
+    planes: wp.array(dtype=wp.vec3),
+    grey: patch_match.window,
+    weight: patch_match.window,
+    moments: wp.vec2,
+    others: patch_match.Others,
+    least: float,
+    found: wp.array(dtype=wp.float32),
+):
+    k = wp.tid()
+    found[k] = patch_match.disagreement(
+        planes[k], 20.5, 15.5, grey, weight, moments[0], moments[1], others, least
     )
 
 
@@ -107,6 +124,41 @@ def test_a_window_is_a_chess_board_round_its_middle():
     places = list(zip(patch_match.COLUMNS, patch_match.ROWS, strict=True))[: patch_match.SAMPLES]
     board = {(i, j) for i in range(-4, 5, 2) for j in range(-4, 5, 2) if (i + j) % 4 == 0}
     assert set(places) == board and len(board) == len(places) == 13
+
+
+def test_the_last_photo_is_left_out_only_where_it_could_not_help():
+    """Costs below what is to be beaten come out as they are; of the others some are not computed to the end."""
+    rng, n, (height, width) = np.random.default_rng(3), 3000, (40, 50)
+    photos = [ndimage.gaussian_filter(rng.random((height, width)), 1.5) for _ in range(3)]
+    photos[1] = 0.5 * photos[1] + 0.5 * photos[2]  # the first shows something else
+    grey, weight = np.zeros(16), np.zeros(16)
+    at = 15 + np.array(patch_match.ROWS, int), 20 + np.array(patch_match.COLUMNS, int)
+    grey[:13], weight[:13] = photos[2][at][:13], 1 / 13
+    mean = float(weight @ grey)
+    moments = wp.vec2(mean, float(weight @ grey**2) - mean**2)
+    planes = np.column_stack([rng.uniform(-9, 9, n), np.zeros((n, 2))])
+    sizes = [(k * height * width, width, height) for k in range(3)]
+    others = filled(
+        patch_match.Others, "cpu", turns=np.tile(np.eye(3), (3, 1, 1)), shifts=np.array([[1.0, 0, 0], [0, 1, 0], [1, 1, 0]]),
+        sizes=np.array(sizes), images=np.concatenate([x.ravel() for x in photos]), told=np.zeros((1, 3)), contradicting=0.0,
+    )  # fmt: skip
+
+    def costs(least):
+        out = wp.zeros(n, dtype=wp.float32, device="cpu")
+        given = (
+            wp.array(planes, dtype=wp.vec3, device="cpu"),
+            patch_match.window(*grey),
+            patch_match.window(*weight),
+        )
+        wp.launch(disagreements, dim=n, inputs=[*given, moments, others, least, out], device="cpu")
+        return out.numpy()
+
+    whole = costs(float(patch_match.UNKNOWN))
+    for least in (0.1, 0.15, 0.2, 0.3):
+        below, some = whole < least, costs(least)
+        np.testing.assert_array_equal(some[below], whole[below])
+        assert (some[~below] >= least).all() and below.sum() > 20
+        assert (some[~below] > whole[~below]).sum() > 100
 
 
 @pytest.mark.parametrize("shift", [(3.5, 0.1, 0.01), (-0.1, 3.5, 0.01)])

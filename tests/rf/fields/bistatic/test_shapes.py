@@ -25,6 +25,20 @@ def as_partition(label):
     return {frozenset(np.flatnonzero(label == k).tolist()) for k in np.unique(label)}
 
 
+def test_the_middle_of_a_piece_is_the_face_nearest_to_its_middle():
+    """Of a strip of squares that are of two pieces, of three and five squares."""
+    x, y = np.meshgrid(np.arange(9.0), [0.0, 1.0], indexing="ij")
+    corner = np.arange(18).reshape(9, 2)
+    quads = np.column_stack([corner[:-1], corner[1:, ::-1]])
+    faces = np.concatenate([quads[:, [0, 3, 1]], quads[:, [1, 3, 2]]])
+    mesh = Mesh(np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()]), faces)
+    surface = Surface.of(mesh, element_m=10.0)
+    assert len(surface.mesh.faces) == len(faces)
+    centre = surface.mesh.triangles.mean(axis=1)
+    middle = centre[surface.middles((centre[:, 0] > 3).astype(int))]
+    np.testing.assert_allclose(middle[:, 0], [1.5, 5.5], atol=0.17)
+
+
 def test_sides_of_a_room_are_taken_for_materials_of_their_own_and_a_thing_for_one():
     mesh, part = joined(ROOM, CUPBOARD, DESK)
     group, material, look = groups_of(mesh)
