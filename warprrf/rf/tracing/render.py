@@ -68,7 +68,7 @@ class PathGains:
 
 
 def materials_of(tracer: Tracer, model: Model) -> Materials:
-    """The parameters of ``model`` under a transmitter, as kernels take them: the same object for the same ones."""
+    """The parameters of ``model`` under a transmitter, as kernels take them; the last ones are kept."""
     p, surface, effects = model.parameters, tracer.surface, replace(model.effects, residual=False)
 
     def make() -> Materials:

@@ -145,10 +145,8 @@ class Surface:
 
     def middles(self, piece: np.ndarray) -> np.ndarray:
         """Of each piece of the surface, ``piece`` (F,) of each face, the face nearest to its middle."""
-        centre, area = (
-            self.mesh.triangles.mean(axis=1),
-            np.maximum(np.bincount(piece, self.mesh.areas), 1e-12),
-        )
+        centre = self.mesh.triangles.mean(axis=1)
+        area = np.maximum(np.bincount(piece, self.mesh.areas), 1e-12)
         sums = [np.bincount(piece, self.mesh.areas * x) / area for x in centre.T]
         gap = np.linalg.norm(centre - np.stack(sums, axis=1)[piece], axis=1)
         order = np.lexsort((gap, piece))

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
+from math import ceil
 
 import numpy as np
 from scipy.sparse import block_diag, csr_matrix, hstack, identity, vstack
@@ -92,8 +93,10 @@ def fit_residual(
     own_rows = [slice(*own) for own in pairwise(np.cumsum([0, *(len(s.rest) for s in shares)]))]
     # Receivers that are measured alike go through the measurement together, batches of them side by side.
     alike = [list(own) for _, own in groupby(shares, key=lambda s: s.observed.measured.alike)]
-    ends = [(own, np.linspace(0, len(own), max(-(-len(own) // AT_ONCE), 2) + 1).astype(int)) for own in alike]
-    batches = [own[a:b] for own, cuts in ends for a, b in pairwise(cuts) if b > a]
+    batches = []
+    for group in alike:
+        ends = np.linspace(0, len(group), max(ceil(len(group) / AT_ONCE), 2) + 1).astype(int)
+        batches += [group[a:b] for a, b in pairwise(ends) if b > a]
     powers = [vstack([s.power for s in batch], format="csr") for batch in batches]
     counts = np.cumsum([len(batch) * len(batch[0].rest) for batch in batches])
 
