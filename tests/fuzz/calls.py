@@ -25,7 +25,7 @@ from warprrf.rf.fields.harmonic.fitting import FieldOptions
 
 IGNORED = ("progress", "ax", "client")
 """Arguments that are not mutated unless an example names them: a caller's own functions, matplotlib's axes."""
-UNCHECKED = ("trace_links", "path_gains", "materials_of", "check_positions")
+UNCHECKED = ("trace_links", "path_gains", "check_positions")
 """Methods that are given what others checked or made, or that every verb asks."""
 PARTS = {"transformed": ("means", "vertices", "world_to_camera")}
 """What else a refusal may name: parts of what a method makes."""

@@ -208,6 +208,10 @@ class Model:
     residual: np.ndarray
     transmitter: np.ndarray
 
+    def at_ratio(self, ratio: float) -> Model:
+        """That of the same surfaces at ``ratio`` times the carrier."""
+        return replace(self, parameters=self.parameters.at_ratio(ratio))
+
     def cell_gains(self, transmitter: np.ndarray) -> np.ndarray:
         """Gains of cells under ``transmitter`` (3,), shape ``(2, X)``, and the common gain."""
         known = np.array([[True], [np.array_equal(transmitter, self.transmitter)]]) & self.effects.residual

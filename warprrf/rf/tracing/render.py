@@ -67,9 +67,10 @@ class PathGains:
         return self.by_ray(["S"])
 
 
-def materials_of(tracer: Tracer, model: Model) -> Materials:
-    """The parameters of ``model`` under a transmitter, as kernels take them; the last ones are kept."""
-    p, surface, effects = model.parameters, tracer.surface, replace(model.effects, residual=False)
+def materials_of(tracer: Tracer, p: Parameters, effects: Effects) -> Materials:
+    """Parameters of groups under a transmitter as kernels take them, with what elements send by ``effects``; the last ones are
+    kept."""
+    surface = tracer.surface
 
     def make() -> Materials:
         got = irradiance(tracer, p, effects)
@@ -78,18 +79,14 @@ def materials_of(tracer: Tracer, model: Model) -> Materials:
         radiance = got * p.scattered_share[surface.side_group] / np.pi
         return Materials(p, tracer.slabs, None, surface.side_group, radiance, device=tracer.grid.device)
 
-    return tracer.materials.get((p.values, effects), make)
+    further = effects.scatterings, effects.transmissions, effects.mirror_scatter, effects.scatter_mirror
+    return tracer.materials.get((p.values, further), make)
 
 
-def path_gains(view: View, model: Model, materials: Materials) -> PathGains:
-    """What the receivers of ``view`` get, residual and common gain included.
-
-    Args:
-        view: what they see.
-        model: effects, parameters and residual.
-        materials: :func:`materials_of` it under the view's transmitter.
-    """
+def path_gains(view: View, model: Model) -> PathGains:
+    """What the receivers of ``view`` get under a model of groups, residual and common gain included."""
     t, found = view.tracer, {}
+    materials = materials_of(t, model.parameters, model.effects)
     gains = model.cell_gains(t.transmitter)
     tables = view.traced(model.effects)
     for name, records in tables.items():

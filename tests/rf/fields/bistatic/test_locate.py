@@ -177,10 +177,9 @@ def test_slopes_of_what_no_field_has_are_refused(field):
 def test_receivers_traced_at_once_get_what_each_gets_alone(field):
     tracer = field.tracer().on_grid((20, 40), 1)
     places = np.concatenate([UNSEEN, OTHERS[:1]])
-    materials, model = field.materials_of(tracer), field.state
-    together = path_gains(tracer.view(places, field.effects), model, materials).apart
+    together = path_gains(tracer.view(places, field.effects), field.state).apart
     for place, found in zip(places, together, strict=True):
-        alone = path_gains(tracer.view(place, field.effects), model, materials)
+        alone = path_gains(tracer.view(place, field.effects), field.state)
         assert len(alone.specular) > 1 and alone.by_ray().max() > 0
         np.testing.assert_allclose(found.specular, alone.specular, rtol=1e-12)
         np.testing.assert_allclose(found.by_ray(), alone.by_ray(), rtol=1e-6)

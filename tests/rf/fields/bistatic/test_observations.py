@@ -26,7 +26,7 @@ from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.readings import Readings, path_weights
 from warprrf.rf.tracing.model import SETS, Effects, Layout
 from warprrf.rf.tracing.records import Bins, Materials
-from warprrf.rf.tracing.render import irradiance
+from warprrf.rf.tracing.render import PathGains, irradiance
 from warprrf.rf.tracing.tracer import SPECULAR
 
 RX = RECEIVERS[0]
@@ -190,8 +190,14 @@ def test_slopes_of_records_of_every_sequence_are_those_of_differences(scene, rec
         assert (np.abs((1 + 1e-6) * found.T - slopes).max(axis=1) > bound)[seen].all() and seen.any(), name
     o = observation(view, pixels(view), field.floor)
     table, index = o.slopes(EVERYTHING, materials(x), layout)
-    slopes = differences(lambda x: o.predicted(field.state, materials(x)), x, 0.02)
-    rounding = np.finfo(np.float32).eps * o.predicted(field.state, materials(x)).max() / 0.02
+    tables = view.traced(EVERYTHING)
+
+    def predicted(x):
+        powers = {name: records.powers(materials(x)) for name, records in tables.items()}
+        return o.of_gains(PathGains(view, powers, tables, field.parameters))
+
+    slopes = differences(predicted, x, 0.02)
+    rounding = np.finfo(np.float32).eps * predicted(x).max() / 0.02
     bound = 5e-3 * np.abs(slopes).max(axis=1) + rounding
     assert (np.abs(dense(table, index, layout) - slopes).max(axis=1) <= bound).all()
 

@@ -38,7 +38,7 @@ def planted_shares(field, planted):
     for receiver in RECEIVERS:
         view, power = field.view(receiver), textured.spectrum(receiver).path_gain.ravel() / field.floor
         o = observation(view, MEASURED, field.floor, NEPER * np.log1p(power))
-        found.append(shares_of(o, field.state, field.materials_of(view.tracer)))
+        found.append(shares_of(o, field.state))
         again = MEASURED.of_bins((found[-1].power @ np.exp(planted).ravel())[:, None])[:, 0] + found[-1].rest
         np.testing.assert_allclose(again, power, rtol=1e-4, atol=1e-6 * power.max())
     return found

@@ -60,24 +60,21 @@ def test_a_mirror_lights_the_sides_of_a_thin_board_that_face_it():
 def test_materials_under_a_transmitter_are_made_once(scene):
     """The same for equal parameters and effects, others for any that differ."""
     field = BistaticField.prior(scene, spectra(scene, RECEIVERS[:1]), effects=EVERYTHING)
-    tracer, model = field.view(RECEIVERS[0]).tracer, field.state
-    first = materials_of(tracer, model)
-    p = model.parameters
+    tracer, p = field.view(RECEIVERS[0]).tracer, field.parameters
+    first = materials_of(tracer, p, EVERYTHING)
     alike = replace(p, log_weight=p.log_weight.copy(), log_mirror=p.log_mirror.copy())
-    for same in (
-        replace(model, parameters=alike),
-        replace(model, effects=replace(EVERYTHING, residual=True)),
-    ):
-        assert materials_of(tracer, same) is first
+    fewer = replace(EVERYTHING, residual=not EVERYTHING.residual, mirrors=1, diffractions=0)
+    assert materials_of(tracer, alike, EVERYTHING) is materials_of(tracer, p, fewer) is first
     changed = [
         replace(p, **{name: getattr(p, name) + 0.1}) for name in ("log_weight", "log_excess", "log_mirror")
     ]
     changed += [replace(p, log_gain=0.1), replace(p, log_through=p.log_through - 0.1)]
-    others = [replace(model, parameters=q) for q in changed]
-    others += [replace(model, effects=replace(EVERYTHING, scatterings=2))]
+    others = [(q, EVERYTHING) for q in changed]
+    off = {"scatterings": 2, "mirror_scatter": False, "scatter_mirror": False, "transmissions": 1}
+    others += [(p, replace(EVERYTHING, **{name: value})) for name, value in off.items()]
     for other in others:
-        assert materials_of(tracer, other) is not materials_of(tracer, model), other
-    radiance = [materials_of(tracer, m)._radiance for m in (model, others[0])]
+        assert materials_of(tracer, *other) is not materials_of(tracer, p, EVERYTHING), other
+    radiance = [materials_of(tracer, *m)._radiance for m in ((p, EVERYTHING), others[0])]
     assert not np.allclose(*radiance)
 
 
@@ -90,7 +87,7 @@ def test_columns_are_the_sums_of_their_records(scene, reciprocal):
     )
     view, beam, p = field.view(RECEIVERS[0]), BeamOperator(SHAPE, np.radians(5.0)), field.parameters
     gains, o = field.path_gains(view), observation(view, SpectrumPixels(beam), field.floor)
-    columns = columns_of(o, EVERYTHING, field.materials_of(view.tracer))
+    columns = columns_of(o, EVERYTHING, p)
     single = replace(columns, senders=columns.senders[:0], further=columns.further[:0]).power(p)
 
     def image(by_ray):

@@ -81,7 +81,6 @@ from warprrf.rf.spectra.readings import antenna_of, check_turned
 from warprrf.rf.spectra.spectrum import Spectrum, default_floor, to_db
 from warprrf.rf.tracing.model import ARRAYS as PARAMETER_ARRAYS
 from warprrf.rf.tracing.model import MOST_NEPERS, SETS, Effects, Layout, Model, Parameters
-from warprrf.rf.tracing.records import Materials
 from warprrf.rf.tracing.render import PathGains, images, materials_of, path_gains
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import Tracer, View
@@ -132,7 +131,6 @@ class BistaticField(RadioField):
     fitted_under: np.ndarray | None = field(default=None, repr=False)
     report: dict[str, Any] = field(default_factory=dict, repr=False)
     device: DeviceLike = field(default=None, repr=False)
-    _evaluated: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
     _maps: Cache = field(init=False, repr=False, default_factory=lambda: Cache(2))
 
     def __post_init__(self) -> None:
@@ -498,7 +496,7 @@ class BistaticField(RadioField):
     def path_gains(self, view: View) -> PathGains:
         """Path gain of all that is seen, by sequence of interactions."""
         check_type("view", view, View)
-        return path_gains(view, self.state, self.materials_of(view.tracer))
+        return path_gains(view, self.state)
 
     def tracer(self, transmitter: ArrayLike | None = None) -> Tracer:
         """The geometry under ``transmitter`` (3,) [m], by default the fitted one; that of the last few is kept."""
@@ -507,11 +505,6 @@ class BistaticField(RadioField):
             self.surface, source, self.frequency_hz, self.shape, self.sub_pixels, beam_sigma_rad=self.beam_sigma_rad,
             loss_per_m=0.0 if self.air is None else self.air.loss_per_m(self.frequency_hz), device=self.device,
         )  # fmt: skip
-
-    def materials_of(self, tracer: Tracer) -> Materials:
-        """Its parameters under a transmitter as kernels take them, what surfaces get of each other included."""
-        key = tracer.transmitter.tobytes(), tracer.frequency_hz, tracer.grid.loss_per_m
-        return self._evaluated.get(key, lambda: materials_of(tracer, self.state))
 
     def suggest(
         self,
@@ -557,10 +550,9 @@ class BistaticField(RadioField):
         return NEPER * np.sqrt(variance[: len(self.surface.element_area)])
 
     def _sensitivity(self, antenna: Antenna | None = None) -> tuple[Sensitivity, Unknowns]:
-        tracer = self.tracer()
-        materials, tracer = self.materials_of(tracer), tracer.on_grid(SUGGEST_SHAPE, 1)
+        tracer = self.tracer().on_grid(SUGGEST_SHAPE, 1)
         floor = self.floor * np.prod(self.shape) / np.prod(SUGGEST_SHAPE)
-        return Sensitivity(tracer, self.state, materials, floor, antenna), Unknowns.of(tracer, self.material)
+        return Sensitivity(tracer, self.state, floor, antenna), Unknowns.of(tracer, self.material)
 
     def _link_work(self, options: LinkOptions) -> tuple[Work, int]:
         effects, shape = self.effects, options.shape or LINK_SHAPE
@@ -580,7 +572,7 @@ class BistaticField(RadioField):
                 "error is not known; fit whole spectra of four or more, without quick=True"
             )
         rows = np.unique(self.material, return_index=True)[1]
-        lit = self.materials_of(view.tracer)
+        lit = materials_of(view.tracer, self.parameters, self.effects)
         materials = lit.by_materials(self.parameters.take(rows), self.material)
         layout = Layout(len(rows), len(self.parameters.lobes), through=True)
         place = Place(

@@ -132,7 +132,7 @@ def _mapped(bistatic: Any, part: tuple[np.ndarray, np.ndarray]) -> dict[str, np.
     model = bistatic.state
     model = replace(model, effects=replace(model.effects, mirrors=min(model.effects.mirrors, 1)))
     view = tracer.on_grid(SHAPE, 1).view(receivers, model.effects, keeps=False)
-    gains = path_gains(view, model, bistatic.materials_of(tracer))
+    gains = path_gains(view, model)
     paths, rays = view.paths, gains.by_ray()
     pixel = np.ravel_multi_index((paths.receiver, *pixel_of(paths.arrival, SHAPE)), (count, *SHAPE))
     image = rays + np.bincount(pixel, gains.specular, len(rays))

@@ -42,7 +42,6 @@ from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
 from warprrf.rf.positions import warn_of_unmodelled
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.tracing.model import SETS, Effects, Model
-from warprrf.rf.tracing.render import path_gains
 
 SHORT_STEPS = 10  # of a fit that only decides about something
 BETTER = 0.995
@@ -291,23 +290,22 @@ def everyone(t: Training, choice: Solution, residual: bool) -> tuple[Solution, M
 
 def with_residual(t: Training, model: Model, places: Sequence[int] | np.ndarray) -> Model:
     """``model`` with gains of surface cells that readings at ``places`` tell."""
-    shares = [shares_of(o, here, materials) for o, here, materials in t.evaluated(model, places)]
+    shares = [shares_of(t.observations[k], model) for k in places]
     t.step()
     return replace(model, residual=fit_residual(shares, t.surface, quick=t.options.quick))
 
 
 def _offsets(t: Training, found: Model) -> dict[int, list[tuple[Place, np.ndarray]]]:
     """By data set of unknown positions its places, and how far each receiver is from where it is said to be [m]."""
-    unsure = [
-        k for k, o in t.observations.items() if getattr(t.data[o.place.data], "position_std_m", 0.0) > 0
-    ]
     offsets: dict[int, list[tuple[Place, np.ndarray]]] = {}
-    for o, model, materials in t.evaluated(found, unsure):
+    for o in t.observations.values():
         one = t.data[o.place.data]
-        gains = path_gains(o.view, model, materials)
+        if getattr(one, "position_std_m", 0.0) == 0:
+            continue
+        gains = o.path_gains(found)
         total = np.maximum(read(gains, o.measured), 0.0) / o.floor
         direct = gains.specular / o.floor
-        gain = o.gain(model.parameters, total)
+        gain = o.gain(gains.parameters, total)
         other = np.maximum(total - direct @ o.measured.of_paths(o.view), 0.0)
         offset = position_offset(one, o, gain * other, gain * direct)  # type: ignore[arg-type]
         offsets.setdefault(o.place.data, []).append((o.place, offset))

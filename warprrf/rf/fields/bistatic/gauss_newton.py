@@ -33,9 +33,8 @@ from warprrf.rf.fields.bistatic.observations import (
     columns_of,
     huber,
 )
-from warprrf.rf.tracing.model import ROUGHNESS, Effects, Layout, Model, Parameters
+from warprrf.rf.tracing.model import ROUGHNESS, Effects, Layout, Parameters
 from warprrf.rf.tracing.records import Materials, Records
-from warprrf.rf.tracing.render import materials_of
 from warprrf.rf.tracing.tracer import SPECULAR
 
 WEIGHT_STD, EXCESS_STD, MIRROR_STD = 2.0, 0.8, 1.5
@@ -231,15 +230,8 @@ class Problem:
         **settings: Any,
     ) -> Problem:
         """That of observations where light comes as under parameters ``p`` of materials."""
-        known: dict[Any, Materials] = {}
-        columns = []
-        for o in observations:
-            key = id(o.view.tracer), o.ratio
-            if key not in known:
-                groups = p.at_ratio(o.ratio).take(material)
-                model = Model(effects, groups, np.zeros((2, 0)), o.place.transmitter)
-                known[key] = materials_of(o.view.tracer, model)
-            columns.append(columns_of(o, effects, known[key]))
+        groups = p.take(material)
+        columns = [columns_of(o, effects, groups) for o in observations]
         return cls(observations, columns, effects, material, **settings)
 
     @cached_property

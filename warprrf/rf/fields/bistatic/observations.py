@@ -41,7 +41,7 @@ from warprrf.rf.spectra.readings import Readings, fading_db, path_weights, quest
 from warprrf.rf.spectra.spectrum import to_db
 from warprrf.rf.tracing.model import SETS, Effects, Layout, Model, Parameters
 from warprrf.rf.tracing.records import Bins, Materials
-from warprrf.rf.tracing.render import PathGains, path_gains
+from warprrf.rf.tracing.render import PathGains, materials_of, path_gains
 from warprrf.rf.tracing.tracer import SPECULAR, View
 
 OWN_GAIN = -2
@@ -237,9 +237,13 @@ class Observation:
             return self.target.gain(power)
         return float(np.exp(p.log_gains[self.chain])) if self.chain >= 0 else 1.0
 
-    def predicted(self, model: Model, materials: Materials) -> np.ndarray:
-        """Readings under a model of groups, residual and gains included, in units of the floor, shape ``(N,)``."""
-        return self.of_gains(path_gains(self.view, model, materials))
+    def path_gains(self, model: Model) -> PathGains:
+        """What the place gets under a model of groups at the fit's carrier."""
+        return path_gains(self.view, model.at_ratio(self.ratio))
+
+    def predicted(self, model: Model) -> np.ndarray:
+        """Readings under such a model, residual and gains included, in units of the floor, shape ``(N,)``."""
+        return self.of_gains(self.path_gains(model))
 
     def of_gains(self, gains: PathGains) -> np.ndarray:
         """The same of the path gains that its view gets."""
@@ -415,14 +419,15 @@ class Columns:
         return found.reshape(index.size, found.shape[-1]), index.ravel()
 
 
-def columns_of(o: Observation, effects: Effects, materials: Materials) -> Columns:
-    """Those of an observation's groups, as light comes to them under ``materials``."""
-    p, count = materials.parameters, len(o.target.db)
+def columns_of(o: Observation, effects: Effects, p: Parameters) -> Columns:
+    """Those of an observation's groups, as light comes to them under parameters ``p`` of groups at the fit's carrier."""
+    p, count = p.at_ratio(o.ratio), len(o.target.db)
+    materials = materials_of(o.view.tracer, p, effects)
     groups, single = np.zeros(0, int), np.zeros((0, len(p.lobes), 3, count), np.float32)
     if effects.scatterings:
         groups, single = o.single(materials)
     senders, further = o.further(effects, materials)
-    share = np.maximum(p.scattered_share[materials.material[senders]], 1e-12)
+    share = np.maximum(p.scattered_share[senders], 1e-12)
     return Columns(groups, single, senders, (further / share[:, None]).astype(np.float32))
 
 
@@ -584,11 +589,9 @@ class _Arrays(Kind):
             unit = (SPEED_OF_LIGHT / one.frequency_hz / (4.0 * np.pi * distance)) ** 2
         target, chain = Target(NEPER * np.log1p(power[known] / one.floor)), OWN_GAIN if one.relative else -1
         bare = Observation(place, view, measured.part(known), target, unit * one.floor, chain)
-        start = Parameters.prior(view.tracer.surface.groups)
-        materials = Materials(start, view.tracer.slabs, device=view.tracer.grid.device)
-        single = SETS["single"]
-        scattered = columns_of(bare, single, materials).power(start)
-        total = scattered + bare.heard(single, materials)
+        start, single = Parameters.prior(view.tracer.surface.groups), SETS["single"]
+        scattered = columns_of(bare, single, start).power(start)
+        total = scattered + bare.heard(single, materials_of(view.tracer, start, single))
         gain = bare.gain(start, total)
         spread = np.sqrt(scattered * np.maximum(2.0 * total - scattered, 0.0))
         std_db = NEPER * gain * spread / (1.0 + gain * total)
@@ -638,9 +641,9 @@ def _shares(o: Observation) -> tuple[np.ndarray, np.ndarray]:
     surface = o.view.tracer.surface
     none = np.zeros((2, surface.cells))
     model = Model(SETS["single"], Parameters.prior(surface.groups), none, o.place.transmitter)
-    materials = Materials(model.parameters, o.view.tracer.slabs, device=o.view.tracer.grid.device)
+    materials = materials_of(o.view.tracer, model.parameters, model.effects)
     single = o.view.records[SPECULAR].powers(materials)[:, None] * o.path
-    share = single / np.maximum(o.predicted(model, materials), np.maximum(single.sum(axis=0), 1e-300))
+    share = single / np.maximum(o.predicted(model), np.maximum(single.sum(axis=0), 1e-300))
     return share[o.view.paths.in_sight].sum(axis=0), (share**2).sum(axis=0)
 
 

@@ -17,7 +17,7 @@ from warprrf.rf.em.materials import assumed_permittivity
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.bistatic.observations import Place
 from warprrf.rf.tracing.model import LOBES, SETS, Effects, Model, Parameters
-from warprrf.rf.tracing.render import materials_of, path_gains
+from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import Tracer
 
@@ -151,7 +151,7 @@ def total(tracer: Tracer, receivers: np.ndarray, model: Model, on: dict[str, Any
     if len(receivers) == 0:
         return np.zeros(0)
     here = replace(model, effects=replace(FEW, **on))
-    gains = path_gains(tracer.view(receivers, here.effects), here, materials_of(tracer, here))
+    gains = path_gains(tracer.view(receivers, here.effects), here)
     direct = np.bincount(gains.view.paths.receiver, gains.specular, len(receivers))
     return np.asarray(direct + gains.by_ray().reshape(len(receivers), -1).sum(axis=1))
 

@@ -131,7 +131,7 @@ def links(
     receivers, transmitter = part
     tracer, count = bistatic.tracer(transmitter), len(receivers)
     view = tracer.on_grid(shape, LINK_SUB_PIXELS).view(receivers, effects)
-    gains = path_gains(view, replace(bistatic.state, effects=effects), bistatic.materials_of(tracer))
+    gains = path_gains(view, replace(bistatic.state, effects=effects))
     paths, specular = view.paths, gains.specular
     total, moment, square = (
         np.bincount(paths.receiver, specular * (paths.delay_m / SPEED_OF_LIGHT) ** k, minlength=count)

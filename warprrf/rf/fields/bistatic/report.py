@@ -18,7 +18,6 @@ from warprrf.rf.fields.bistatic.options import MOST_BLOCKED, RARE, RAYS, evenly,
 from warprrf.rf.fields.bistatic.training import Training
 from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.tracing.model import Layout, Model
-from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.tracer import View
 
 SIDE_LOBES_DB = 3.0
@@ -30,26 +29,26 @@ def left_out(t: Training, model: Model) -> dict[str, Any]:
     how much they would raise all power there [dB], by name; and ``"error_db"``, by how much the fit has more than was read
     there, rms. What it lacks is no measure of its error: it may be just these effects."""
     blocked = list({o.place.seen_from: k for k, o in t.observations.items() if _is_dark(o.view)}.values())
-    seen = list(t.evaluated(model, evenly(np.array(blocked, int), MOST_BLOCKED)))
+    seen = [t.observations[k] for k in evenly(np.array(blocked, int), MOST_BLOCKED)]
     tried = model.effects, *t.candidates
     lacking = {name: on for name, on in RARE.items() if not any(getattr(e, key) for e in tried for key in on)}
     change, by_tracer = {name: np.zeros(len(seen)) for name in RARE}, dict[int, list[int]]()
     whole, over = np.zeros(len(seen)), np.zeros(len(seen))
-    for k, (o, here, materials) in enumerate(seen):
-        gains = path_gains(o.view, here, materials)
+    for k, o in enumerate(seen):
+        gains = o.path_gains(model)
         whole[k] = gains.specular.sum() + gains.by_ray().sum() + o.floor
-        read_sum, predicted = o.target.sums(o.predicted(here, materials))
+        read_sum, predicted = o.target.sums(o.of_gains(gains))
         over[k] = NEPER * max(np.log1p(predicted) - np.log1p(read_sum), 0.0)
         by_tracer.setdefault(id(o.view.tracer), []).append(k)
     for own in by_tracer.values() if lacking else ():
-        tracer, here = seen[own[0]][0].view.tracer.on_grid(*RAYS), seen[own[0]][1]
-        receivers = np.stack([seen[k][0].place.receiver for k in own])
+        tracer, here = seen[own[0]].view.tracer.on_grid(*RAYS), model.at_ratio(seen[own[0]].ratio)
+        receivers = np.stack([seen[k].place.receiver for k in own])
         few = total(tracer, receivers, here, {})
         for name, on in lacking.items():
             more = np.maximum(total(tracer, receivers, here, on) - few, 0.0)
             change[name][own] = NEPER * np.log1p(more / whole[own])
     error_db = float(np.sqrt(np.mean(over**2))) if len(seen) else 0.0
-    found: dict[str, Any] = {"receivers": [o.place.receiver.tolist() for o, *_ in seen], "error_db": error_db}
+    found: dict[str, Any] = {"receivers": [o.place.receiver.tolist() for o in seen], "error_db": error_db}
     return found | {name: own.tolist() for name, own in change.items()}
 
 

@@ -24,8 +24,6 @@ from warprrf.device import threads
 from warprrf.rf.fields.bistatic.measured import read
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, Observation, huber
 from warprrf.rf.tracing.model import Model
-from warprrf.rf.tracing.records import Materials
-from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import SPECULAR
 
@@ -48,10 +46,10 @@ class Shares:
     rest: np.ndarray
 
 
-def shares_of(o: Observation, model: Model, materials: Materials) -> Shares:
+def shares_of(o: Observation, model: Model) -> Shares:
     """What cells give the readings of one receiver under ``model``, whose residual does not count."""
     bare = replace(model, effects=replace(model.effects, residual=False))
-    gains, view = path_gains(o.view, bare, materials), o.view
+    gains, view = o.path_gains(bare), o.view
     unit = o.floor
     if o.chain != -1:
         unit = o.floor / o.gain(model.parameters, np.maximum(read(gains, o.measured), 0.0) / o.floor)

@@ -20,7 +20,6 @@ from warprrf.rf.fields.bistatic.observations import NOISE_DB, READING_ERROR_DB
 from warprrf.rf.spectra.antenna import Antenna, turned_gain
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_of
 from warprrf.rf.tracing.model import Model
-from warprrf.rf.tracing.records import Materials
 from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.tracer import SPECULAR, Tracer
 
@@ -71,21 +70,17 @@ class Sensitivity:
     Args:
         tracer: the geometry under the transmitter, on a grid of :data:`SHAPE`.
         model: of its surfaces.
-        materials: those of it under the transmitter.
         floor: path gain of a pixel, and of a reading, below which nothing is told.
         antenna: what is turned to directions; None for whole spectra.
     """
 
-    def __init__(
-        self, tracer: Tracer, model: Model, materials: Materials, floor: float, antenna: Antenna | None = None
-    ) -> None:
-        self.tracer, self.model, self.materials, self.floor = tracer, model, materials, floor
-        self.antenna = antenna
+    def __init__(self, tracer: Tracer, model: Model, floor: float, antenna: Antenna | None = None) -> None:
+        self.tracer, self.model, self.floor, self.antenna = tracer, model, floor, antenna
 
     def powers(self, place: np.ndarray) -> tuple[csr_matrix, np.ndarray]:
         """Power that is due to each gain in each pixel at ``place`` (3,), shape ``(P, U)``, and all power ``(P,)``."""
         view = self.tracer.view(place, self.model.effects)
-        found = path_gains(view, self.model, self.materials)
+        found = path_gains(view, self.model)
         s, count = self.tracer.surface, SHAPE[0] * SHAPE[1]
         elements, element = len(s.element_area), s.element.take(view.hits.face, mode="wrap")
         pixel = np.ravel_multi_index(pixel_of(view.paths.arrival, SHAPE), SHAPE)

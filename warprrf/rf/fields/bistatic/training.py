@@ -42,8 +42,6 @@ from warprrf.rf.fields.bistatic.observations import (
 from warprrf.rf.fields.bistatic.options import SUB_PIXELS, FitOptions, evenly, needed
 from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.tracing.model import SETS, Effects, Model, Parameters
-from warprrf.rf.tracing.records import Materials
-from warprrf.rf.tracing.render import materials_of
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import Tracer, View, view_of
 
@@ -342,20 +340,7 @@ class Training:
 
     def predicted(self, model: Model, places: Iterable[int]) -> list[np.ndarray]:
         """All readings at ``places`` under a model, in units of their floors."""
-        return [o.predicted(here, materials) for o, here, materials in self.evaluated(model, places)]
-
-    def evaluated(
-        self, model: Model, places: Iterable[int]
-    ) -> Iterable[tuple[Observation, Model, Materials]]:
-        """Observations with the model at their carriers, as kernels take it."""
-        known: dict[Any, tuple[Model, Materials]] = {}
-        for k in places:
-            o = self.observations[k]
-            key = id(o.view.tracer), o.ratio
-            if key not in known:
-                here = replace(model, parameters=model.parameters.at_ratio(o.ratio))
-                known[key] = here, materials_of(o.view.tracer, here)
-            yield o, *known[key]
+        return [self.observations[k].predicted(model) for k in places]
 
     def loss(self, model: Model, places: Sequence[int] | np.ndarray) -> float:
         """Mean loss of all readings at ``places`` [dB^2]."""
