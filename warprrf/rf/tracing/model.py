@@ -213,7 +213,7 @@ class Model:
         return replace(self, parameters=self.parameters.at_ratio(ratio))
 
     def cell_gains(self, transmitter: np.ndarray) -> np.ndarray:
-        """Gains of cells under ``transmitter`` (3,), shape ``(2, X)``, and the common gain."""
+        """Gains of cells under ``transmitter`` (3,), times the common gain, shape ``(2, X)``."""
         known = np.array([[True], [np.array_equal(transmitter, self.transmitter)]]) & self.effects.residual
         return np.asarray(self.parameters.gain * np.exp(known * self.residual))
 

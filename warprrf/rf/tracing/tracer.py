@@ -259,8 +259,11 @@ class Tracer:
 
     @property
     def images(self) -> MirrorImages:
-        """Images of the transmitter in the surface's mirrors."""
-        return self.kept.get("images", lambda: images_of(self.surface, self.transmitter, self.grid.device))
+        """Images of the transmitter in the surface's mirrors, whose outlines may be torn."""
+        s, device = self.surface, self.grid.device
+        return self.kept.get(
+            "images", lambda: MirrorImages(s.patches, self.transmitter, slack_m=MIRROR_SLACK_M, device=device)
+        )
 
     def walls(self, most: int) -> Walls:
         """What may be passed, up to ``most`` slabs on one way."""
@@ -506,11 +509,6 @@ def view_of(
     return replace(view, tracer=None, hits=replace(view.hits, **none))  # type: ignore[arg-type]
 
 
-def images_of(surface: Surface, transmitter: np.ndarray, device: DeviceLike) -> MirrorImages:
-    """Images of ``transmitter`` (3,) in a surface's mirrors, whose outlines may be torn."""
-    return MirrorImages(surface.patches, transmitter, slack_m=MIRROR_SLACK_M, device=device)
-
-
 class MirroredLight:
     """Images of the transmitter in single mirrors that light pieces of the surface, found once at the middle of each: a piece
     is what faces one of six ways of a cell.
@@ -534,7 +532,7 @@ class MirroredLight:
         self._piece = np.unique(6 * s.cell + way, return_inverse=True)[1]
         middle = s.middles(self._piece)
         centre, image = s.mesh.triangles[middle].mean(axis=1), s.images(transmitter)[0]
-        piece, patch, point = images_of(s, transmitter, grid.device).candidates(centre, 1)
+        piece, patch, point = tracer.images.candidates(centre, 1)
         # Light must come from in front of the piece, of either side if it has two, and not from its own patch.
         normal = s.front_normal[middle[piece]]
         side = ((point[:, 0] - centre[piece]) * normal).sum(axis=1)

@@ -8,6 +8,8 @@ import pytest
 from furnished import MATERIALS, RECEIVERS, ROOM, SHAPE, SIGMA, TX, F, spectra
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths, observation
 
+from warprrf.rf.channel.array_spectra import UP, hemisphere
+from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.fresnel import fresnel_curves, slab_transmission
 from warprrf.rf.em.materials import itu_material
 from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT
@@ -16,8 +18,8 @@ from warprrf.rf.fields.bistatic import fit as fitting
 from warprrf.rf.fields.bistatic import gauss_newton as newton
 from warprrf.rf.fields.bistatic import training
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.gauss_newton import Problem
-from warprrf.rf.fields.bistatic.measured import SpectrumPixels, WeighedPaths
+from warprrf.rf.fields.bistatic.gauss_newton import Problem, layout_of
+from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, WeighedPaths
 from warprrf.rf.fields.bistatic.merging import _mirror_changes
 from warprrf.rf.fields.bistatic.observations import Columns
 from warprrf.rf.fields.bistatic.training import trace
@@ -261,6 +263,29 @@ def test_what_readings_would_change_by_is_known_of_slabs_too():
     powers = [view.records[SPECULAR].powers(own) for own in (after, before)]
     expected = (powers[0] - powers[1])[view.kept_paths(effects)] @ o.path[view.kept_paths(effects)]
     np.testing.assert_allclose(changed[1][0], expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
+
+
+def test_an_array_s_slopes_are_those_of_what_counts_where_more_slabs_were_sought():
+    """What its field passes is no parameter then: a path through glass, the last material, counts nothing."""
+    scene, array = glazed(), PlanarArray(4, 4, orientation=UP)
+    sought = replace(SETS["single"], transmissions=3, residual=False)
+    field = BistaticField.prior(scene, spectra(scene, RECEIVERS, frequency_hz=140e9), effects=sought)
+    view, fewer = field.view(RECEIVERS[3]), replace(sought, transmissions=0)
+    assert 0 < view.kept_paths(fewer).sum() < view.kept_paths(sought).sum()
+    o = observation(view, ArrayImage.of(view, array, hemisphere((18, 36)).reshape(-1, 3), 0.0), field.floor)
+    problem = Problem.of([o], fewer, np.arange(2), field.parameters)
+    layout = layout_of(problem, field.parameters)
+    x, step = layout.pack(field.parameters), 1e-3
+
+    def error(x):
+        return next(problem.linearised(layout.unpack(x, field.parameters), layout))[0]
+
+    ((_, table, index),) = problem.linearised(field.parameters, layout)
+    for k, row in zip(index, table, strict=True):
+        if k % layout.stride != layout.lobes:  # that of permittivity is a table's
+            ends = [error(x + sign * step * (np.arange(layout.size) == k)) for sign in (1.0, -1.0)]
+            slope = (ends[0] - ends[1]) / (2.0 * step)
+            np.testing.assert_allclose(row, slope, atol=0.02 * np.abs(table).max())
 
 
 def test_what_glass_lets_through_is_found_at_any_carrier_or_said_to_be_left_out():

@@ -316,7 +316,8 @@ class Observation:
         specular, p = self.view.records[SPECULAR], materials.parameters
         amplitude, slope = self._amplitudes(effects, materials)
         rise = np.zeros((len(amplitude), count), np.float32)
-        for path, mirror in zip(*np.nonzero(specular.index >= 0), strict=True):
+        counts = self.view.kept_paths(effects)[:, None] & (specular.index >= 0)
+        for path, mirror in zip(*np.nonzero(counts), strict=True):
             at = place[materials.material[specular.index[path, mirror]]] + len(p.lobes)
             rise[path, at + EXCESS_COLUMN] += slope[path, mirror]
             share = MIRRORED_COLUMN if specular.kind[path, mirror] == MIRROR else THROUGH_COLUMN
