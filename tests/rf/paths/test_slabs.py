@@ -190,3 +190,17 @@ def test_a_field_s_paths_through_slabs_and_over_edges_are_those_that_are_traced(
     np.testing.assert_array_equal(mine.interactions[:, :deep], known.interactions[order])
     np.testing.assert_allclose(mine.vertices[:, :deep], known.vertices[order], atol=1e-6)
     np.testing.assert_allclose(mine.tau, known.tau[order], rtol=1e-9)
+
+
+@pytest.mark.parametrize("fewer", [{"mirrors": 0}, {"transmissions": 0}, {"diffractions": 0}])
+def test_what_counts_of_more_paths_is_what_is_traced_for_fewer(fewer):
+    """A mirror beside an edge counts as one."""
+    frame = SpectrumDataset.empty(
+        transmitter=TX, frequency_hz=F, shape=(18, 36), beam_sigma_rad=0.1, floor=1e-20
+    )
+    every = Effects(mirrors=1, transmissions=2, diffractions=1)
+    view, few = BistaticField.prior(SHEET, frame, effects=every).view(RX), replace(every, **fewer)
+    known = BistaticField.prior(SHEET, frame, effects=few).view(RX).paths
+    kept = view.kept_paths(few)
+    assert 0 < len(known) == kept.sum() < len(kept)
+    np.testing.assert_allclose(np.sort(view.paths.delay_m[kept]), np.sort(known.delay_m), rtol=1e-12)

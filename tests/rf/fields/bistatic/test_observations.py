@@ -19,6 +19,7 @@ from warprrf.rf.fields.bistatic import gauss_newton as fitting
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.gauss_newton import Problem, _normal_equations
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, WeighedPaths, read
+from warprrf.rf.fields.bistatic.measured import slopes as slopes_of
 from warprrf.rf.fields.bistatic.merging import _costs
 from warprrf.rf.fields.bistatic.observations import OWN_GAIN, Target, observe, places_of
 from warprrf.rf.spectra.antenna import horn
@@ -189,7 +190,8 @@ def test_slopes_of_records_of_every_sequence_are_those_of_differences(scene, rec
         assert (np.abs(found.T - slopes).max(axis=1) <= bound).all(), name
         assert (np.abs((1 + 1e-6) * found.T - slopes).max(axis=1) > bound)[seen].all() and seen.any(), name
     o = observation(view, pixels(view), field.floor)
-    table, index = o.slopes(EVERYTHING, materials(x), layout)
+    table, index = slopes_of(view, o.measured, EVERYTHING, materials(x), layout)
+    table = table / field.floor
     tables = view.traced(EVERYTHING)
 
     def predicted(x):

@@ -49,11 +49,8 @@ from warprrf.rf.fields.batches import Work
 from warprrf.rf.fields.bistatic import edited, files
 from warprrf.rf.fields.bistatic.fit import fit
 from warprrf.rf.fields.bistatic.locate import locate
-from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, read
+from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, read, slopes
 from warprrf.rf.fields.bistatic.observations import (
-    Observation,
-    Place,
-    Target,
     as_list,
     frame_of,
     kinds_of,
@@ -575,19 +572,15 @@ class BistaticField(RadioField):
         lit = materials_of(view.tracer, self.parameters, self.effects)
         materials = lit.by_materials(self.parameters.take(rows), self.material)
         layout = Layout(len(rows), len(self.parameters.lobes), through=True)
-        place = Place(
-            0, rows[:1], view.tracer.transmitter, view.receivers[0], self.frequency_hz, self.shape, self.air
-        )
-        o = Observation(place, view, SpectrumPixels(self._beam), Target(np.zeros(image.size)), self.floor)
-        slopes, index = o.slopes(self.effects, materials, layout)
-        slopes = np.float32(self.parameters.gain) * slopes
+        table, index = slopes(view, SpectrumPixels(self._beam), self.effects, materials, layout)
+        table *= np.float32(self.parameters.gain / self.floor)
         power = image.ravel() / self.floor
         if len(self.errors.covariance) > layout.size:  # of a common gain
-            slopes = np.concatenate([slopes, power[None].astype(np.float32)])
+            table = np.concatenate([table, power[None].astype(np.float32)])
             index = np.append(index, layout.size)
-        slopes *= (NEPER / (1.0 + power)).astype(np.float32)
+        table *= (NEPER / (1.0 + power)).astype(np.float32)
         return self.errors.std_db(
-            NEPER * np.log1p(power).reshape(image.shape), view.receivers[0], slopes, index
+            NEPER * np.log1p(power).reshape(image.shape), view.receivers[0], table, index
         )
 
     def _taken_apart(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

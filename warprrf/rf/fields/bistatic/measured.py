@@ -19,9 +19,9 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.mirror_paths import stops_of
 from warprrf.rf.paths.polarisation import chain_amplitude, vertical_ends
 from warprrf.rf.spectra.beam import BeamOperator
-from warprrf.rf.tracing.model import Parameters
+from warprrf.rf.tracing.model import Effects, Layout, Parameters
 from warprrf.rf.tracing.rays import RayGrid
-from warprrf.rf.tracing.records import Materials, Records
+from warprrf.rf.tracing.records import Bins, Materials, Records
 from warprrf.rf.tracing.render import PathGains
 from warprrf.rf.tracing.tracer import SPECULAR, View
 from warprrf.rows import Rows
@@ -67,6 +67,23 @@ def read(gains: PathGains, measurement: Measurement) -> np.ndarray:
         amplitude = together.amplitudes(specular, p)[0]
         direct = p.gain * together.received(np.where(gains.specular > 0, amplitude, 0.0))
     return np.asarray(measurement.of_bins(table)[:, 0] + direct)
+
+
+def slopes(
+    view: View, measurement: Measurement, effects: Effects, materials: Materials, layout: Layout
+) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of readings of one receiver, whose powers add, to the parameters of materials ``(C, N)`` float32, and the places
+    of these ``(C,)``."""
+    tables, (own, count) = view.traced(effects), measurement.bins(view)
+    side, specular = view.tracer.surface.side_group, tables.pop(SPECULAR)
+    groups = [records.groups(side) for records in (specular, *tables.values())]
+    place, index = layout.columns(materials.material[np.concatenate(groups)])
+    rise = specular.slopes(materials, place, len(index)) * view.kept_paths(effects)[:, None]
+    sums = np.zeros((count, len(index)), np.float32)
+    for records in tables.values():
+        records.add_slopes(materials, Bins.of(own[records.ray], count), place, sums)
+    scattered = np.asarray(measurement.of_bins(sums, quick=True)).T
+    return rise.T.astype(np.float32) @ measurement.of_paths(view) + scattered, index
 
 
 class ByPixels:

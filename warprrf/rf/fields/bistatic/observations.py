@@ -330,19 +330,6 @@ class Observation:
         amplitude, slope = self.together.amplitudes(specular, materials.parameters, materials.material)
         return amplitude * kept, slope * kept[:, None]
 
-    def slopes(self, effects: Effects, materials: Materials, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of readings to the parameters of materials ``(C, N)`` float32, and their places ``(C,)``."""
-        tables, (own, count) = self.view.traced(effects), self.ray_bins
-        side, specular = self.view.tracer.surface.side_group, tables.pop(SPECULAR)
-        groups = [records.groups(side) for records in (specular, *tables.values())]
-        place, index = layout.columns(materials.material[np.concatenate(groups)])
-        rise = specular.slopes(materials, place, len(index)) * self.view.kept_paths(effects)[:, None]
-        sums = np.zeros((count, len(index)), np.float32)
-        for records in tables.values():
-            records.add_slopes(materials, Bins.of(own[records.ray], count), place, sums)
-        scattered = np.asarray(self.measured.of_bins(sums, quick=True)).T / np.float32(self.floor)
-        return rise.T.astype(np.float32) @ self.path + scattered, index
-
     @cached_property
     def ray_bins(self) -> tuple[np.ndarray, int]:
         """What the readings sum rays in: bin of each ray, -1 for none, and how many bins there are."""
