@@ -43,8 +43,8 @@ def build(real: type) -> Any:
         """Rows are materials: lobe weights, epsilon_r - 1, mirrored share, share let through, slope of ln even reflection to
         ln(epsilon_r - 1), 1 where lobes are reciprocal; ``scale`` is a table over the cosine for each lobe; ``row`` and
         ``side_row`` are the material of each group and of each element's side, ``radiance`` what that sends. Of groups:
-        complex permittivity, 0 where it is not known, and thickness in wavelengths; slabs are of these, and mirrors too if
-        ``slab`` is 1."""
+        complex permittivity, 0 where it is not known, and thickness in wavelengths; slabs are of these. If ``slab`` is 1 each
+        group is a material of its own, and mirrors are slabs too."""
 
         weight: wp.array2d(dtype=real)
         excess: wp.array(dtype=real)

@@ -5,7 +5,8 @@ Rays fill the sphere around a receiver. What they hit is connected to the transm
 got of others (:mod:`warprrf.rf.tracing.render`), and are seen directly (``E``) or in a mirror (``EM``). Slabs
 (``T``) may stand in the way of light to a surface (``TS``; ``MTS``, before or behind the mirror), or of sight (``ST``, ``ET``),
 where rays go straight on. Line of sight and mirrors alone, through slabs too, come from the image method
-(:mod:`warprrf.rf.paths.mirror_paths`).
+(:mod:`warprrf.rf.paths.mirror_paths`). What slabs let rays pass, and how strong paths over edges are, follows materials as they
+are taken to be before any measurement; else tables hold geometry alone.
 
 A :class:`Tracer` belongs to a surface, a transmitter and a grid of rays; what it traced gives the :class:`View` of a receiver.
 """

@@ -210,7 +210,7 @@ class BistaticField(RadioField):
         ends = ends[np.sort(np.unique(ends, axis=0, return_index=True)[1])]
         receivers = ends[(ends[:, :3] == frame.transmitter).all(axis=1), 3:]
         fitted = replace(
-            cls.prior(found["surface"], frame, sub_pixels=chosen.rays, device=device),
+            cls.prior(found["surface"], frame, sub_pixels=chosen.rays_a_side, device=device),
             **found, fitted_on=ends[:, 3:], fitted_under=ends[:, :3],
         )  # fmt: skip
         if any(isinstance(one, SpectrumDataset) for one in data):
@@ -230,7 +230,7 @@ class BistaticField(RadioField):
         frame = frame_of(data)
         effects = replace(o.candidates(frame.frequency_hz)[:2][-1], residual=False)
         lobes = o.exponents(frame.frequency_hz)
-        known: dict[str, Any] = {"reciprocal": o.reciprocal, "sub_pixels": o.rays, "device": device}
+        known: dict[str, Any] = {"reciprocal": o.reciprocal, "sub_pixels": o.rays_a_side, "device": device}
         prior = cls.prior(geometry, frame, effects=effects, lobes=lobes, **known)
         places_of(data, prior.mesh, device)
         own = assumed(prior.surface, prior.frequency_hz)

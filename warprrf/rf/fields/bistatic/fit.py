@@ -1,8 +1,8 @@
 """Fitting a bistatic field: trace what receivers see, observe what was read, decide which effects count and which groups are of
 one material, fit parameters of materials, and find what differs within them and how wrong all that is.
 
-:func:`fit` reads as that list. Each step is a function of a :class:`~warprrf.rf.fields.bistatic.training.Training`, which
-nothing changes.
+:func:`fit` reads as that list. Each step is a function of a :class:`~warprrf.rf.fields.bistatic.training.Training`; what it
+decides is handed on, and noted in the report.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from warprrf.rf.fields.bistatic.placing import moved, position_offset, with_zero
 from warprrf.rf.fields.bistatic.report import covariance_of, left_out, report_of, warn_of
 from warprrf.rf.fields.bistatic.residual import fit_residual, shares_of
 from warprrf.rf.fields.bistatic.training import (
-    FEW,
+    FEW_RECEIVERS,
     MERGES,
     MOST_KEPT,
     MOST_TO_CHOOSE,
@@ -71,7 +71,9 @@ def fit(
         receivers = [p.receiver for p in places if np.array_equal(p.transmitter, first.transmitter)]
         link = mesh, first.transmitter, np.array(receivers)
         warn_of_unmodelled(*link, frequency_hz=frequency_hz, device=device, **rare)
-    look = partial(trace, geometry, sub_pixels=options.rays, client=client, device=device, progress=progress)
+    look = partial(
+        trace, geometry, sub_pixels=options.rays_a_side, client=client, device=device, progress=progress
+    )
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
     with threadpool_limits(1, user_api="blas"):
         t, model, found, zeros = _learned(data, places, look, options, progress)
@@ -116,7 +118,7 @@ def _learned(
     choice = choose(t)
     others = np.setdiff1d(np.arange(len(places)), list(t.observations))
     if len(others):
-        keeps = rays_of(places, options.rays) <= MOST_KEPT
+        keeps = rays_of(places, options.rays_a_side) <= MOST_KEPT
         t = t if keeps else t.without_records()
         again = time.perf_counter()
         more, _ = look(data, only=others, effects=choice.effects, decides=False, keeps=keeps)
@@ -275,7 +277,7 @@ def cross_validate(t: Training, choice: Solution) -> tuple[bool, ErrorModel | No
 def _folds(t: Training) -> list[np.ndarray]:
     """Places that are held out in turn to learn errors."""
     folds = [t.split.held]
-    if len(t.observations) <= FEW:
+    if len(t.observations) <= FEW_RECEIVERS:
         others = np.setdiff1d(t.split.kept, t.split.always)
         folds += np.array_split(others, max(len(others) // max(len(t.split.held), 2), 2))
     return folds

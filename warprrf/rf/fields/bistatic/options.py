@@ -96,14 +96,14 @@ class FitOptions:
         return LOBES if known is None else known
 
     @property
-    def rays(self) -> int:
+    def rays_a_side(self) -> int:
         """Square root of the rays per pixel."""
         return self.sub_pixels or (1 if self.quick else SUB_PIXELS)
 
 
 RARE: dict[str, dict[str, Any]] = {"transmission": {"transmissions": 3}, "diffraction": {"diffractions": 1}}
 """Effects by name, and what of :class:`Effects` has them whole."""
-FEW = replace(SETS["single"], mirrors=2, residual=False)
+SIMPLE = replace(SETS["single"], mirrors=2, residual=False)
 MOST_BLOCKED = 12
 """Blocked places at which effects are estimated."""
 RAYS = (20, 40), 2
@@ -131,10 +131,10 @@ def needed(effects: Effects, surface: Surface, places: Sequence[Place], device: 
         first = own[0]
         tracer = Tracer.of(surface, first.transmitter, first.frequency_hz, *RAYS, device=device)
         receivers = np.unique([place.receiver for place in own], axis=0)
-        sight = tracer.paths(receivers, replace(FEW, mirrors=0))
+        sight = tracer.paths(receivers, replace(SIMPLE, mirrors=0))
         blocked = evenly(np.setdiff1d(np.arange(len(receivers)), sight.receiver), MOST_BLOCKED)
         p, none = assumed(surface, first.frequency_hz), np.zeros((2, surface.cells))
-        model = Model(FEW, p, none, tracer.transmitter)
+        model = Model(SIMPLE, p, none, tracer.transmitter)
         before = total(tracer, receivers[blocked], model, {})
         for name, on in RARE.items():
             after = total(tracer, receivers[blocked], model, on)
@@ -147,10 +147,10 @@ def needed(effects: Effects, surface: Surface, places: Sequence[Place], device: 
 
 
 def total(tracer: Tracer, receivers: np.ndarray, model: Model, on: dict[str, Any]) -> np.ndarray:
-    """Total path gain of receivers (R, 3) under the parameters of ``model``, with :data:`FEW` effects and those that are ``on``."""
+    """Total path gain of receivers (R, 3) under the parameters of ``model``, with :data:`SIMPLE` effects and those ``on``."""
     if len(receivers) == 0:
         return np.zeros(0)
-    here = replace(model, effects=replace(FEW, **on))
+    here = replace(model, effects=replace(SIMPLE, **on))
     gains = path_gains(tracer.view(receivers, here.effects), here)
     direct = np.bincount(gains.view.paths.receiver, gains.specular, len(receivers))
     return np.asarray(direct + gains.by_ray().reshape(len(receivers), -1).sum(axis=1))

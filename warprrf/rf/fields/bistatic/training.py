@@ -47,7 +47,7 @@ from warprrf.rf.tracing.tracer import Tracer, View, view_of
 
 HELD_OUT, LEAST_RECEIVERS = 0.25, 4
 """Share of receivers that are held out, and of how many at least."""
-FEW = 20
+FEW_RECEIVERS = 20
 """Receivers up to which errors are learned from every one, held out in turn."""
 MOST_TO_CHOOSE = 24
 """Receivers that fits which only decide about something learn from."""
@@ -73,8 +73,8 @@ def trace(
     device: DeviceLike = None,
     progress: Progress | None = None,
 ) -> tuple[list[Seen], Effects]:
-    """What the receivers of ``ds`` see of ``geometry`` (a Reconstruction, Scene, Mesh or Surface), whatever the materials: traced
-    once, used by every fit; and the effects whose mirrors, slabs and edges were sought.
+    """What the receivers of ``ds`` see of ``geometry`` (a Reconstruction, Scene, Mesh or Surface), whatever the materials, for
+    all steps of a fit; and the effects whose mirrors, slabs and edges were sought.
 
     Args:
         only: indices of the places that are traced, of those that :func:`places_of` lists; all by default.
@@ -226,7 +226,7 @@ class Training:
         """What ``data`` holds of the places that decide, where that is ``seen`` and effects were ``sought``."""
         frequency_hz = frame_of(data).frequency_hz
         candidates = _possible(options.candidates(frequency_hz), sought, data)
-        steps = 4 + len(candidates) + MERGES + (2 * split.count if split.count <= FEW else 3)
+        steps = 4 + len(candidates) + MERGES + (2 * split.count if split.count <= FEW_RECEIVERS else 3)
         found = cls(
             options, candidates, seen[0][1].tracer.surface, split, {}, {},
             chains_of([place for place, _ in seen]), data, options.exponents(frequency_hz), _Steps(progress, split.count, steps),
