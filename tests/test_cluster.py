@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from fuzz.answers import differs, leaves
 from golden import make
+from radio_scenes import seen
 
 import warprrf as wr
 from benchmarks.machine import connected
@@ -15,7 +16,6 @@ from warprrf import device
 from warprrf.cluster import each
 from warprrf.device import threads
 from warprrf.rf.fields import batches
-from warprrf.rf.fields.bistatic.training import trace
 
 PLACES = make.places(9)
 F = np.linspace(299e9, 301e9, 4)
@@ -46,7 +46,7 @@ def test_every_verb_gives_the_bits_of_one_process(client, tmp_path):
     for verb in (
         partial(wr.simulate, scene, receivers=PLACES[:3], **how), partial(field.spectra, PLACES),
         partial(field.paths, PLACES), partial(field.cfr, PLACES, F, **link),
-        partial(field.radio_map, 1.2, 0.5), lambda client=None: trace(scene, ds, client=client)[0],
+        partial(field.radio_map, 1.2, 0.5), lambda client=None: seen(scene, ds, client=client),
     ):  # fmt: skip
         same(verb(client=client), verb())
     workspace = {"receivers": PLACES[:3], "workspace": tmp_path, **how}

@@ -9,10 +9,12 @@ from golden.make import joined as joined
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.bistatic.gauss_newton import Problem
-from warprrf.rf.fields.bistatic.observations import Observation, Place, Target
+from warprrf.rf.fields.bistatic.observations import Observation, Place, Target, places_of
+from warprrf.rf.fields.bistatic.training import trace
 from warprrf.rf.paths.images import MirrorImages
 from warprrf.rf.paths.mirror_paths import zone_paths
 from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import MIRROR_SLACK_M
 
 EPSILON_0 = 8.8541878128e-12
@@ -120,6 +122,11 @@ def observation(view, measured, floor, db=None, **how):
     )
     count = len(measured.of_bins(np.zeros((measured.bins(view)[1], 1))))
     return Observation(place, view, measured, Target(np.zeros(count) if db is None else db), floor, **how)
+
+
+def seen(scene, ds, **how):
+    """Places of ``ds`` and what a fit sees there."""
+    return trace(Surface.of(scene), places_of([ds], scene.mesh, None), **how)[0]
 
 
 def as_fits_predict(o, effects, p):

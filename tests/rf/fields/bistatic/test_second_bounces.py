@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from furnished import RECEIVERS, ROOM, SHAPE, TX, F, spectra
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths, observation
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths, observation, seen
 from trimesh.creation import icosphere
 
 from warprrf.geometry.mesh import Mesh
@@ -16,7 +16,6 @@ from warprrf.rf.fields.bistatic.gauss_newton import Problem, gauss_newton
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
 from warprrf.rf.fields.bistatic.merging import merge
 from warprrf.rf.fields.bistatic.observations import columns_of
-from warprrf.rf.fields.bistatic.training import trace
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.spectrum import to_db
 from warprrf.rf.tracing.model import SETS, Effects, Parameters
@@ -133,7 +132,7 @@ def problem(scene):
     measured = SpectrumPixels(BeamOperator(SHAPE, np.radians(5.0)))
     observations = [
         observation(view, measured, ds.floor, t.ravel())
-        for (_, view), t in zip(trace(scene, ds)[0], target, strict=True)
+        for (_, view), t in zip(seen(scene, ds), target, strict=True)
     ]
     return Problem.of(observations, SINGLE, np.arange(3), Parameters.prior(3))
 

@@ -35,6 +35,7 @@ from warprrf.rf.fields.bistatic.training import (
     MOST_TO_CHOOSE,
     Split,
     Training,
+    check_rays,
     rays_of,
     trace,
 )
@@ -42,6 +43,7 @@ from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
 from warprrf.rf.positions import warn_of_unmodelled
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.tracing.model import SETS, Effects, Model
+from warprrf.rf.tracing.surface import Surface
 
 SHORT_STEPS = 10  # of a fit that only decides about something
 BETTER = 0.995
@@ -64,6 +66,7 @@ def fit(
         if isinstance(one, SpectrumDataset) and len(one) and not (one.path_gain > one.floor).any():
             raise ValueError("ds: got no pixel above the floor, expected spectra with power to fit to")
     places = places_of(data, mesh, device)
+    check_rays(places, options.rays_a_side)
     if options.effects != "auto":  # else these are decided on by what they are worth
         frequency_hz, first = frame_of(data).frequency_hz, places[0]
         effects = options.candidates(frequency_hz)[0]
@@ -71,8 +74,12 @@ def fit(
         receivers = [p.receiver for p in places if np.array_equal(p.transmitter, first.transmitter)]
         link = mesh, first.transmitter, np.array(receivers)
         warn_of_unmodelled(*link, frequency_hz=frequency_hz, device=device, **rare)
+    tell = progress or (lambda *_: None)
+    tell("patches", 0, 1)
+    surface = Surface.of(geometry)
+    tell("patches", 1, 1)
     look = partial(
-        trace, geometry, sub_pixels=options.rays_a_side, client=client, device=device, progress=progress
+        trace, surface, sub_pixels=options.rays_a_side, client=client, device=device, progress=progress
     )
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
     with threadpool_limits(1, user_api="blas"):
@@ -109,7 +116,7 @@ def _learned(
     sought = candidates[0] if len(candidates) == 1 else None
     decides = options.effects == "auto" and options.relevance is None
     started = time.perf_counter()
-    seen, sought = look(data, only=split.deciding, effects=sought, decides=decides)
+    seen, sought = look([places[k] for k in split.deciding], effects=sought, decides=decides)
     tracing_s = time.perf_counter() - started
     data, zeros = with_zeros(data, seen)
     t = Training.of(seen, sought, split, data, options, rng, progress)
@@ -121,7 +128,7 @@ def _learned(
         keeps = rays_of(places, options.rays_a_side) <= MOST_KEPT
         t = t if keeps else t.without_records()
         again = time.perf_counter()
-        more, _ = look(data, only=others, effects=choice.effects, decides=False, keeps=keeps)
+        more, _ = look([places[k] for k in others], effects=choice.effects, decides=False, keeps=keeps)
         tracing_s += time.perf_counter() - again
         t = t.and_at(others, more, rng)
     residual, errors = cross_validate(t, choice)

@@ -14,12 +14,10 @@ from typing import Any
 import numpy as np
 
 from warprrf.cache import cached_property
-from warprrf.checks import check_count
 from warprrf.cluster import each
 from warprrf.device import DeviceLike, Progress, resolve
-from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
-from warprrf.rf.fields.base import Data, Measured
+from warprrf.rf.fields.base import Measured
 from warprrf.rf.fields.bistatic.gauss_newton import (
     KNOWN_THROUGH_STD,
     THROUGH_STD,
@@ -33,11 +31,9 @@ from warprrf.rf.fields.bistatic.observations import (
     Observation,
     Place,
     Seen,
-    as_list,
     chains_of,
     frame_of,
     observe,
-    places_of,
 )
 from warprrf.rf.fields.bistatic.options import SUB_PIXELS, FitOptions, evenly, needed
 from warprrf.rf.spectra.readings import Readings
@@ -61,10 +57,9 @@ MOST_KEPT = 15_000_000
 
 
 def trace(
-    geometry: GeometryLike,
-    ds: Data,
+    surface: Surface,
+    places: Sequence[Place],
     *,
-    only: Sequence[int] | np.ndarray | None = None,
     effects: Effects | None = None,
     decides: bool = True,
     keeps: bool = True,
@@ -73,11 +68,10 @@ def trace(
     device: DeviceLike = None,
     progress: Progress | None = None,
 ) -> tuple[list[Seen], Effects]:
-    """What the receivers of ``ds`` see of ``geometry`` (a Reconstruction, Scene, Mesh or Surface), whatever the materials, for
-    all steps of a fit; and the effects whose mirrors, slabs and edges were sought.
+    """What is seen of a surface at ``places``, whatever the materials, for all steps of a fit; and the effects whose mirrors, slabs
+    and edges were sought.
 
     Args:
-        only: indices of the places that are traced, of those that :func:`places_of` lists; all by default.
         effects: which tables are traced at once (others when they are first asked for); None for single bounces, and for
             as many mirrors up to 3 as can be searched (2 in a city).
         decides: whether paths pass slabs and go over edges as the scene needs it (:func:`needed`), else as ``effects`` say.
@@ -85,22 +79,13 @@ def trace(
         sub_pixels: square root of the rays per pixel.
         client: a ``dask.distributed.Client`` whose workers trace, to the same bits; this process by default.
         device: where rays are cast.
-        progress: called with the stages ``"patches"``, ``"mirrors"`` and ``"transport"``.
+        progress: called with the stages ``"mirrors"`` and ``"transport"``.
 
     Raises:
-        ValueError: for receivers on a surface or outside the scene, numbers out of range, or more rays or chains of
-            mirrors than :data:`MOST_RAYS` and :data:`~warprrf.rf.paths.images.MOST_CHAINS`.
-        TypeError: for a geometry without a mesh.
+        ValueError: for more chains of mirrors than :data:`~warprrf.rf.paths.images.MOST_CHAINS`.
     """
     tell = progress or (lambda *_: None)
-    places = places_of(as_list(ds), as_mesh(geometry, "geometry"), device)
-    check_count("sub_pixels", sub_pixels, 1, 16)
-    _check_rays(places, sub_pixels)
-    places = places if only is None else [places[int(k)] for k in only]
     wanted = replace(SETS["single"], mirrors=3) if effects is None else effects
-    tell("patches", 0, 1)
-    surface = Surface.of(geometry)
-    tell("patches", 1, 1)
     if decides:
         wanted = needed(wanted, surface, places, device)
     keeps = keeps and rays_of(places, sub_pixels) <= MOST_KEPT
@@ -132,8 +117,12 @@ def rays_of(places: Sequence[Place], sub_pixels: int) -> int:
     return sum(place.shape[0] * place.shape[1] for place in places) * sub_pixels**2
 
 
-def _check_rays(places: Sequence[Place], sub_pixels: int) -> None:
-    """Refuse places whose rays would not fit into memory."""
+def check_rays(places: Sequence[Place], sub_pixels: int) -> None:
+    """Refuse places whose rays would not fit into memory.
+
+    Raises:
+        ValueError: for more than :data:`MOST_RAYS`.
+    """
     rays, ray_bytes = rays_of(places, sub_pixels), 40  # that are kept of each
     if rays > MOST_RAYS:
         raise ValueError(
