@@ -62,6 +62,13 @@ class PathGains:
         return sum((np.bincount(records[n].ray, self.tables[n], count) for n in chosen), np.zeros(count))
 
     @property
+    def total(self) -> np.ndarray:
+        """All of it at each receiver, shape ``(R,)``."""
+        count = len(self.view.receivers)
+        direct = np.bincount(self.view.paths.receiver, self.specular, count)
+        return np.asarray(direct + self.by_ray().reshape(count, -1).sum(axis=1))
+
+    @property
     def single(self) -> np.ndarray:
         """Of what the transmitter lights and the receiver sees directly, by ray, shape ``(R K,)``."""
         return self.by_ray(["S"])

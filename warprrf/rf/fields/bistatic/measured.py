@@ -183,7 +183,7 @@ class WeighedPaths:
         """Those of one receiver that depend on arrival alone: bins are pixels, ``of_bin`` (D, B) that of their
         directions (:func:`pixel_means`), of which each reading is a ``row`` (N,)."""
         hit = view.hits.face >= 0
-        pixel = np.arange(len(hit)) // view.tracer.grid.sub_pixels**2
+        pixel = np.arange(len(hit)) // view.tracer.grid.per_pixel
         return cls(np.where(hit, pixel, -1), of_bin, row, _of_direct(view, weigh))
 
     @classmethod
@@ -209,7 +209,7 @@ class WeighedPaths:
         length = np.linalg.norm(out, axis=1)
         delay = (length + view.hits.range_m[ray]) / SPEED_OF_LIGHT
         out /= np.maximum(length, 1e-9)[:, None]
-        key = [ray // grid.sub_pixels**2 if arrival else np.zeros(len(ray), int)]
+        key = [ray // grid.per_pixel if arrival else np.zeros(len(ray), int)]
         if departure:
             rows, columns = 60, 120  # of the grid of departures that rays are told apart in
             row = np.arccos(np.clip(out[:, 2], -1.0, 1.0)) / np.pi * rows
@@ -271,7 +271,7 @@ def _of_direct(view: View, weigh: Weigh) -> np.ndarray:
 
 def pixel_means(grid: RayGrid) -> np.ndarray:
     """Unit vectors amid the rays of each pixel, shape ``(P, 3)``."""
-    mean = grid.directions.reshape(-1, grid.sub_pixels**2, 3).mean(axis=1)
+    mean = grid.directions.reshape(-1, grid.per_pixel, 3).mean(axis=1)
     return np.asarray(mean / np.linalg.norm(mean, axis=1, keepdims=True))
 
 

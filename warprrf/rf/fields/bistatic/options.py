@@ -151,9 +151,7 @@ def total(tracer: Tracer, receivers: np.ndarray, model: Model, on: dict[str, Any
     if len(receivers) == 0:
         return np.zeros(0)
     here = replace(model, effects=replace(SIMPLE, **on))
-    gains = path_gains(tracer.view(receivers, here.effects), here)
-    direct = np.bincount(gains.view.paths.receiver, gains.specular, len(receivers))
-    return np.asarray(direct + gains.by_ray().reshape(len(receivers), -1).sum(axis=1))
+    return path_gains(tracer.view(receivers, here.effects), here).total
 
 
 def evenly(index: np.ndarray, most: int) -> np.ndarray:

@@ -21,8 +21,8 @@ from warprrf.rf.fields.base import Measured
 from warprrf.rf.fields.bistatic.measured import direct_paths
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, TAP_STEPS, Observation, Place, Seen
 from warprrf.rf.spectra.readings import Readings, path_weights
-from warprrf.rf.tracing.model import Parameters
-from warprrf.rf.tracing.records import Materials
+from warprrf.rf.tracing.model import SETS, Parameters
+from warprrf.rf.tracing.render import materials_of
 from warprrf.rf.tracing.tracer import SPECULAR, View
 
 
@@ -96,7 +96,7 @@ def _clocks(one: Readings, paths: Sequence[tuple[np.ndarray, ...]]) -> np.ndarra
 def _strongest(view: View) -> tuple[np.ndarray, ...]:
     """Powers of its strongest direct paths before any measurement, directions of arrival and departure, delays."""
     tracer = view.tracer
-    prior = Materials(Parameters.prior(tracer.surface.groups), tracer.slabs, device=tracer.grid.device)
+    prior = materials_of(tracer, Parameters.prior(tracer.surface.groups), SETS["single"])
     power = view.records[SPECULAR].powers(prior)
     most = 20  # count
     kept = np.argsort(-power)[:most]

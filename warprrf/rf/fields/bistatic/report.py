@@ -36,7 +36,7 @@ def left_out(t: Training, model: Model) -> dict[str, Any]:
     whole, over = np.zeros(len(seen)), np.zeros(len(seen))
     for k, o in enumerate(seen):
         gains = o.path_gains(model)
-        whole[k] = gains.specular.sum() + gains.by_ray().sum() + o.floor
+        whole[k] = gains.total[0] + o.floor
         read_sum, predicted = o.target.sums(o.of_gains(gains))
         over[k] = NEPER * max(np.log1p(predicted) - np.log1p(read_sum), 0.0)
         by_tracer.setdefault(id(o.view.tracer), []).append(k)
