@@ -9,10 +9,10 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from importlib.metadata import version
-from typing import Annotated, Any, ClassVar, Self, TypeAlias, TypeVar, Unpack, cast
+from typing import Annotated, Any, ClassVar, Self, TypeAlias, TypeVar, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,13 +22,12 @@ from warprrf.cache import Cache
 from warprrf.checks import (
     LARGEST_M,
     Count,
+    Shaped,
     check_array,
     check_choice,
-    check_number,
-    check_positive,
-    check_type,
     checked,
     one_of,
+    within,
 )
 from warprrf.device import DeviceLike, Progress, resolve
 from warprrf.geometry.mesh import GeometryLike, Mesh
@@ -48,18 +47,11 @@ from warprrf.rf.positions import Ends, check_positions, retraced_slope
 from warprrf.rf.spectra.antenna import Antenna, Pattern, samples_of
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.readings import Readings
-from warprrf.rf.spectra.spectrum import (
-    GridShape,
-    Spectra,
-    Spectrum,
-    check_beam,
-    check_range_db,
-    check_shape,
-)
+from warprrf.rf.spectra.spectrum import Beam, Floor, GridShape, RangeDb, Spectra, Spectrum
 from warprrf.steps import digest
 
-_PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
-"""Attributes of every model that are numbers, under these names in the header of a file."""
+_PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad", "report")
+"""Attributes of every model that the header of a file has under these names."""
 Measured: TypeAlias = SpectrumDataset | Readings | ArraySpectra
 """What fields are fitted to: a set of spectra, a table of readings, spectra of coherent arrays."""
 Data: TypeAlias = Measured | Sequence[Measured]
@@ -67,6 +59,7 @@ Data: TypeAlias = Measured | Sequence[Measured]
 
 
 @checked
+@dataclass(frozen=True, eq=False, kw_only=True)
 class RadioField(ABC):
     """A fitted radio field; build it with :meth:`fit` or :meth:`load`.
 
@@ -77,32 +70,35 @@ class RadioField(ABC):
         floor, range_db, beam_sigma_rad: of the data set it was fitted to.
         fitted_on: receivers that it was fitted to [m], shape ``(R, 3)``.
         fitted_under: transmitter of each of those [m], shape ``(R, 3)``; None for its own.
-        mesh: what blocks; None if the geometry has no mesh.
         air: absorption in its path gains, that of the data set it was fitted to; None for none.
         device: where it computes.
         report: how the fit went.
         models: the class that fits and reads each model, by the model's name.
     """
 
-    transmitter: np.ndarray
-    frequency_hz: float
-    shape: tuple[int, int]
-    floor: float
-    range_db: tuple[float, float]
-    beam_sigma_rad: float
-    fitted_on: np.ndarray
-    fitted_under: np.ndarray | None = None
-    mesh: Mesh | None
-    air: Air | None
-    device: DeviceLike
-    report: dict[str, Any]
-    _grids: Cache
+    transmitter: Annotated[np.ndarray, Shaped("3")]
+    frequency_hz: Annotated[float, within(*CARRIERS_HZ)]
+    shape: GridShape
+    floor: Floor
+    range_db: RangeDb
+    beam_sigma_rad: Beam
+    fitted_on: Annotated[np.ndarray, Shaped("R 3")] = field(default_factory=lambda: np.zeros((0, 3)))
+    fitted_under: Annotated[np.ndarray, Shaped("R 3")] | None = None
+    air: Air | None = None
+    device: DeviceLike = None
+    report: dict[str, Any] = field(default_factory=dict)
+    _grids: Cache = field(init=False, default_factory=lambda: Cache(2))
     models: ClassVar[dict[str, type[RadioField]]] = {}
 
     @property
     @abstractmethod
     def model(self) -> str:
         """Name of the model."""
+
+    @property
+    @abstractmethod
+    def mesh(self) -> Mesh | None:
+        """What blocks; None if the geometry has no mesh."""
 
     @classmethod
     def fit(cls, geometry: GeometryLike, ds: Data, model: str = "bistatic", **options: Any) -> RadioField:
@@ -140,17 +136,10 @@ class RadioField(ABC):
         if not issubclass(found, cls):
             raise ValueError(f"{os.fspath(path)}: holds a {found.__name__}, expected a {cls.__name__}")
         with tensor_files.named(path, "corrupt, or no radio field of this version"):
-            check_type("report", header["report"], dict)
-            parts: dict[str, Any] = {name: header[name] for name in _PLAIN} | {
-                "shape": tuple(header["shape"]),
-                "range_db": tuple(header["range_db"]),
-                "transmitter": tensors["transmitter"],
-                "fitted_on": tensors["fitted_on"],
-                "air": Air.from_attributes(header),
-                "report": header["report"],
-                "device": device,
-            }
-            return found(**parts, **found._put_together(tensors, header))
+            parts = {name: header[name] for name in _PLAIN} | found._put_together(tensors, header)
+            parts |= {name: tensors[name] for name in ("transmitter", "fitted_on")}
+            air, under = Air.from_attributes(header), tensors.get("fitted_under")
+            return found(**parts, fitted_under=under, air=air, device=device)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything to one safetensors file, in one go."""
@@ -162,10 +151,7 @@ class RadioField(ABC):
         tensors |= {"transmitter": self.transmitter, "fitted_on": self.fitted_on}
         if self.fitted_under is not None:
             tensors["fitted_under"] = self.fitted_under
-        header |= {name: getattr(self, name) for name in _PLAIN} | {
-            "model": self.model,
-            "report": self.report,
-        }
+        header |= {name: getattr(self, name) for name in _PLAIN} | {"model": self.model}
         return tensors, header | ({} if self.air is None else self.air.attributes)
 
     @abstractmethod
@@ -241,8 +227,8 @@ class RadioField(ABC):
             return self
         smaller = float(np.prod(self.shape) / np.prod(shape))
         low, high = (level + 10.0 * float(np.log10(smaller)) for level in self.range_db)
-        new = {"shape": shape, "floor": self.floor * smaller, "range_db": (low, high)}
-        return self._grids.get(shape, lambda: replace(cast(Any, self), **new))
+        floor = self.floor * smaller
+        return self._grids.get(shape, lambda: replace(self, shape=shape, floor=floor, range_db=(low, high)))
 
     def spectra(
         self,
@@ -554,8 +540,7 @@ class RadioField(ABC):
             raise ValueError(
                 f"mirror_order: got {options.mirror_order!r}, but a field of model {self.model!r} has no mirrors"
             )
-        shape, sigma = check_shape(options.shape or self.shape), options.beam_sigma_rad
-        return partial(_links, self, shape, sigma), 1
+        return partial(_links, self, options.shape or self.shape, options.beam_sigma_rad), 1
 
     def radio_map(
         self, height: float, cell: float = 0.25, transmitter: ArrayLike | None = None, **options: Any
@@ -580,19 +565,9 @@ class RadioField(ABC):
         return measured_at(ds, self.fitted_on, under)
 
     def __post_init__(self) -> None:
-        """Check what every model has; ValueError or TypeError names the attribute."""
-        object.__setattr__(self, "_grids", Cache(2))
-        object.__setattr__(self, "transmitter", check_array("transmitter", self.transmitter, (3,)))
+        """Check what annotations do not say; ValueError names the attribute."""
         if self.device is not None:  # its name: a wp.Device cannot be pickled
             object.__setattr__(self, "device", str(self.device))
-        check_number("frequency_hz", self.frequency_hz, *CARRIERS_HZ)
-        check_shape(self.shape)
-        check_positive("floor", self.floor, "linear noise floor")
-        check_range_db(self.range_db)
-        check_beam(self.beam_sigma_rad)
-        known = check_array("fitted_on", self.fitted_on, (None, 3))
-        if self.fitted_under is not None:
-            check_array("fitted_under", self.fitted_under, known.shape)
         if np.abs(self.transmitter).max() > LARGEST_M:
             raise ValueError(f"transmitter: got {self.transmitter}, expected at most {LARGEST_M:g} m")
         if self.air is not None:

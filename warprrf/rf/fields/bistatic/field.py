@@ -41,7 +41,7 @@ from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.channel.array_spectra import check_steering
 from warprrf.rf.channel.arrays import PlanarArray
-from warprrf.rf.em.absorption import Air, Gas, air_of
+from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.materials import Material
 from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import Data, Measured, RadioField, with_settings
@@ -90,10 +90,6 @@ class BistaticField(RadioField):
 
     Attributes:
         surface: patches, material groups and elements.
-        transmitter: position it was fitted for [m], shape ``(3,)``.
-        frequency_hz: carrier [Hz].
-        shape: rows and columns of its spectra.
-        floor, range_db, beam_sigma_rad: of the data set it was fitted to.
         effects: what it models.
         parameters: of the groups; those of one material are alike.
         material: of each group, shape ``(G,)``.
@@ -101,33 +97,19 @@ class BistaticField(RadioField):
             ``(2, X)``; see :mod:`warprrf.rf.fields.bistatic.residual`.
         errors: how wrong it is; None if it was fitted to fewer receivers than that takes.
         sub_pixels: square root of the rays per pixel.
-        air: absorption of every path: that of the data set it was fitted to; None for none.
-        fitted_on: receivers that it was fitted to [m], shape ``(R, 3)``.
-        fitted_under: transmitter of each of those [m], shape ``(R, 3)``; None for its own.
-        report: how the fit went.
-        device: where it computes.
+
+    The others are those of :class:`RadioField`.
     """
 
     __repr__ = one_line
 
     surface: Surface = field(repr=False)
-    transmitter: np.ndarray
-    frequency_hz: float
-    shape: tuple[int, int]
-    floor: float
-    range_db: tuple[float, float]
-    beam_sigma_rad: float
     effects: Effects
     parameters: Parameters = field(repr=False)
     material: np.ndarray = field(repr=False)
     residual: np.ndarray = field(repr=False)
     errors: ErrorModel | None = field(default=None, repr=False)
     sub_pixels: Annotated[int, whole(1, 16)] = SUB_PIXELS
-    air: Air | None = None
-    fitted_on: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
-    fitted_under: np.ndarray | None = field(default=None, repr=False)
-    report: dict[str, Any] = field(default_factory=dict, repr=False)
-    device: DeviceLike = field(default=None, repr=False)
     _maps: Cache = field(init=False, repr=False, default_factory=lambda: Cache(2))
 
     def __post_init__(self) -> None:
@@ -153,7 +135,7 @@ class BistaticField(RadioField):
         return "bistatic"
 
     @property
-    def mesh(self) -> Mesh:  # type: ignore[override]
+    def mesh(self) -> Mesh:
         """What blocks."""
         return self.surface.mesh
 

@@ -71,6 +71,5 @@ def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict
         "parameters": Parameters(**parameters),
         "material": tensors["material"],
         "residual": tensors["residual"],
-        "fitted_under": tensors.get("fitted_under"),
         "errors": ErrorModel(**errors) if errors else None,
     }

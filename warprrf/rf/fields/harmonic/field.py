@@ -36,7 +36,7 @@ from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.geometry.splats.gaussians import Gaussians, discs_on_mesh, gaussians_of
 from warprrf.geometry.splats.rasterizer import Parameters, Rasterizer
 from warprrf.kernels.radio import harmonics as _kernels
-from warprrf.rf.em.absorption import Air, Gas, air_of
+from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField, with_settings
 from warprrf.rf.fields.harmonic import fitting
@@ -73,40 +73,25 @@ class HarmonicField(RadioField):
 
     Attributes:
         gaussians: frozen geometry.
-        mesh: surface for line of sight; None if the geometry has none.
-        transmitter: position it was fitted for [m], shape ``(3,)``.
-        frequency_hz: carrier [Hz].
-        shape: rows and columns of its spectra.
-        floor, range_db, beam_sigma_rad: of the data set it was fitted to.
         options: what it computes.
         layers: coefficients per Gaussian, shape ``(N, 16)`` float32: ``gain``, and for ``rf3dgs`` ``delay`` and
             ``aod_x``, ``aod_y``, ``aod_z``.
         gain_unit: linear factor of the gain layer.
         delay_unit: seconds per unit of the delay layer.
-        air: absorption over every path's length, that of the data set it was fitted to; None for none. ``rf3dgs`` has
-            lengths for an explicit line of sight alone and learns it with the gain.
-        fitted_on: receivers whose spectra it was fitted to [m], shape ``(R, 3)``.
-        report: how the fit went: seconds, pairs, losses, Gaussians seen.
+        mesh: surface for line of sight; None if the geometry has none.
+
+    The others are those of :class:`RadioField`. ``rf3dgs`` has lengths, for ``air`` to absorb over, of an explicit line of
+    sight alone, and learns the rest with the gain.
     """
 
     __repr__ = one_line
 
     gaussians: Gaussians = field(repr=False)
-    mesh: Mesh | None = field(repr=False)
-    transmitter: np.ndarray
-    frequency_hz: float
-    shape: tuple[int, int]
-    floor: float
-    range_db: tuple[float, float]
-    beam_sigma_rad: float
     options: FieldOptions
     layers: dict[str, np.ndarray] = field(repr=False)
     gain_unit: Positive
     delay_unit: Annotated[float, within(0.0, 1.0)]
-    air: Air | None = None
-    fitted_on: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
-    report: dict[str, Any] = field(default_factory=dict, repr=False)
-    device: DeviceLike = field(default=None, repr=False)
+    mesh: Mesh | None = field(default=None, repr=False)
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(8))
 
     def __post_init__(self) -> None:
