@@ -13,6 +13,7 @@ from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.relevance.model import full_field, material_parameters, with_lobes
 from warprrf.rf.relevance.search import Relevance, choose, full_model, relevance
+from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.tracing.model import SETS, Effects
 
 RECEIVERS = RECEIVERS[:4]
@@ -133,7 +134,7 @@ def test_a_larger_tolerance_never_keeps_more(several):
 
 def test_the_choice_stays_within_its_tolerance(slabs, several):
     """Checked on spectra made anew, not on what the choice was made with."""
-    full = full_field(slabs, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA)[0]
+    full = full_field(slabs, SpectrumDataset.empty(**OPTIONS))[0]
     for found in several[1:4]:
         assert max(found.image_db, found.total_db) <= found.tolerance_db
         smallest = with_lobes(full.parameters, found.lobes)

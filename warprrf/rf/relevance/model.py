@@ -22,7 +22,6 @@ from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import default_floor, pixel_solid_angles, to_db
 from warprrf.rf.tracing.model import Effects, Parameters
 from warprrf.rf.tracing.render import images
-from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import View
 
 EVERYTHING = Effects(mirrors=2)
@@ -60,30 +59,21 @@ def material_parameters(materials: Sequence[Any], frequency_hz: float) -> Parame
         )  # fmt: skip
 
 
-def full_field(
-    geometry: Any,
-    *,
-    transmitter: np.ndarray,
-    frequency_hz: float,
-    shape: tuple[int, int],
-    beam_sigma_rad: float,
-    device: Any = None,
-) -> tuple[BistaticField, str]:
+def full_field(geometry: Any, frame: SpectrumDataset, device: Any = None) -> tuple[BistaticField, str]:
     """A field with every effect on for a Scene, Reconstruction, Mesh or bistatic field, and where its materials come from:
-    ``"scene"``, ``"fit"`` or ``"assumed"``."""
+    ``"scene"``, ``"fit"`` or ``"assumed"``.
+
+    Of ``frame`` transmitter, carrier, grid and beam count; where a field is given, the transmitter alone."""
     if isinstance(geometry, BistaticField):
         effects = replace(EVERYTHING, residual=geometry.effects.residual)
         # Air is judged by itself.
-        return replace(geometry, effects=effects, transmitter=transmitter, air=None), "fit"
-    surface = Surface.of(geometry)
-    none = SpectrumDataset.empty(
-        transmitter=transmitter, frequency_hz=frequency_hz, shape=shape, beam_sigma_rad=beam_sigma_rad
-    )
-    field = BistaticField.prior(surface, none, effects=replace(EVERYTHING, residual=False), device=device)
+        return replace(geometry, effects=effects, transmitter=frame.transmitter, air=None), "fit"
+    field = BistaticField.prior(geometry, frame, effects=replace(EVERYTHING, residual=False), device=device)
     if not hasattr(geometry, "materials"):
         return field, "assumed"
-    parameters = material_parameters(geometry.materials, frequency_hz)
-    return replace(field, parameters=replace(parameters, log_through=surface.slabs(frequency_hz)[2])), "scene"
+    parameters = material_parameters(geometry.materials, frame.frequency_hz)
+    through = field.parameters.log_through
+    return replace(field, parameters=replace(parameters, log_through=through)), "scene"
 
 
 def with_lobes(p: Parameters, kept: tuple[int, ...]) -> Parameters:

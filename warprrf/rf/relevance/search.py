@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from warprrf.checks import check_array, checked, one_line, positive
+from warprrf.checks import checked, one_line, positive
 from warprrf.device import Progress
 from warprrf.files import read_json, write_json
 from warprrf.geometry.mesh import as_mesh
@@ -27,7 +27,8 @@ from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.options import RARE
 from warprrf.rf.positions import check_positions, check_receivers, question_unit
 from warprrf.rf.relevance.model import FullModel, effects_of, full_field, lobe_name
-from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape
+from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD
 from warprrf.rf.tracing.model import Effects
 
 TITLES = {
@@ -294,16 +295,12 @@ def full_model(
 ) -> tuple[FullModel, str]:
     """What :func:`choose` takes, for the arguments of :func:`relevance`; errors as there."""
     asked = Setting(**setting).of(geometry)
-    frequency_hz = check_frequency(asked.frequency_hz)
-    question_unit(as_mesh(geometry, "geometry"), SPEED_OF_LIGHT / frequency_hz)
-    full, source = full_field(
-        geometry,
-        transmitter=check_array("transmitter", asked.transmitter, (3,)),
-        frequency_hz=frequency_hz,
-        shape=check_shape(asked.shape),
-        beam_sigma_rad=asked.beam_sigma_rad,
-        device=device,
+    at, frequency_hz = asked.transmitter, check_frequency(asked.frequency_hz)
+    frame = SpectrumDataset.empty(
+        transmitter=at, frequency_hz=frequency_hz, shape=asked.shape, beam_sigma_rad=asked.beam_sigma_rad
     )
+    question_unit(as_mesh(geometry, "geometry"), SPEED_OF_LIGHT / frequency_hz)
+    full, source = full_field(geometry, frame, device)
     places = np.atleast_2d(check_receivers("receivers", receivers))
     known = geometry.transmitter if isinstance(geometry, BistaticField) else None
     check_positions(full.mesh, full.transmitter, places, full.wavelength_m, known=known, device=device)
