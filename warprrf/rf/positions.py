@@ -35,6 +35,7 @@ small they are: Friis's formula does not hold, and gives gains above one within 
 radiansphere around a small antenna", Proc. IRE 47 (1959)."""
 
 _DIRECTIONS = 24
+_UPWARD = _DIRECTIONS, 0.0, 1.0  # of a lattice over the upper half of the sphere, from low to steep
 _BANDS = 3  # of rays upward: low, slanting, steep; a fourth of as many is overhead
 _LEAK = 0.02  # share of rays that may leave a closed room: its walls need not meet exactly
 _AT_ONCE = 20_000  # places whose rays are cast in one launch
@@ -304,9 +305,11 @@ def under_a_roof(mesh: Mesh, points: np.ndarray, *, device: DeviceLike = None) -
     bool; in doubt it is not."""
     found = np.zeros(len(points), dtype=bool)
     agreed = 0.75  # share of the rays of a band that must say the same
+    overhead = lattice(_DIRECTIONS // _BANDS, 0.98, 1.0)
+    upward = np.concatenate([lattice(*_UPWARD), overhead])
     for first in range(0, len(points), _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
-        winding, _ = mesh.crossings(points[some], np.concatenate([_upward(), _overhead()]), device=device)
+        winding, _ = mesh.crossings(points[some], upward, device=device)
         middle = np.median(winding, axis=1, keepdims=True)
         for votes in (winding % 2 == 1, (winding == middle) & (middle != 0)):
             share = votes.reshape(len(votes), _BANDS + 1, -1).mean(axis=2)
@@ -473,33 +476,16 @@ def _spread(mesh: Mesh) -> np.ndarray:
 
 def _sky_over(mesh: Mesh, points: np.ndarray, device: DeviceLike) -> np.ndarray:
     """Whether a third of the rays upward from ``points`` (N, 3) meets nothing, shape ``(N,)``, bool."""
-    side = mesh.crossings(points, _upward(), device=device)[1]
+    side = mesh.crossings(points, lattice(*_UPWARD), device=device)[1]
     sky = 1.0 / 3.0  # share of rays upward that meet nothing where there is sky
     return np.asarray((side == 0).mean(axis=1) >= sky)
 
 
 @lru_cache(maxsize=4)
-def lattice(count: int) -> np.ndarray:
-    """Directions ``(count, 3)`` spread over the sphere: a Fibonacci lattice, of which none runs along a wall."""
+def lattice(count: int, first: float = 1.0, last: float = -1.0) -> np.ndarray:
+    """Directions ``(count, 3)`` spread over the sphere, or what of it lies between two heights, sines of the elevation: a
+    Fibonacci lattice, of which none runs along a wall."""
     k = np.arange(count) + 0.5
-    return _turned(1.0 - 2.0 * k / count, k)
-
-
-@lru_cache(maxsize=1)
-def _upward() -> np.ndarray:
-    """Directions likewise spread over the upper half of the sphere, from low to steep."""
-    k = np.arange(_DIRECTIONS) + 0.5
-    return _turned(k / _DIRECTIONS, k)
-
-
-@lru_cache(maxsize=1)
-def _overhead() -> np.ndarray:
-    """As many directions straight up, nearly, as a band of those has."""
-    k = np.arange(_DIRECTIONS // _BANDS) + 0.5
-    overhead = 0.98  # least sine of the elevation there
-    return _turned(overhead + (1.0 - overhead) * k / len(k), k)
-
-
-def _turned(height: np.ndarray, k: np.ndarray) -> np.ndarray:
-    azimuth, across = np.pi * (1.0 + np.sqrt(5.0)) * k, np.sqrt(1.0 - height**2)
+    azimuth, height = np.pi * (1.0 + np.sqrt(5.0)) * k, first + (last - first) * k / count
+    across = np.sqrt(1.0 - height**2)
     return np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), height])
