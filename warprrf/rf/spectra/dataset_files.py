@@ -133,13 +133,9 @@ def _rounded(arrays: Mapping[str, np.ndarray], floor: float) -> tuple[dict[str, 
 
 def _round_mantissa(values: np.ndarray, bits: int, step: float) -> np.ndarray:
     """float32 values with ``bits`` explicit mantissa bits, and no finer than a power of two of at most ``step``."""
-    step = 2.0 ** np.floor(np.log2(step))
-    coarse = np.round(values.astype(np.float64) / step) * step  # steps below float32's range
-    rounded = np.where(values < step * 2.0**bits, coarse, values).astype(np.float32)
-    drop = 23 - bits
-    whole = rounded.view(np.uint32)
-    half = np.uint32((1 << (drop - 1)) - 1) + ((whole >> np.uint32(drop)) & np.uint32(1))  # ties to even
-    return ((whole + half) & np.uint32(0xFFFFFFFF ^ ((1 << drop) - 1))).view(np.float32)
+    last_bit = np.frexp(values)[1] - 1 - bits  # the power of two that it stands for
+    steps = np.ldexp(1.0, np.maximum(last_bit, int(np.floor(np.log2(step)))))
+    return (np.round(values / steps) * steps).astype(np.float32)
 
 
 def export_exr(path: str | os.PathLike[str], spectrum: Spectrum) -> None:
