@@ -40,7 +40,7 @@ from warprrf.rf.em.absorption import Air, Gas
 from warprrf.rf.em.waves import CARRIERS_HZ, SPEED_OF_LIGHT
 from warprrf.rf.fields.batches import Batch, Work
 from warprrf.rf.fields.location import Location
-from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
+from warprrf.rf.maps.links import LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
 from warprrf.rf.paths.path_set import PATH_VARIABLES, Paths, attributes_of
 from warprrf.rf.positions import Ends, check_positions, retraced_slope
@@ -641,5 +641,5 @@ def _sampled(option: Any) -> Any:
 
 
 def _links(field: RadioField, shape: tuple[int, int], sigma: float, part: Part) -> Links:
-    search = BeamSearch(shape, sigma, device=field.device)
-    return links_of(_paths(field, None, part), search)
+    (paths,) = _paths(field, None, part)
+    return links_of(paths, shape, sigma, field.device)

@@ -8,7 +8,6 @@ pixels of a grid for what is diffuse.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -75,57 +74,46 @@ def directivity(sigma: float, cosine: Any = 1.0) -> np.ndarray:
     return np.asarray(2.0 * kappa * np.exp(kappa * (cosine - 1.0)) / -np.expm1(-2.0 * kappa))
 
 
-class BeamSearch:
-    """Looks for the best direction of a receiver's beam.
+def best_beam_gain(
+    diffuse: np.ndarray,
+    receiver: np.ndarray,
+    arrival: np.ndarray,
+    power: np.ndarray,
+    sigma: float,
+    device: Any = None,
+) -> np.ndarray:
+    """Gain of each receiver's beam in its best direction, shape ``(R,)``.
 
     Args:
-        shape: rows and columns of the grid that diffuse power is given on.
+        diffuse: path gain per pixel, before any beam, shape ``(R, H, W)``.
+        receiver, arrival, power: each sharp path's receiver ``(L,)``, unit direction ``(L, 3)`` and gain ``(L,)``.
         sigma: beam width [rad].
-
-    Raises:
-        ValueError: for a width that is not positive.
+        device: where diffuse power is spread.
     """
-
-    def __init__(self, shape: tuple[int, int], sigma: float, *, device: Any = None) -> None:
-        self.shape, self.sigma = shape, sigma
-        self._beam = beam_operator(shape, sigma, device)
-        self._density = 4.0 * np.pi / pixel_solid_angles(shape)[:, None]
-
-    def __call__(
-        self, diffuse: np.ndarray, receiver: np.ndarray, arrival: np.ndarray, power: np.ndarray
-    ) -> np.ndarray:
-        """Gain of the best beam of each receiver, shape ``(R,)``.
-
-        Args:
-            diffuse: path gain per pixel, before any beam, shape ``(R, H, W)``.
-            receiver, arrival, power: each sharp path's receiver ``(L,)``, unit direction ``(L, 3)`` and gain ``(L,)``.
-        """
-        count = len(diffuse)
-        gain = np.moveaxis(self._beam(np.moveaxis(diffuse, 0, -1)), -1, 0) * self._density
-        best = gain.reshape(count, -1).max(axis=1)
-        order = np.argsort(receiver, kind="stable")
-        first = np.searchsorted(receiver[order], np.arange(count + 1))
-        for r in range(count):
-            own = order[first[r] : first[r + 1]]
-            if len(own):
-                to = arrival[own]
-                sharp = directivity(self.sigma, to @ to.T) @ power[own]
-                best[r] = max(best[r], (sharp + gain[r][pixel_of(to, self.shape)]).max())
-        return best
+    count, shape = len(diffuse), diffuse.shape[1:]
+    beam, density = beam_operator(shape, sigma, device), 4.0 * np.pi / pixel_solid_angles(shape)[:, None]
+    gain = np.moveaxis(beam(np.moveaxis(diffuse, 0, -1)), -1, 0) * density
+    best = gain.reshape(count, -1).max(axis=1)
+    order = np.argsort(receiver, kind="stable")
+    first = np.searchsorted(receiver[order], np.arange(count + 1))
+    for r in range(count):
+        own = order[first[r] : first[r + 1]]
+        if len(own):
+            to = arrival[own]
+            sharp = directivity(sigma, to @ to.T) @ power[own]
+            best[r] = max(best[r], (sharp + gain[r][pixel_of(to, shape)]).max())
+    return best
 
 
-def links_of(paths: Sequence[Paths], search: BeamSearch) -> Links:
-    """Links of receivers whose paths are known, one set each."""
-    found = []
-    for p in paths:
-        own = p.valid
-        power, toward = p.power[own], p.arrival[own]
-        rough = p.kind[own] == "diffuse"
-        image = np.zeros(search.shape)
-        np.add.at(image, pixel_of(toward[rough], search.shape), power[rough])
-        sharp = np.flatnonzero(~rough)
-        beam = search(image[None], np.zeros(len(sharp), int), toward[sharp], power[sharp])
-        timed = np.isfinite(p.tau[own])
-        spread = delay_spread(power[timed], p.tau[own][timed])[1] if timed.any() else np.nan
-        found.append((power.sum(), power.max(initial=0.0), float(spread), beam[0]))
-    return Links(*np.array(found, float).reshape(-1, 4).T)
+def links_of(paths: Paths, shape: tuple[int, int], sigma: float, device: Any = None) -> Links:
+    """Links ``(1,)`` of a receiver whose paths are known; its diffuse ones lie in pixels of a grid of ``shape``."""
+    own = paths.valid
+    power, toward, tau = paths.power[own], paths.arrival[own], paths.tau[own]
+    rough = paths.kind[own] == "diffuse"
+    image = np.zeros((1, *shape))
+    np.add.at(image[0], pixel_of(toward[rough], shape), power[rough])
+    sharp = np.flatnonzero(~rough)
+    beam = best_beam_gain(image, np.zeros(len(sharp), int), toward[sharp], power[sharp], sigma, device)
+    timed = np.isfinite(tau)
+    spread = delay_spread(power[timed], tau[timed])[1] if timed.any() else np.nan
+    return Links(*(np.array([x], float) for x in (power.sum(), power.max(initial=0.0), spread, beam[0])))

@@ -16,7 +16,7 @@ import numpy as np
 from warprrf.rf.channel.path_arrays import SCATTER
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.maps.links import BeamSearch, Links
+from warprrf.rf.maps.links import Links, best_beam_gain
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.spectrum import angles_from_directions, strongest_rays
 from warprrf.rf.tracing.model import Effects
@@ -153,5 +153,6 @@ def links(
     with np.errstate(invalid="ignore"):
         mean = moment / total
         spread = np.sqrt(np.maximum(square / total - mean**2, 0.0))
-    search = BeamSearch(shape, beam_sigma_rad, device=tracer.grid.device)
-    return Links(total, best, spread, search(image, paths.receiver, paths.arrival, specular))
+    sharp = paths.receiver, paths.arrival, specular
+    beam = best_beam_gain(image, *sharp, beam_sigma_rad, tracer.grid.device)
+    return Links(total, best, spread, beam)
