@@ -59,7 +59,8 @@ class _SceneFile:
                 self.bsdfs[element.get("as")] = self.bsdfs[element.get("id")]
 
     def parts(self) -> list[ScenePart]:
-        shapes = [shape for element in self.top for shape in _single_shapes(element)]
+        roots = [element for element in self.top if element.tag == "shape"]
+        shapes = [shape for root in roots for shape in root.iter("shape") if shape.get("type") != "merge"]
         if not shapes:
             raise ValueError(f"path: {self.path} holds no shapes")
         ids = [shape.get("id") or f"shape_{k}" for k, shape in enumerate(shapes)]
@@ -191,14 +192,12 @@ class _SceneFile:
                     name,
                     f"is a {kind!r}, expected one of ply, obj, {', '.join(_PRIMITIVES)}; export it as a mesh",
                 )
-            place = next((t for t in shape.findall("transform") if t.get("name") == "to_world"), None)
-            matrix = np.eye(4) if place is None else to_world(place)
+            matrix = to_world(shape.findall("transform[@name='to_world']/*"))
         except ValueError as error:
             if str(error).startswith("path: "):
                 raise
             raise self.wrong(name, str(error)) from error
-        if place is not None:
-            vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+        vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
         if not (np.abs(vertices) <= LARGEST_M).all():
             raise self.wrong(name, f"holds places that are NaN, infinite or beyond {LARGEST_M:g} m")
         flipped = (_text(shape, "flip_normals", "boolean") or "").strip().lower() == "true"
@@ -244,17 +243,9 @@ class _Builder(ElementTree.TreeBuilder):
         raise ValueError("it declares a document type, which a scene has no use for")
 
 
-def _single_shapes(element: Element) -> list[Element]:
-    """``element`` if it is a shape; those within if it is a ``merge`` of shapes."""
-    if element.tag != "shape":
-        return []
-    if element.get("type") != "merge":
-        return [element]
-    return [shape for part in element for shape in _single_shapes(part)]
-
-
 def _text(element: Element, name: str, tag: str = "string") -> str | None:
-    return next((part.get("value", "") for part in element.findall(tag) if part.get("name") == name), None)
+    part = element.find(f"{tag}[@name='{name}']")
+    return None if part is None else part.get("value", "")
 
 
 def _value(element: Element, name: str, default: float) -> float:
@@ -307,14 +298,14 @@ def _radio_material(element: Element, label: str) -> Material | None:
     return itu_material(identifier, name=label, **common) if itu_name(identifier) else None
 
 
-def to_world(transform: Element) -> np.ndarray:
-    """The matrix of a ``transform`` element, shape ``(4, 4)``: its parts apply one after the other, first to last.
+def to_world(parts: list[Element]) -> np.ndarray:
+    """The matrix of the parts of a ``transform`` element, shape ``(4, 4)``: they apply one after the other, first to last.
 
     Raises:
         ValueError: for parts that are unknown or hold no such numbers.
     """
     matrix = np.eye(4)
-    for part in transform:
+    for part in parts:
         if part.tag not in _TRANSFORMS:
             raise ValueError(
                 f"has the transform {part.tag!r}, expected one of {', '.join(_TRANSFORMS)}; apply it to the mesh"
@@ -334,11 +325,9 @@ def _vector(part: Element, name: str, default: float | None) -> np.ndarray:
     return np.array([_numbers(part.get(k, str(default)), f"the {part.tag} {k}", 1)[0] for k in "xyz"])
 
 
-def _affine(linear: np.ndarray, offset: np.ndarray | None = None) -> np.ndarray:
+def _affine(linear: np.ndarray, offset: np.ndarray | float = 0.0) -> np.ndarray:
     matrix = np.eye(4)
-    matrix[:3, :3] = linear
-    if offset is not None:
-        matrix[:3, 3] = offset
+    matrix[:3, :3], matrix[:3, 3] = linear, offset
     return matrix
 
 
@@ -420,7 +409,7 @@ def _cylinder(shape: Element) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _point(shape: Element, name: str, default: tuple[float, float, float]) -> np.ndarray:
-    part = next((p for p in shape.findall("point") if p.get("name") == name), None)
+    part = shape.find(f"point[@name='{name}']")
     return np.array(default) if part is None else _vector(part, name, 0.0)
 
 
