@@ -125,14 +125,14 @@ class Antenna:
             raise ValueError("gain: got both of gain and field or neither, expected one of them")
         shape = len(rows), len(columns)
         if field is None or gain is not None:
-            return cls(_Grid.of(rows, columns, check_array("gain", gain, shape)), polarisation)  # type: ignore[arg-type]
+            return cls(_gridded(rows, columns, check_array("gain", gain, shape)), polarisation)  # type: ignore[arg-type]
         ports = check_array("field", field, dtype=complex)
         ports = ports[None] if ports.ndim == 3 else ports
         if ports.ndim != 4 or ports.shape[1:] != (*shape, 2) or not 1 <= len(ports) <= 2:
             raise ValueError(
                 f"field: got shape {np.shape(field)}, expected {(*shape, 2)}, or that of one or two ports {('K', *shape, 2)}"
             )
-        return cls(tuple(_Grid.of(rows, columns, port) for port in ports), polarisation)
+        return cls(tuple(_gridded(rows, columns, port) for port in ports), polarisation)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], polarisation: str | None = None) -> Antenna:
@@ -371,7 +371,7 @@ def main_lobe(antenna: Antenna) -> Antenna:
     around = np.linspace(-np.pi, np.pi, 73)
     gain = own.gain(_off_boresight_directions(angle[:, None], around))
     ends = np.array([_flank_end(angle, row, gain.max()) for row in gain.T])
-    return replace(antenna, pattern=_MainLobe(own, around, ends), polarisation=None)
+    return replace(antenna, pattern=partial(_within_ends, own, around, ends), polarisation=None)
 
 
 def _isotropic(zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
@@ -417,28 +417,20 @@ class _OffBoresight:
         return _checked_gain(self.gain(angle), angle)
 
 
-@dataclass(frozen=True, eq=False)
-class _Grid:
-    """Values ``(T, P, ...)`` at zeniths (T,) and azimuths (P,), the last of which repeats the first."""
+def _gridded(zenith: np.ndarray, azimuth: np.ndarray, values: np.ndarray) -> Shape:
+    """Values ``(T, P)``, or ``(T, P, 2)``, between zeniths (T,) and azimuths (P,), all the way round."""
+    if azimuth[-1] - azimuth[0] < 2.0 * np.pi - 1e-6:
+        azimuth = np.append(azimuth, azimuth[0] + 2.0 * np.pi)
+        values = np.concatenate([values, values[:, :1]], axis=1)
+    grid = RegularGridInterpolator((zenith, azimuth), values, bounds_error=False, fill_value=None)
+    return partial(_on_grid, grid)
 
-    zenith: np.ndarray
-    azimuth: np.ndarray
-    values: np.ndarray
 
-    @classmethod
-    def of(cls, zenith: np.ndarray, azimuth: np.ndarray, values: np.ndarray) -> _Grid:
-        if azimuth[-1] - azimuth[0] < 2.0 * np.pi - 1e-6:
-            azimuth = np.append(azimuth, azimuth[0] + 2.0 * np.pi)
-            values = np.concatenate([values, values[:, :1]], axis=1)
-        return cls(zenith, azimuth, values)
-
-    def __call__(self, zenith: np.ndarray, azimuth: np.ndarray) -> Any:
-        turned = self.azimuth[0] + np.mod(azimuth - self.azimuth[0], 2.0 * np.pi)
-        grid = RegularGridInterpolator(
-            (self.zenith, self.azimuth), self.values, bounds_error=False, fill_value=None
-        )
-        found = grid((np.clip(zenith, self.zenith[0], self.zenith[-1]), np.minimum(turned, self.azimuth[-1])))
-        return found if self.values.ndim == 2 else (found[..., 0], found[..., 1])
+def _on_grid(grid: RegularGridInterpolator, zenith: np.ndarray, azimuth: np.ndarray) -> Any:
+    rows, columns = grid.grid
+    turned = columns[0] + np.mod(azimuth - columns[0], 2.0 * np.pi)
+    found = grid((np.clip(zenith, rows[0], rows[-1]), np.minimum(turned, columns[-1])))
+    return found if grid.values.ndim == 2 else (found[..., 0], found[..., 1])
 
 
 def _mean_gain(ports: Sequence[Shape], zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
@@ -448,19 +440,14 @@ def _mean_gain(ports: Sequence[Shape], zenith: np.ndarray, azimuth: np.ndarray) 
     return np.asarray(np.mean(gains, axis=0))
 
 
-@dataclass(frozen=True, eq=False)
-class _MainLobe:
-    """The gain of an antenna up to ends (A,) off boresight at the angles ``around`` it (A,)."""
-
-    antenna: Antenna
-    around: np.ndarray
-    end: np.ndarray
-
-    def __call__(self, zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
-        d = directions_from_angles(zenith, azimuth)
-        end = np.interp(np.arctan2(d[..., 2], d[..., 1]), self.around, self.end)
-        off = np.arctan2(np.hypot(d[..., 1], d[..., 2]), d[..., 0])
-        return np.where(off <= end, self.antenna.gain(d), 0.0)
+def _within_ends(
+    antenna: Antenna, around: np.ndarray, ends: np.ndarray, zenith: np.ndarray, azimuth: np.ndarray
+) -> np.ndarray:
+    """The gain of an antenna up to ``ends`` (A,) off boresight at the angles ``around`` it (A,)."""
+    d = directions_from_angles(zenith, azimuth)
+    end = np.interp(np.arctan2(d[..., 2], d[..., 1]), around, ends)
+    off = np.arctan2(np.hypot(d[..., 1], d[..., 2]), d[..., 0])
+    return np.where(off <= end, antenna.gain(d), 0.0)
 
 
 def _off_boresight_directions(angle: np.ndarray, around: np.ndarray) -> np.ndarray:
