@@ -27,6 +27,7 @@ from warprrf.rf.spectra.spectrum import (
     GridShape,
     RangeDb,
     Spectrum,
+    SpreadPaths,
     check_departures,
     check_shape,
     check_whole,
@@ -40,6 +41,7 @@ POLARISATION = "mean over vertical and horizontal transmit, sum over both receiv
 
 
 BeamWidth: TypeAlias = Annotated[float, positive("beam width in radians")]
+Flags: TypeAlias = Annotated[np.ndarray, lambda name, value: _check_flags(name, value), Shaped("R", np.bool_)]
 
 
 @runtime_checkable
@@ -124,7 +126,7 @@ class SpectrumDataset:
     polarisation: str
     seed: Seed
     role: NDArray[np.str_]
-    line_of_sight: np.ndarray
+    line_of_sight: Flags
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -132,7 +134,6 @@ class SpectrumDataset:
         check_shape(self.shape)
         check_departures(self.aod)
         object.__setattr__(self, "role", _check_roles(self.role, len(self)))
-        object.__setattr__(self, "line_of_sight", _check_flags(self.line_of_sight, len(self)))
         object.__setattr__(self, "attributes", _check_attributes(self.attributes))
 
     def __repr__(self) -> str:
@@ -391,20 +392,17 @@ class SpectrumDataset:
         check_whole("path_gain", self.path_gain)
         options |= {"boresight_gain_dbi": boresight_gain_dbi, "noise": noise, "progress": progress}
         done = deembed(self.path_gain, pattern, self.beam_sigma_rad, **options)
-        count, rows, columns = done.path_gain.shape
-        there = done.source.reshape(count, -1)
-        chosen = np.maximum(there, 0)
-        each = np.arange(count)[:, None]
-        delay = np.where(there >= 0, self.delay_s.reshape(count, -1)[each, chosen], np.nan)
-        aod = np.where(there[..., None] >= 0, self.aod.reshape(count, -1, 2)[each, chosen], np.nan)
-        gain = done.path_gain.astype(np.float32)
+        each = [SpreadPaths(*one) for one in zip(done.path_gain, done.source, strict=True)]
+        delay = [one.of_strongest(own.ravel()) for one, own in zip(each, self.delay_s, strict=True)]
+        aod = [one.of_strongest(own.reshape(-1, 2)) for one, own in zip(each, self.aod, strict=True)]
+        gain, count = done.path_gain.astype(np.float32), len(each)
         received = count > 0 and np.median(gain.max(axis=(1, 2))) > 0
         floor = default_floor(gain) if received else self.floor
         return replace(
             self,
             path_gain=gain,
-            delay_s=delay.reshape(count, rows, columns),
-            aod=aod.reshape(count, rows, columns, 2),
+            delay_s=np.reshape(delay, self.delay_s.shape),
+            aod=np.reshape(aod, self.aod.shape),
             floor=floor,
             range_db=(10.0 * float(np.log10(floor)), float(to_db(gain.max(initial=0.0), floor))),
             attributes={
@@ -510,13 +508,12 @@ def _check_roles(role: ArrayLike, count: int) -> np.ndarray:
     return found.astype("<U5")
 
 
-def _check_flags(value: ArrayLike, count: int) -> np.ndarray:
-    found = check_array("line_of_sight", value, (count,))
-    if not np.isin(found, (0.0, 1.0)).all():
-        raise ValueError(
-            f"line_of_sight: got {found[~np.isin(found, (0.0, 1.0))][0]:g}, expected True and False"
-        )
-    return found.astype(bool)
+def _check_flags(name: str, value: np.ndarray) -> np.ndarray:
+    found = check_array(name, value)
+    wrong = found[~np.isin(found, (0.0, 1.0))]
+    if wrong.size:
+        raise ValueError(f"{name}: got {wrong[0]:g}, expected True and False")
+    return found
 
 
 def _check_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:

@@ -77,7 +77,7 @@ class Deembedded(NamedTuple):
 
 
 def deembed(
-    path_gain: ArrayLike,
+    path_gain: np.ndarray,
     pattern: Pattern,
     beam_sigma_rad: float,
     *,
@@ -95,9 +95,7 @@ def deembed(
         TypeError: for an option of the other kind of antenna.
         ValueError: for noise with a fixed antenna, or naming another argument.
     """
-    power = check_array("path_gain", path_gain, (None, None, None))
-    if (power < 0).any():
-        raise ValueError(f"path_gain: got {int((power < 0).sum())} negative values, expected linear power")
+    power = np.asarray(path_gain, np.float64)
     fixed = None
     if not callable(pattern) and not isinstance(pattern, Antenna | str):
         fixed = check_array("pattern", pattern, finite=False)

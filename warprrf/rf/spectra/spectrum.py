@@ -21,15 +21,16 @@ from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.checks import (
+    NotNegative,
     check_array,
     check_count,
     check_items,
     check_known_whole,
-    check_number,
     check_positive,
     checked,
     one_line,
     positive,
+    within,
 )
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
@@ -60,15 +61,6 @@ def check_shape(shape: Sequence[int]) -> tuple[int, int]:
     return rows, columns
 
 
-def check_beam(beam_sigma_rad: float) -> float:
-    """``beam_sigma_rad`` as a beam width from :data:`NARROWEST_BEAM_RAD` to pi.
-
-    Raises:
-        ValueError: otherwise.
-    """
-    return check_number("beam_sigma_rad", beam_sigma_rad, NARROWEST_BEAM_RAD, np.pi)
-
-
 def check_range_db(range_db: Sequence[float]) -> tuple[float, float]:
     """``range_db`` as lowest and highest value [dB].
 
@@ -82,7 +74,7 @@ def check_range_db(range_db: Sequence[float]) -> tuple[float, float]:
 
 
 GridShape: TypeAlias = Annotated[tuple[int, int], lambda _, shape: check_shape(shape)]
-Beam: TypeAlias = Annotated[float, lambda _, width: check_beam(width)]
+Beam: TypeAlias = Annotated[float, within(NARROWEST_BEAM_RAD, np.pi)]
 RangeDb: TypeAlias = Annotated[tuple[float, float], lambda _, range_db: check_range_db(range_db)]
 Floor: TypeAlias = Annotated[float, positive("linear noise floor")]
 
@@ -464,8 +456,8 @@ class Spectrum:
     path_gain: np.ndarray
     delay_s: np.ndarray | None = None
     aod: np.ndarray | None = None
-    floor: float = 0.0
-    range_db: tuple[float, float] | None = None
+    floor: NotNegative = 0.0
+    range_db: RangeDb | None = None
     std_db: np.ndarray | None = None
     attributes: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
@@ -479,9 +471,6 @@ class Spectrum:
                 object.__setattr__(self, name, np.asarray(value))
         if self.aod is not None:
             check_departures(self.aod)
-        check_number("floor", self.floor, least=0.0)
-        if self.range_db is not None:
-            check_range_db(self.range_db)
 
     @property
     def shape(self) -> tuple[int, int]:
