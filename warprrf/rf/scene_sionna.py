@@ -275,26 +275,14 @@ def _sionna_pattern(rt: Any, antenna: Antenna) -> Any:
     fields = antenna.field(directions_from_angles(*np.meshgrid(zenith, azimuth, indexing="ij")))
 
     def port(field: np.ndarray) -> Any:
-        planes = [
-            mi.Float(np.ascontiguousarray(part.ravel(), np.float32))
-            for end in np.moveaxis(np.asarray(field, complex), -1, 0)
-            for part in (end.real, end.imag)
-        ]
+        parts = np.concatenate([np.real(field), np.imag(field)], axis=-1).astype(np.float32)
+        table = mi.Texture2f(mi.TensorXf(parts), wrap_mode=dr.WrapMode.Clamp, use_accel=False)
 
         def towards(theta: Any, phi: Any) -> Any:
             row, column = theta / np.pi * (rows - 1), (phi / (2.0 * np.pi) + 0.5) * (columns - 1)
-            i, j = (mi.UInt32(dr.clip(a, 0, n - 2)) for a, n in ((row, rows), (column, columns)))
-            u, v = row - mi.Float(i), column - mi.Float(j)
-
-            def at(plane: Any) -> Any:
-                corner = [
-                    [dr.gather(mi.Float, plane, (i + a) * columns + j + b) for b in (0, 1)] for a in (0, 1)
-                ]
-                above, below = (one + v * (other - one) for one, other in corner)
-                return above + u * (below - above)
-
-            along, across = (mi.Complex2f(at(re), at(im)) for re, im in (planes[:2], planes[2:]))
-            return along, across
+            # texels have their centres half a texel from the edges
+            along, across, *imaginary = table.eval(mi.Point2f((column + 0.5) / columns, (row + 0.5) / rows))
+            return mi.Complex2f(along, imaginary[0]), mi.Complex2f(across, imaginary[1])
 
         return towards
 
