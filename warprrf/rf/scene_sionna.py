@@ -14,7 +14,7 @@ import glob
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -112,7 +112,7 @@ def array_from_sionna(rt_array: Any) -> PlanarArray:
 
 def _antenna(pattern: Any) -> Antenna:
     """Our antenna of a ``sionna.rt.AntennaPattern``: by name where it is everywhere the same as ours of a name."""
-    live = Antenna(tuple(_SionnaPort(port) for port in pattern.patterns))
+    live = Antenna(tuple(partial(_sionna_port, port) for port in pattern.patterns))
     towards = pixel_directions((18, 36)).reshape(-1, 3)
     fields = live.field(towards)
     for name in PATTERNS:
@@ -123,25 +123,20 @@ def _antenna(pattern: Any) -> Antenna:
     return live
 
 
-@dataclass(frozen=True, eq=False)
-class _SionnaPort:
+def _sionna_port(function: Any, zenith: np.ndarray, azimuth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """One of the functions of a ``sionna.rt.AntennaPattern`` on NumPy's arrays."""
+    floats = select_variant().Float
+    # where padded, directions are not known: Sionna gets some number, and what it says of it is unknown too
+    known = np.isfinite(zenith)
+    theta, phi = (floats(np.where(known, a, 0.0).astype(np.float32).ravel()) for a in (zenith, azimuth))
 
-    function: Any
+    def numbers(field: Any) -> np.ndarray:
+        parts = (np.array(part, np.float64) for part in (field.real, field.imag))
+        re, im = (np.broadcast_to(part, theta.numpy().shape).reshape(zenith.shape) for part in parts)
+        return np.where(known, re + 1j * im, np.nan)
 
-    def __call__(self, zenith: np.ndarray, azimuth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        floats = select_variant().Float
-        # where padded, directions are not known: Sionna gets some number, and what it says of it is unknown too
-        known = np.isfinite(zenith)
-        theta, phi = (floats(np.where(known, a, 0.0).astype(np.float32).ravel()) for a in (zenith, azimuth))
-
-        def numbers(field: Any) -> np.ndarray:
-            parts = (np.array(part, np.float64) for part in (field.real, field.imag))
-            re, im = (np.broadcast_to(part, theta.numpy().shape).reshape(zenith.shape) for part in parts)
-            return np.where(known, re + 1j * im, np.nan)
-
-        along, across = self.function(theta, phi)
-        return numbers(along), numbers(across)
+    along, across = function(theta, phi)
+    return numbers(along), numbers(across)
 
 
 def _shortest(values: Any) -> np.ndarray:

@@ -68,9 +68,8 @@ class BeamOperator:
         x = np.moveaxis(rfft(flat, axis=1), 1, 0)
         out = irfft(np.moveaxis(self._matrices[name, real] @ x, 0, 1), n=columns, axis=1)
         size = np.abs(out)
-        largest = size.max(axis=0).max(
-            axis=0
-        )  # half the time of both axes at once, as is a product to a mask
+        # half the time of both axes at once, as is a product to a mask
+        largest = size.max(axis=0).max(axis=0)
         out *= size >= 50.0 * np.finfo(real).eps * largest
         return out.reshape(images.shape).astype(images.dtype, copy=False)
 

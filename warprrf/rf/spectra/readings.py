@@ -321,9 +321,8 @@ def question_readings(readings: Readings) -> None:
     free_space = np.minimum(
         free_space_gain(r.transmitters, r.receivers, r.frequency_hz) * 10.0 ** (gain_db / 10.0), 1.0
     )
-    fading_db = 10.0 * (
-        r.samples is not None
-    )  # a power at one place above the mean of its fading: 1 in 20,000, if Rayleigh's
+    # a power at one place above the mean of its fading: 1 in 20,000, if Rayleigh's
+    fading_db = 10.0 * (r.samples is not None)
     margin_db = MARGIN_DB + fading_db
     question_levels("power", np.where(known, r.power, np.nan), free_space, margin_db=margin_db)
     above = np.flatnonzero(~known & (r.power > 1.0))
