@@ -259,11 +259,8 @@ def is_free(
     if clearance_m > 0:
         free[free] = mesh.distance(points[free], device=device) >= clearance_m
     free[free] = ~parted(mesh, points[free], known, device=device)
-    if known is not None:
-        floor = bool(_is_over(mesh, known[None], device)[0])
-    else:
-        floor = bool(_is_over(mesh, _spread(mesh), device).mean() > 0.1)
-    if floor:
+    places = _spread(mesh) if known is None else known[None]
+    if _is_over(mesh, places, device).mean() > 0.1:
         free[free] = _is_over(mesh, points[free], device)
     return free
 
