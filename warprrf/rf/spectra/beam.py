@@ -40,15 +40,11 @@ class BeamOperator:
     def _matrix(self) -> csr_matrix:
         """The map as a sparse matrix, because a beam ends a few widths from its centre, in single precision."""
         rows, columns = self.shape
-        out, own, value = [], [], []
         turn = np.arange(columns)
-        for i in range(rows):
-            m, j = np.nonzero(self._kernel[..., i])
-            out.append((m[:, None] * columns + (j[:, None] + turn) % columns).ravel())
-            own.append(np.broadcast_to(i * columns + turn, (len(m), columns)).ravel())
-            value.append(np.repeat(self._kernel[m, j, i], columns))
-        places = (np.concatenate(out), np.concatenate(own))
-        return csr_matrix((np.concatenate(value).astype(np.float32), places), shape=(rows * columns,) * 2)
+        m, j, i = np.nonzero(self._kernel)
+        out, own = m[:, None] * columns + (j[:, None] + turn) % columns, i[:, None] * columns + turn
+        value = np.repeat(self._kernel[m, j, i].astype(np.float32), columns)
+        return csr_matrix((value, (out.ravel(), own.ravel())), shape=(rows * columns,) * 2)
 
     def __call__(self, images: np.ndarray, *, quick: bool = False) -> np.ndarray:
         """Spread ``images`` (H, W, ...), in their precision; what is below 1e-14 of the largest is rounding, and 0.
