@@ -185,55 +185,42 @@ def mark_seen(offset: int, gaussian: wp.array(dtype=int), seen: wp.array(dtype=i
 
 
 @wp.kernel(enable_backward=False)
-def list_seen(offset: int, row: wp.array(dtype=int), gaussian: wp.array(dtype=int)):
-    """The Gaussian of each row, from the rows of all, which are those of the next one where a Gaussian has none."""
-    g = offset + wp.tid()
-    if row[g + 1] > row[g]:
-        gaussian[row[g]] = g
-
-
-@wp.kernel(enable_backward=False)
 def gather_pairs(
     offset: int,
-    first: int,
-    row: wp.array(dtype=int),
+    first_pixel: int,
+    first_pair: int,
+    start: wp.array(dtype=int),
     gaussian: wp.array(dtype=int),
+    row: wp.array(dtype=int),
+    pixel_start: wp.array(dtype=int),
+    pixel: wp.array(dtype=int),
     keys: wp.array(dtype=int),
     order: wp.array(dtype=int),
 ):
-    """The row of each of a receiver's pairs, which are those from ``first`` on of a batch, to sort them by."""
-    e = offset + wp.tid()
-    keys[first + e] = row[gaussian[e]]
-    order[first + e] = first + e
-
-
-@wp.kernel(enable_backward=False)
-def gather_starts(
-    offset: int, pixel: int, first: int, start: wp.array(dtype=int), pixel_start: wp.array(dtype=int)
-):
-    """Where the pairs of a receiver's pixels begin, its first pair being ``first`` and its first pixel ``pixel``."""
+    """A receiver's pixels and pairs as those of a batch from ``first_pixel`` and ``first_pair`` on: where a pixel's pairs begin,
+    and of each pair its pixel, and its row, to sort them by. There is one thread more than pixels."""
     p = offset + wp.tid()
-    pixel_start[pixel + p] = first + start[p]
+    pixel_start[first_pixel + p] = first_pair + start[p]
+    if p + 1 < start.shape[0]:
+        for e in range(first_pair + start[p], first_pair + start[p + 1]):
+            pixel[e] = first_pixel + p
+            keys[e] = row[gaussian[e - first_pair]]
+            order[e] = e
 
 
 @wp.kernel(enable_backward=False)
-def invert(offset: int, order: wp.array(dtype=int), place: wp.array(dtype=int)):
-    """Where a pair has come to in ``order``."""
-    e = offset + wp.tid()
-    place[order[e]] = e
-
-
-@wp.kernel(enable_backward=False)
-def pixels_of_pairs(
+def sorted_pairs(
     offset: int,
     pixels: int,
-    pixel_start: wp.array(dtype=int),
-    pair_of_pixel: wp.array(dtype=int),
+    order: wp.array(dtype=int),
+    pixel: wp.array(dtype=int),
+    place: wp.array(dtype=int),
     pair_pixel: wp.array(dtype=int),
     pair_direction: wp.array(dtype=int),
 ):
-    """The pixel of each pair, of the batch and of its receiver, which has ``pixels``."""
-    p = offset + wp.tid()
-    for j in range(pixel_start[p], pixel_start[p + 1]):
-        pair_pixel[pair_of_pixel[j]] = p
-        pair_direction[pair_of_pixel[j]] = p % pixels
+    """Where a pair has come to in ``order``, and its pixel there, of the batch and of its receiver, which has ``pixels``."""
+    e = offset + wp.tid()
+    p = pixel[order[e]]
+    place[order[e]] = e
+    pair_pixel[e] = p
+    pair_direction[e] = p % pixels

@@ -90,30 +90,28 @@ class Problem:
         row = wp.zeros(count + 1, dtype=int, device=self.device)
         for view in self.transport.views:
             self.launch(_pairs.mark_seen, len(view.gaussian), view.gaussian, row)
+        seen = np.flatnonzero(row.numpy())
         wp.utils.array_scan(row, row, inclusive=False)
-        seen = wp.empty(int(row[count:].numpy()[0]), dtype=int, device=self.device)
-        self.launch(_pairs.list_seen, count, row, seen)
-        return row, seen.numpy()
+        return row, seen
 
     def _sorted(self, receivers: np.ndarray) -> Pairs:
         """The pairs of some receivers, sorted by Gaussian."""
         views = [self.transport.views[r] for r in receivers]
-        firsts = np.cumsum([0, *(len(view.gaussian) for view in views)]).tolist()
-        count, pixels = firsts[-1], self.pixels * len(views)
+        count, pixels = sum(len(view.gaussian) for view in views), self.pixels * len(views)
         keys, order = (wp.empty(2 * count, dtype=int, device=self.device) for _ in range(2))  # room to sort
+        pixel, place, pair_pixel, pair_direction = (
+            wp.empty(count, dtype=int, device=self.device) for _ in range(4)
+        )
         pixel_start = wp.empty(pixels + 1, dtype=int, device=self.device)
-        for k, (first, view) in enumerate(zip(firsts[:-1], views, strict=True)):
-            self.launch(_pairs.gather_pairs, len(view.gaussian), first, self._row, view.gaussian, keys, order)
-            at = self.pixels * k, first
-            self.launch(_pairs.gather_starts, self.pixels + 1, *at, view.start, pixel_start)
+        first = 0
+        for k, view in enumerate(views):
+            inputs = view.start, view.gaussian, self._row, pixel_start, pixel, keys, order
+            self.launch(_pairs.gather_pairs, self.pixels + 1, self.pixels * k, first, *inputs)
+            first += len(view.gaussian)
         wp.utils.radix_sort_pairs(keys, order, count, 0, len(self.seen).bit_length())
         row_start = wp.empty(len(self.seen) + 1, dtype=int, device=self.device)
         self.launch(tile_starts, len(row_start), keys, count, row_start)
-        place, pair_pixel, pair_direction = (wp.empty(count, dtype=int, device=self.device) for _ in range(3))
-        self.launch(_pairs.invert, count, order, place)
-        self.launch(
-            _pairs.pixels_of_pairs, pixels, self.pixels, pixel_start, place, pair_pixel, pair_direction
-        )
+        self.launch(_pairs.sorted_pairs, count, self.pixels, order, pixel, place, pair_pixel, pair_direction)
         weight = self.in_order(place, [view.weight for view in views])
         return Pairs(receivers, row_start, pair_pixel, pair_direction, weight, pixel_start, place)
 
@@ -140,11 +138,7 @@ class Problem:
 
 def harmonics(shape: tuple[int, int], real: type, device: DeviceLike) -> wp.array:
     """The 16 real harmonics at every pixel's direction, shape ``(H * W,)`` of 16-vectors, on the device."""
-    kernels = _kernels.build(real)
-    kind = np.float64 if real is wp.float64 else np.float32
-    toward: wp.array = wp.array(
-        pixel_directions(shape).reshape(-1, 3).astype(kind), dtype=kernels.vec3, device=device
-    )
+    kernels, toward = _kernels.build(real), pixel_directions(shape).reshape(-1, 3)
     out = wp.zeros(len(toward), dtype=kernels.vec16, device=device)
     _device.launch(kernels.evaluate_basis, len(toward), [toward, out], device=device)
     return out
