@@ -12,7 +12,7 @@ import warprrf as wr
 from warprrf.device import launch
 from warprrf.geometry.splats.gaussians import discs_on_mesh
 from warprrf.geometry.splats.rasterizer import RADIO, Rasterizer
-from warprrf.kernels.radio.opacity import count_up
+from warprrf.kernels.radio.transport import mark_seen
 from warprrf.rf.fields.harmonic.transport import transport
 
 pytestmark = [pytest.mark.cuda, pytest.mark.parametrize("device", ["cuda:0"], indirect=True)]
@@ -43,7 +43,7 @@ def test_copies_are_counted_both_ways(device):
         there.assign(np.ones(10, np.float32))
         there.numpy()
         wp.array(np.zeros(10), dtype=wp.float64, device="cpu").numpy()  # these stay where they are
-        launch(count_up, 5, [wp.zeros(5, dtype=int, device=device)], device=device)
+        launch(mark_seen, 5, [wp.zeros(5, dtype=int, device=device) for _ in range(2)], device=device)
     assert counted == {"up": 80, "up, copies": 2, "down": 40, "down, copies": 1}
 
 

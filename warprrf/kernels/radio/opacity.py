@@ -8,7 +8,7 @@ and, with contributions ``c_e = w_e u_g A_e`` to the pixel's sum C and v = dL/dC
 
     dL/do_g = sum_e v r_e (c_e / alpha_e - (C - C_<=e) / (1 - alpha_e)),      zero where alpha is clamped.
 
-Opacities are moved by their logits, between two limits.
+Opacities are moved by their logits, between two limits: dL/dlogit_g = dL/do_g o_g (1 - o_g).
 """
 
 from types import SimpleNamespace
@@ -74,20 +74,15 @@ def build(real: type) -> SimpleNamespace:
         offset: int,
         row_start: wp.array(dtype=int),
         pair_adjoint: wp.array(dtype=real),
+        opacity: wp.array(dtype=real),
         gradient: wp.array(dtype=real),
     ):
-        """``dL/do_g``: the sum over the Gaussian's pairs."""
+        """``dL/dlogit_g``, by the sum over the Gaussian's pairs."""
         row = offset + wp.tid()
         total = real(0.0)
         for e in range(row_start[row], row_start[row + 1]):
             total += pair_adjoint[e]
-        gradient[row] = total
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def to_logits(offset: int, opacity: wp.array(dtype=real), gradient: wp.array(dtype=real)):
-        """The derivative by an opacity becomes that by its logit."""
-        row = offset + wp.tid()
-        gradient[row] = gradient[row] * opacity[row] * (real(1.0) - opacity[row])
+        gradient[row] = total * opacity[row] * (real(1.0) - opacity[row])
 
     @wp.kernel(module="unique", enable_backward=False)
     def activate(
@@ -99,9 +94,7 @@ def build(real: type) -> SimpleNamespace:
         logits[row] = logit
         opacity[row] = real(1.0) / (real(1.0) + wp.exp(-logit))
 
-    return SimpleNamespace(
-        blend=blend, blend_adjoint=blend_adjoint, add_rows=add_rows, to_logits=to_logits, activate=activate
-    )
+    return SimpleNamespace(blend=blend, blend_adjoint=blend_adjoint, add_rows=add_rows, activate=activate)
 
 
 @wp.kernel(enable_backward=False)
@@ -110,10 +103,3 @@ def owners(offset: int, row_start: wp.array(dtype=int), pair_gaussian: wp.array(
     row = offset + wp.tid()
     for e in range(row_start[row], row_start[row + 1]):
         pair_gaussian[e] = row
-
-
-@wp.kernel(enable_backward=False)
-def count_up(offset: int, out: wp.array(dtype=int)):
-    """0, 1, 2, ..."""
-    i = offset + wp.tid()
-    out[i] = i

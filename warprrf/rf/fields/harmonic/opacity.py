@@ -8,6 +8,7 @@ is 1e-4.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +21,7 @@ from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
 from warprrf.kernels.adam import build_adam, corrections
 from warprrf.kernels.radio import opacity as _kernels
 from warprrf.kernels.radio.transport import write_responses
-from warprrf.rf.fields.harmonic.problem import Problem
+from warprrf.rf.fields.harmonic.problem import Pairs, Problem
 from warprrf.rf.fields.harmonic.transport import Transport, cutoffs, kept, strongest
 
 
@@ -44,8 +45,8 @@ class Listed:
         opacity = wp.array(opacities, dtype=float, device=device)
         views = []
         for view, response in zip(seen.views, self.responses, strict=True):
-            order = wp.empty(len(response), dtype=int, device=device)
-            _device.launch(_kernels.count_up, len(order), [order], device=device)
+            order = wp.ones(len(response), dtype=int, device=device)
+            wp.utils.array_scan(order, order, inclusive=False)  # 0, 1, 2, ...
             weight = wp.empty(len(response), dtype=float, device=device)
             inputs = [self.alpha_max, view.start, order, view.gaussian, response, opacity, weight]
             _device.launch(kernels.blend, len(view.start) - 1, inputs, device=device)
@@ -111,10 +112,7 @@ class OpacityTraining:
         if state is None:
             state = np.stack([np.log(first / (1 - first)), np.zeros_like(first), np.zeros_like(first)])
         self._logits, self._first, self._second = (problem.upload(row) for row in state)
-        self.pairs = [
-            (self._owners(batch.row_start, len(batch.pair_pixel)), self._responses(listed, k))
-            for k, batch in enumerate(problem.batches)
-        ]
+        self.pairs = [self._pairs(batch, listed.responses) for batch in problem.batches]
         largest = max(len(b.pair_pixel) for b in problem.batches)
         self._weight, self._pair_adjoint = (
             wp.zeros(largest, dtype=problem.real, device=problem.device) for _ in range(2)
@@ -124,17 +122,13 @@ class OpacityTraining:
         )
         self._activate()
 
-    def _owners(self, row_start: wp.array, pairs: int) -> wp.array:
-        """The row of each pair of a batch."""
-        out = wp.empty(pairs, dtype=int, device=self.problem.device)
-        self.problem.launch(_kernels.owners, len(row_start) - 1, row_start, out)
-        return out
-
-    def _responses(self, listed: Listed, index: int) -> wp.array:
-        """The responses of the pairs of batch ``index``."""
-        p, batch = self.problem, self.problem.batches[index]
-        own = [listed.responses[r].to(p.device) for r in batch.receivers]
-        return p.in_order(batch.pair_of_pixel, own)
+    def _pairs(self, batch: Pairs, responses: Sequence[wp.array]) -> tuple[wp.array, wp.array]:
+        """The row of each pair of a batch, and its response."""
+        p = self.problem
+        row = wp.empty(len(batch.pair_pixel), dtype=int, device=p.device)
+        p.launch(_kernels.owners, len(p.seen), batch.row_start, row)
+        own = [responses[r].to(p.device) for r in batch.receivers]
+        return row, p.in_order(batch.pair_of_pixel, own)
 
     @property
     def opacities(self) -> np.ndarray:
@@ -156,21 +150,20 @@ class OpacityTraining:
         return self._weight
 
     def find_gradient(self, index: int, contribution: wp.array, total: wp.array, adjoint: wp.array) -> None:
-        """Write the derivative of the loss by each opacity of batch ``index`` to ``gradient``."""
+        """Write the derivative of the loss of batch ``index`` by each logit to ``gradient``."""
         p, batch = self.problem, self.problem.batches[index]
         p.launch(
             self.kernels.blend_adjoint, len(batch.pixel_start) - 1, self.alpha_max, batch.pixel_start,
             batch.pair_of_pixel, *self.pairs[index], self._opacity, contribution, total, adjoint, self._pair_adjoint,
         )  # fmt: skip
-        p.launch(self.kernels.add_rows, len(p.seen), batch.row_start, self._pair_adjoint, self.gradient)
+        inputs = batch.row_start, self._pair_adjoint, self._opacity, self.gradient
+        p.launch(self.kernels.add_rows, len(p.seen), *inputs)
 
     def step(self, count: int, rate: float) -> None:
-        """Adam's step ``count`` (from 1) along the derivative by the opacities."""
-        p, rows = self.problem, len(self.problem.seen)
-        p.launch(self.kernels.to_logits, rows, self._opacity, self.gradient)
-        none = wp.empty(0, dtype=p.real, device=p.device)
+        """Adam's step ``count`` (from 1) along the derivative by the logits."""
+        p, none = self.problem, wp.empty(0, dtype=self.problem.real, device=self.problem.device)
         p.launch(
-            build_adam(p.real), rows, 1, p.upload(np.array([rate])), *corrections(count), none, none, self.gradient,
+            build_adam(p.real), len(p.seen), 1, p.upload(np.array([rate])), *corrections(count), none, none, self.gradient,
             self._first, self._second, self._logits,
         )  # fmt: skip
         self._activate()
