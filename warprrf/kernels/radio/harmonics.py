@@ -17,7 +17,6 @@ its other end on either side, as it is periodic in azimuth.
 """
 
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -36,30 +35,23 @@ PER_NEPER = 10.0 / np.log(10.0)  # dB per unit of natural logarithm of power
 def build(real: type) -> SimpleNamespace:
     """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     types = {"vec3": wp.types.vector(3, real), "vec16": wp.types.vector(COEFFICIENTS, real)}
-    forward, adjoint = _forward(real), _adjoints(real)
-    return SimpleNamespace(**types, **forward, **adjoint, **_sums(real), evaluate_basis=_basis(real))
+    kernels = [*_forward(real), *_adjoints(real), *_sums(real)]
+    return SimpleNamespace(**types, **{kernel.func.__name__: kernel for kernel in kernels})
 
 
-def _basis(real: type) -> wp.Kernel:
-    """The kernel of the harmonics."""
+def _forward(real: type) -> list[wp.Kernel]:
+    """From directions and coefficients to harmonics, contributions, sums and images."""
     vec3 = wp.types.vector(3, real)
     vec16 = wp.types.vector(COEFFICIENTS, real)
     harmonics = _sh.build(real).basis
+    limit = wp.constant(real(EXPONENT_LIMIT))
+    per_neper = wp.constant(real(PER_NEPER))
 
     @wp.kernel(module="unique", enable_backward=False)
     def evaluate_basis(offset: int, directions: wp.array(dtype=vec3), out: wp.array(dtype=vec16)):
         """The 16 harmonics of each direction."""
         i = offset + wp.tid()
         out[i] = harmonics(directions[i])
-
-    return evaluate_basis
-
-
-def _forward(real: type) -> dict[str, Any]:
-    """From coefficients to contributions, sums and images."""
-    vec16 = wp.types.vector(COEFFICIENTS, real)
-    limit = wp.constant(real(EXPONENT_LIMIT))
-    per_neper = wp.constant(real(PER_NEPER))
 
     @wp.func
     def gain(x: real, kind: int):
@@ -143,15 +135,10 @@ def _forward(real: type) -> dict[str, Any]:
             total += weight[e] * gain(wp.dot(coefficients[gaussian[e]], basis[p]), kind)
         out[p] = total
 
-    return {
-        "contributions": contributions,
-        "pixel_sums": pixel_sums,
-        "to_image": to_image,
-        "predict": predict,
-    }
+    return [evaluate_basis, contributions, pixel_sums, to_image, predict]
 
 
-def _adjoints(real: type) -> dict[str, Any]:
+def _adjoints(real: type) -> list[wp.Kernel]:
     """From the loss back to coefficients."""
     vec16 = wp.types.vector(COEFFICIENTS, real)
     per_neper = wp.constant(real(PER_NEPER))
@@ -231,14 +218,10 @@ def _adjoints(real: type) -> dict[str, Any]:
             total += (pixel_adjoint[pair_pixel[e]] * slope) * basis[pair_direction[e]]
         gradient[row] = total
 
-    return {
-        "loss_adjoint": loss_adjoint,
-        "absolute_adjoint": absolute_adjoint,
-        "coefficient_adjoint": coefficient_adjoint,
-    }
+    return [loss_adjoint, absolute_adjoint, coefficient_adjoint]
 
 
-def _sums(real: type) -> dict[str, Any]:
+def _sums(real: type) -> list[wp.Kernel]:
     """What pairs and pixels carry, put in order and added up."""
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -295,4 +278,4 @@ def _sums(real: type) -> dict[str, Any]:
                 similarity += wp.float64(score[row * stride + wp.static(MARGIN) + wrapped + x])
         out[row] = wp.vec2d(error, similarity)
 
-    return {"put_in_order": put_in_order, "add_to_means": add_to_means, "row_errors": row_errors}
+    return [put_in_order, add_to_means, row_errors]
