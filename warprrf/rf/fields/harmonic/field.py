@@ -259,20 +259,17 @@ class HarmonicField(RadioField):
         loss = np.isfinite(length) if self.model == "rf3dgs" else self._free_space(length)
         return np.nan_to_num(pixel_solid_angles(self.shape)[:, None] * loss, posinf=0.0)
 
-    def _line_of_sight(self, receiver: np.ndarray, transmitter: np.ndarray) -> tuple[bool, float]:
-        """Whether the mesh lets them see each other, and their Friis gain, less absorption."""
+    def _line_of_sight(
+        self, receiver: np.ndarray, transmitter: np.ndarray
+    ) -> tuple[float, np.ndarray | None]:
+        """Friis gain, less absorption, 0 where the mesh does not let them see each other; and its beam on the grid, if the model
+        has an explicit line of sight."""
         visible = self.mesh is not None and self.mesh.visible(receiver, transmitter, device=self.device)[0]
-        return bool(visible), float(self._free_space(float(np.linalg.norm(receiver - transmitter))))
-
-    def _beam(self, receiver: np.ndarray, transmitter: np.ndarray) -> np.ndarray | None:
-        """The explicit line of sight's beam on the grid, or None."""
+        toward = transmitter - receiver
+        gain = float(self._free_space(float(np.linalg.norm(toward)))) if visible else 0.0
         if self.options.line_of_sight != "explicit":
-            return None
-        visible, gain = self._line_of_sight(receiver, transmitter)
-        if not visible:
-            return None
-        toward = (transmitter - receiver)[None]
-        return spread(toward, [gain], self.shape, self.beam_sigma_rad, device=self.device)
+            return gain, None
+        return gain, spread(toward[None], [gain], self.shape, self.beam_sigma_rad, device=self.device)
 
     def _free_space(self, length_m: float | np.ndarray) -> float | np.ndarray:
         """Gain of a path of ``length_m`` [m] between isotropic antennas, less what the air absorbs."""
@@ -304,7 +301,7 @@ class HarmonicField(RadioField):
     def _view_from(self, receiver: np.ndarray, source: np.ndarray) -> View:
         """Spectrum at one receiver and what it was made of."""
         seen = self._seen_from(receiver[None], None)
-        visible, friis = self._line_of_sight(receiver, source)
+        friis, beam = self._line_of_sight(receiver, source)
         (lengths,) = self._lengths(seen, source)
         power = self._factor(lengths.total) * self.gain_unit * self._blend("gain", seen)
         point, delay = lengths.point, lengths.total / SPEED_OF_LIGHT
@@ -313,17 +310,16 @@ class HarmonicField(RadioField):
             point = np.full_like(point, np.nan)
             delay, departure = self._channels(seen)
         angles = np.stack(angles_from_directions(departure), axis=-1)
-        beam = self._beam(receiver, source)
         direct = np.zeros(self.shape, dtype=bool)
         if beam is not None:
             direct, power = beam > power, power + beam
-        elif visible and self.options.model == "rf3dgs+":
+        elif friis > 0 and self.options.model == "rf3dgs+":
             direct = near_line_of_sight(receiver, source, self.shape, self.beam_sigma_rad)
         toward = receiver - source
         delay = np.where(direct, np.linalg.norm(toward) / SPEED_OF_LIGHT, delay)
         angles = np.where(direct[..., None], np.stack(angles_from_directions(toward)), angles)
         spectrum = Spectrum(power.astype(np.float32), delay, angles, self.floor, self.range_db)
-        return View(spectrum, receiver, source, point, visible, friis, beam)
+        return View(spectrum, receiver, source, point, friis, beam)
 
     def _channels(self, seen: Transport) -> tuple[np.ndarray, np.ndarray]:
         """Learned delay [s] and vector of departure; NaN where a ray meets nothing or nothing was learned."""
@@ -368,10 +364,9 @@ def _train(
         listed = list_responses(gaussians, seen, ds.range_db, progress=progress)
         seen = listed.transport
     factor = blank._factor(np.stack([own.total for own in blank._lengths(seen, blank.transmitter)]))
-    extra = None
+    extra = np.zeros_like(factor)
     if options.line_of_sight == "explicit":
-        beams = [blank._beam(receiver, blank.transmitter) for receiver in seen.receivers]
-        extra = np.stack([np.zeros(blank.shape) if beam is None else beam for beam in beams])
+        extra[:] = [blank._line_of_sight(receiver, blank.transmitter)[1] for receiver in seen.receivers]
     problem = Problem(seen, batch=options.batch, seed=options.seed, device=device)
     plan, gain_unit, delay_unit = fitting.targets(options, ds, images, problem, factor, extra)
     channel_steps = 100  # of each delay and AoD channel: they start at means that are nearly right

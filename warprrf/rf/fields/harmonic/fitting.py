@@ -117,7 +117,7 @@ class Target:
         unit: what each Gaussian's value is multiplied by, shape ``(G,)``; None for one.
         factor: what multiplies a pixel's blended gain (solid angle and spreading loss), shape ``(R, H, W)``; None for
             a channel.
-        extra: power added to a pixel [linear], shape ``(R, H, W)``; None for zero.
+        extra: power added to a pixel [linear], shape ``(R, H, W)``.
         mask: one where a channel's pixel counts, shape ``(R, H, W)``; None for a gain.
         low, high: range of the dB image [dB over N0]; ``factor`` and ``extra`` are in units of N0.
     """
@@ -198,8 +198,8 @@ class _BatchTarget:
     """
 
     image: wp.array
-    factor: wp.array
-    extra: wp.array
+    factor: wp.array | None
+    extra: wp.array | None
     mask: wp.array | None
     moments: tuple[wp.array, wp.array] | None
     count: float
@@ -215,7 +215,7 @@ class Layer:
         self.unit = p.upload(np.ones(len(p.seen)) if target.unit is None else target.unit)
         self.data = [self._data(batch.receivers) for batch in p.batches]
         pairs = max(len(batch.pair_pixel) for batch in p.batches)
-        pixels = max(len(data.factor) for data in self.data)
+        pixels = max(len(batch.receivers) for batch in p.batches) * p.pixels
         self.contribution = wp.zeros(pairs, dtype=p.real, device=p.device)
         self.scalars = [wp.zeros(pixels, dtype=p.real, device=p.device) for _ in range(3)]
         self.errors = wp.zeros(pixels // p.transport.shape[1], dtype=wp.vec2d, device=p.device)
@@ -224,26 +224,21 @@ class Layer:
     def _data(self, receivers: np.ndarray) -> _BatchTarget:
         """The target of some receivers."""
         p, target, shape = self.problem, self.target, (len(receivers), *self.problem.transport.shape)
-        count = len(receivers) * p.pixels
-
-        def uploaded(values: np.ndarray | None, default: float) -> wp.array:
-            if values is None:
-                return wp.full(count, p.real(default), dtype=p.real, device=p.device)
-            return p.upload(values[receivers].ravel())
-
-        factor, extra = uploaded(target.factor, 1.0), uploaded(target.extra, 0.0)
         image = np.asarray(target.image[receivers], p.precision)
+        factor, extra, mask = (
+            None if whole is None else p.upload(whole[receivers].ravel())
+            for whole in (target.factor, target.extra, target.mask)
+        )
         if target.mask is not None:
-            mask = target.mask[receivers]
-            counted = max(float(mask.sum(dtype=np.float64)), 1.0)
-            return _BatchTarget(p.upload(image.ravel()), factor, extra, p.upload(mask.ravel()), None, counted)
+            counted = max(float(target.mask[receivers].sum(dtype=np.float64)), 1.0)
+            return _BatchTarget(p.upload(image.ravel()), factor, extra, mask, None, counted)
         plane = self.loss.plane(image, shape)
-        return _BatchTarget(plane, factor, extra, None, self.loss.moments(plane, shape), count)
+        return _BatchTarget(plane, factor, extra, mask, self.loss.moments(plane, shape), image.size)
 
     def step(self, index: int, coefficients: wp.array) -> float:
         """Loss of batch ``index``; leaves its gradient in ``self.gradient`` (zero for Gaussians it does not see)."""
         p, k, batch, data = self.problem, self.problem.kernels, self.problem.batches[index], self.data[index]
-        size = len(data.factor)
+        size = len(batch.receivers) * p.pixels
         total, absolute, adjoint = self.scalars
         weight = batch.pair_weight if self.opacity is None else self.opacity.weights(index)
         seen = [batch.pair_direction, weight, self.unit, p.basis]
@@ -252,7 +247,7 @@ class Layer:
         p.launch(k.pixel_sums, size, batch.pixel_start, batch.pair_of_pixel, self.contribution, total)
         score = wp.empty(0, dtype=p.real, device=p.device)
         if data.moments is not None:
-            score = self._image_adjoint(data, data.moments)
+            score = self._image_adjoint(data, data.moments, len(batch.receivers))
         else:
             share = p.real(1.0 / data.count)
             p.launch(k.absolute_adjoint, size, share, data.mask, data.image, total, absolute, adjoint)
@@ -271,11 +266,13 @@ class Layer:
             return float(error)
         return float((1 - SSIM_SHARE) * error + SSIM_SHARE * (1 - similarity))
 
-    def _image_adjoint(self, data: _BatchTarget, moments: tuple[wp.array, wp.array]) -> wp.array:
+    def _image_adjoint(
+        self, data: _BatchTarget, moments: tuple[wp.array, wp.array], receivers: int
+    ) -> wp.array:
         """The plane of similarities of the dB image of the sums that lie in ``self.scalars``; leaves errors and adjoint
         there."""
         p, k, target = self.problem, self.problem.kernels, self.target
-        shape = len(data.factor) // p.pixels, *p.transport.shape
+        shape = receivers, *p.transport.shape
         total, absolute, adjoint = self.scalars
         canvas, rows, width = self.loss.canvas(shape), shape[0] * shape[1], shape[2]
         place = width, len(canvas) // rows, WRAPPED
@@ -373,13 +370,13 @@ def targets(
     images: np.ndarray,
     problem: Problem,
     factor: np.ndarray,
-    extra: np.ndarray | None,
+    extra: np.ndarray,
 ) -> tuple[dict[str, Target], float, float]:
     """What to fit the spectra ``images`` (R, H, W) of ``ds`` with.
 
     Args:
         factor: what multiplies a pixel's blended gain, shape ``(R, H, W)``.
-        extra: power of an explicit line of sight, shape ``(R, H, W)``; None for none.
+        extra: power of an explicit line of sight, shape ``(R, H, W)``.
 
     Returns:
         Targets of the layers in order: ``gain`` first, then ``delay``, ``aod_x``, ``aod_y``, ``aod_z`` for ``rf3dgs``;
@@ -392,7 +389,7 @@ def targets(
     floor = float(ds.floor)
     blended = factor * problem.transport.pixel_weight
     met = blended > 0
-    power = images if extra is None else images - extra
+    power = images - extra
     above = (power > floor) & met
     if not above.any():
         raise ValueError(
@@ -416,14 +413,14 @@ def targets(
             unit=None if exponential else np.exp(start),
             # in units of the floor, so that float32 works near one
             factor=factor * (gain_unit / floor),
-            extra=None if extra is None else extra / floor,
+            extra=extra / floor,
             low=low - 10 * np.log10(floor),
             high=high - 10 * np.log10(floor),
         )
     }
     delay_unit = 1.0
-    delays = None if ds.delay_s is None else np.asarray(ds.delay_s, np.float64)
-    if options.model == "rf3dgs" and delays is not None:
+    if options.model == "rf3dgs" and ds.delay_s is not None:
+        delays = np.asarray(ds.delay_s, np.float64)
         mask = (images > floor) & np.isfinite(delays) & (problem.transport.dominant >= 0)
         if mask.any():
             delay_unit = float(delays[mask].max())

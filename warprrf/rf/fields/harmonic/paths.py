@@ -22,8 +22,7 @@ class View:
         spectrum: the spectrum at ``receiver``.
         receiver, transmitter: positions [m], shape ``(3,)``.
         points: interaction points [m], shape ``(H, W, 3)``; NaN where unknown.
-        visible: whether the mesh lets the two see each other.
-        line_of_sight_gain: its Friis gain.
+        line_of_sight_gain: its Friis gain; 0 where the mesh does not let the two see each other.
         beam: power of the explicit line of sight per pixel, shape ``(H, W)``; None if the model has none.
     """
 
@@ -31,7 +30,6 @@ class View:
     receiver: np.ndarray
     transmitter: np.ndarray
     points: np.ndarray
-    visible: bool
     line_of_sight_gain: float
     beam: np.ndarray | None
 
@@ -47,7 +45,7 @@ def paths_of(view: View, beam_sigma_rad: float, frequency_hz: float, max_paths: 
     line_of_sight = 0.0
     if view.beam is not None:
         line_of_sight, power = min(view.line_of_sight_gain, total), np.maximum(power - view.beam, 0.0)
-    elif view.visible:
+    elif view.line_of_sight_gain > 0:
         near = near_line_of_sight(view.receiver, view.transmitter, shape, beam_sigma_rad)
         line_of_sight, power = float(power[near].sum()), np.where(near, 0.0, power)
     rest = total - line_of_sight
