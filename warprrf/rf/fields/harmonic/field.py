@@ -36,6 +36,7 @@ from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.geometry.splats.gaussians import Gaussians, discs_on_mesh, gaussians_of
 from warprrf.geometry.splats.rasterizer import Parameters, Rasterizer
 from warprrf.kernels.radio import harmonics as _kernels
+from warprrf.kernels.radio import transport as _rays
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField, with_settings
@@ -44,12 +45,7 @@ from warprrf.rf.fields.harmonic.fitting import CHANNEL_RATES, GAIN_RATES, FieldO
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining, list_responses
 from warprrf.rf.fields.harmonic.paths import View, near_line_of_sight, paths_of
 from warprrf.rf.fields.harmonic.problem import Problem, harmonics
-from warprrf.rf.fields.harmonic.transport import (
-    Lengths,
-    Transport,
-    path_lengths,
-    transport,
-)
+from warprrf.rf.fields.harmonic.transport import Transport, transport
 from warprrf.rf.paths.trace import Paths
 from warprrf.rf.positions import Ends, check_dataset, warn_of_unmodelled
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -244,14 +240,29 @@ class HarmonicField(RadioField):
         """The Gaussians where they are rendered, uploaded once."""
         return self._uploaded.get("gaussians", lambda: Rasterizer(device=self.device).upload(self.gaussians))
 
-    def _lengths(self, seen: Transport, transmitter: np.ndarray) -> Iterator[Lengths]:
-        """Path lengths of the pixels of each receiver of ``seen`` by the interaction point that the options name."""
+    def _bounces(self, seen: Transport, transmitter: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Where the rays of each receiver's pixels are taken to interact [m], ``(H, W, 3)``, and how long the paths over there are
+        [m], ``(H, W)``; NaN where a ray meets nothing.
 
-        def directions() -> wp.array:
-            return wp.array(pixel_directions(self.shape).reshape(-1, 3), dtype=wp.vec3d, device=seen.device)
-
-        toward, kind = self._uploaded.get("directions", directions), self.options.interaction_point
-        return path_lengths(seen, self._on_device(), toward, kind, transmitter, mesh=self.mesh)
+        One point stands for the whole ray, as in the paper: the centre of the Gaussian that contributes most (``"centre"``), the
+        peak of that Gaussian's response on the ray (``"peak"``), the blended mean of all peaks (``"expected"``), or the mesh hit
+        (``"mesh"``; ``"peak"`` for a ray that misses it). In float64: at 300 GHz a wavelength is 1 mm.
+        """
+        kind, device = self.options.interaction_point, seen.device
+        if kind == "mesh" and self.mesh is None:
+            raise ValueError('interaction_point: got "mesh", but the geometry has no mesh; use "peak"')
+        toward = pixel_directions(self.shape).reshape(-1, 3)
+        directions = self._uploaded.get("directions", lambda: wp.array(toward, dtype=wp.vec3d, device=device))
+        how = _rays.CENTRE if kind == "centre" else _rays.ALONG
+        for origin, view in zip(seen.receivers, seen.views, strict=True):
+            ranges: Any = view.expected_range if kind == "expected" else np.zeros(0)
+            if self.mesh is not None and kind == "mesh":
+                ranges = self.mesh.cast(origin, toward, device=device).t
+            points, lengths = (wp.empty(len(toward), dtype=t, device=device) for t in (wp.vec3d, wp.float64))
+            inputs = [how, wp.vec3d(origin), wp.vec3d(transmitter), directions, *self._on_device()[:3]]
+            inputs += [view.dominant, ranges, points, lengths]
+            _device.launch(_rays.single_bounces, len(toward), inputs, device=device)
+            yield points.numpy().reshape(*self.shape, 3), lengths.numpy().reshape(self.shape)
 
     def _factor(self, length: np.ndarray) -> np.ndarray:
         """Solid angle [sr], times spreading loss for ``rf3dgs+``, of pixels whose paths are of ``length`` (..., H, W) [m];
@@ -302,9 +313,9 @@ class HarmonicField(RadioField):
         """Spectrum at one receiver and what it was made of."""
         seen = self._seen_from(receiver[None], None)
         friis, beam = self._line_of_sight(receiver, source)
-        (lengths,) = self._lengths(seen, source)
-        power = self._factor(lengths.total) * self.gain_unit * self._blend("gain", seen)
-        point, delay = lengths.point, lengths.total / SPEED_OF_LIGHT
+        ((point, length),) = self._bounces(seen, source)
+        power = self._factor(length) * self.gain_unit * self._blend("gain", seen)
+        delay = length / SPEED_OF_LIGHT
         departure = point - source
         if self.options.model == "rf3dgs":
             point = np.full_like(point, np.nan)
@@ -363,7 +374,7 @@ def _train(
     if options.train_opacity:
         listed = list_responses(gaussians, seen, ds.range_db, progress=progress)
         seen = listed.transport
-    factor = blank._factor(np.stack([own.total for own in blank._lengths(seen, blank.transmitter)]))
+    factor = blank._factor(np.stack([length for _, length in blank._bounces(seen, blank.transmitter)]))
     extra = np.zeros_like(factor)
     if options.line_of_sight == "explicit":
         extra[:] = [blank._line_of_sight(receiver, blank.transmitter)[1] for receiver in seen.receivers]

@@ -1,18 +1,14 @@
-"""What a receiver sees of the frozen geometry: blending weights, and the points that its rays are taken to meet.
+"""What a receiver sees of the frozen geometry: blending weights.
 
 Geometry does not change while the radio part is learned, so the weights of a view are computed once, as a sparse
 pixels-by-Gaussians matrix, and every fit and every model reuses them. Radio needs other cutoffs than photos: an image
 60 dB deep shows what an opacity clamp of 0.99 leaks through a wall (-20 dB), so :func:`cutoffs` derives them from the
 data set's range.
-
-An interaction point stands for the whole ray, as in the paper: the centre of the Gaussian that contributes most
-(``"centre"``), the peak of that Gaussian's response on the ray (``"peak"``), the blended mean of all peaks
-(``"expected"``), or the mesh hit (``"mesh"``). Lengths are float64 metres: at 300 GHz a wavelength is 1 mm.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,12 +18,11 @@ from numpy.typing import ArrayLike
 from warprrf import device as _device
 from warprrf.checks import check_array
 from warprrf.device import DeviceLike, Progress
-from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import Blending, Parameters, Rasterizer
 from warprrf.kernels.radio import transport as _kernels
-from warprrf.rf.spectra.spectrum import check_shape, pixel_directions
+from warprrf.rf.spectra.spectrum import check_shape
 
 TOP_K = 16  # Gaussians kept per pixel
 
@@ -196,67 +191,3 @@ def _rows(raster: Rasterizer, found: Strongest) -> Rows:
     inputs = [share, index, weight, alpha, start, gaussian, out]
     _device.launch(_kernels.write_weights, len(dominant), inputs, device=device)
     return Rows(start, gaussian, out, dominant, expected)
-
-
-@dataclass(frozen=True)
-class Lengths:
-    """Single-bounce path geometry of one receiver's pixels; NaN where the ray meets nothing.
-
-    Attributes:
-        shape: rows and columns.
-        points: interaction points on the device [m], ``H * W`` vectors.
-        lengths: transmitter - point - receiver on the device [m], shape ``(H * W,)``.
-    """
-
-    shape: tuple[int, int]
-    points: wp.array
-    lengths: wp.array
-
-    @property
-    def point(self) -> np.ndarray:
-        """Interaction point [m], shape ``(H, W, 3)``."""
-        return np.asarray(self.points.numpy().reshape(*self.shape, 3))
-
-    @property
-    def total(self) -> np.ndarray:
-        """Length transmitter - point - receiver [m], shape ``(H, W)``."""
-        return np.asarray(self.lengths.numpy().reshape(self.shape))
-
-
-def path_lengths(
-    seen: Transport,
-    scene: Parameters,
-    directions: wp.array,
-    kind: str,
-    transmitter: np.ndarray,
-    *,
-    mesh: Mesh | None = None,
-) -> Iterator[Lengths]:
-    """Where the rays of each receiver's pixels are taken to interact, and how long the paths by there are, in float64.
-
-    Args:
-        scene: the Gaussians on the device of ``seen``.
-        directions: of the pixels, ``H * W`` vectors of float64 there.
-        kind: ``"centre"``, ``"peak"``, ``"expected"`` or ``"mesh"`` (see the module); a ray that misses the mesh falls
-            back on ``"peak"``.
-
-    Raises:
-        ValueError: for ``"mesh"`` without a mesh.
-    """
-    if kind == "mesh" and mesh is None:
-        raise ValueError('interaction_point: got "mesh", but the geometry has no mesh; use "peak"')
-    device, pixels = seen.device, seen.shape[0] * seen.shape[1]
-    how = _kernels.CENTRE if kind == "centre" else _kernels.ALONG
-    nowhere = wp.empty(0, dtype=wp.float64, device=device)
-    for origin, view in zip(seen.receivers, seen.views, strict=True):
-        ranges = view.expected_range if kind == "expected" else nowhere
-        if mesh is not None and kind == "mesh":
-            hit = mesh.cast(origin, pixel_directions(seen.shape).reshape(-1, 3), device=device)
-            ranges = hit.t
-        points = wp.empty(pixels, dtype=wp.vec3d, device=device)
-        lengths = wp.empty(pixels, dtype=wp.float64, device=device)
-        inputs = [
-            how, wp.vec3d(origin), wp.vec3d(transmitter), directions, *scene[:3], view.dominant, ranges, points, lengths
-        ]  # fmt: skip
-        _device.launch(_kernels.single_bounces, pixels, inputs, device=device)
-        yield Lengths(seen.shape, points, lengths)
