@@ -19,6 +19,7 @@ import warp as wp
 
 from warprrf import device as _device
 from warprrf.checks import LARGEST, LARGEST_M, check_array
+from warprrf.device import DeviceLike
 from warprrf.kernels.radio import specular as kernels
 from warprrf.rf.em.fresnel import SurfaceTable
 from warprrf.rf.em.materials import ROUGHEST_M, VACUUM_PERMITTIVITY
@@ -80,16 +81,16 @@ class SpecularPaths:
         material: np.ndarray,
         traced: Mapping[str, wp.array],
         frequency_hz: float,
-        device: wp.Device,
+        device: DeviceLike,
     ) -> None:
-        self.receiver, self.frequency_hz, self.device = found.receiver, frequency_hz, device
+        self.receiver, self.frequency_hz, self.device = found.receiver, frequency_hz, _device.resolve(device)
         self._made_of = found, offset, material
         self._traced, self._shape = {name: traced[name] for name in TYPES}, found.patch.shape
         mirrors = found.patch >= 0
         self._there = mirrors | (found.slab >= 0)
         self._sequences = _device.filled(
             kernels.Sequences,
-            device,
+            self.device,
             frequency_hz=frequency_hz,
             receiver=found.receiver,
             count=self._there.sum(axis=1),
@@ -119,7 +120,7 @@ class SpecularPaths:
         return f"SpecularPaths({len(self)} to {receivers} receivers at {self.frequency_hz / 1e9:g} GHz)"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _put_together, (self._made_of, self.parameters, self.frequency_hz, str(self.device))
+        return SpecularPaths, (*self._made_of, self._traced, self.frequency_hz, str(self.device))
 
     def evaluate(
         self,
@@ -260,15 +261,3 @@ def fixed_parameters(
         }
     found |= dict.fromkeys(POSITIONS[2:], np.zeros((1, 3)))
     return {name: wp.array(array, dtype=TYPES[name], device=device) for name, array in found.items()}
-
-
-def _put_together(
-    made_of: tuple[MirrorPaths, np.ndarray, np.ndarray],
-    parameters: Mapping[str, np.ndarray],
-    frequency_hz: float,
-    device: str,
-) -> SpecularPaths:
-    """What a pickle holds of :class:`SpecularPaths`, on the device that it was on."""
-    where = _device.resolve(device)
-    traced = {name: wp.array(value, dtype=TYPES[name], device=where) for name, value in parameters.items()}
-    return SpecularPaths(*made_of, traced, frequency_hz, where)
