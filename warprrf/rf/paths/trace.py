@@ -17,7 +17,7 @@ from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, GeometryLike, as_mesh
 from warprrf.geometry.planar_patches import planar_patches
 from warprrf.rf.em.absorption import Gas
-from warprrf.rf.em.fresnel import SurfaceTable, surface_table
+from warprrf.rf.em.fresnel import surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, Hertz, check_frequency
 from warprrf.rf.paths.edge_paths import EdgeFinder, EdgePaths
 from warprrf.rf.paths.images import MOST_CHAINS, MirrorImages
@@ -200,15 +200,12 @@ class MirrorTracer:
         self.mesh = as_mesh(mesh_or_scene)
         self.transmitter = check_array("transmitter", transmitter, (3,))
         self.frequency_hz = check_frequency(frequency_hz)
-        self.table: SurfaceTable | None = None
+        materials = getattr(mesh_or_scene, "materials", None)
+        groups = None if materials is None else getattr(mesh_or_scene, "face_material", None)
+        self.table = None if materials is None else surface_table(materials, frequency_hz)
+        self.patches = planar_patches(self.mesh, groups)
         self.walls: Walls | None = None
         self._face_material = np.zeros(0, np.int32)
-        groups = None
-        materials = getattr(mesh_or_scene, "materials", None)
-        if materials is not None:
-            self.table = surface_table(materials, frequency_hz)
-            groups = getattr(mesh_or_scene, "face_material", None)
-        self.patches = planar_patches(self.mesh, groups)
         if transmissions and self.table is not None and groups is not None:
             self._face_material = np.asarray(groups, np.int32)
             eta, thickness = (
