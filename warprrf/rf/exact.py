@@ -178,27 +178,22 @@ class ExactEngine:
         e = self.effects
         if not e.scatterings:
             return
-        starts: list[_Beams] = []
         hits = self._tracer.grid.hit(receiver)
-        for rays in self._and_behind(_Beams(hits, np.arange(len(hits.face)), np.zeros(len(hits.face)), "")):
-            yield from self._lit(rays)
-            if e.mirror_scatter:
-                yield from self._lit_by_mirrors(rays)
-            if e.scatterings > 1:
-                starts.append(self._scattered_on(rays, 1))
-            if e.scatter_mirror:
-                starts.append(self._turned(rays))
-        for rays in starts:
-            depth = rays.sequence.count("S")
-            while True:
-                for own in self._and_behind(rays):
-                    yield from self._lit(own)
-                    if e.mirror_scatter:
-                        yield from self._lit_by_mirrors(own)
-                depth += 1
-                if depth >= e.scatterings:
-                    break
-                rays = self._scattered_on(rays, depth)
+        first = _Beams(hits, np.arange(len(hits.face)), np.zeros(len(hits.face)), "")
+        waiting = [first]
+        while waiting:
+            rays = waiting.pop()
+            met = list(self._and_behind(rays))
+            for own in met:
+                yield from self._lit(own)
+                if e.mirror_scatter:
+                    yield from self._lit_by_mirrors(own)
+            depth = rays.sequence.count("S") + 1
+            for own in reversed(met if rays is first else [rays]):
+                if rays is first and e.scatter_mirror:
+                    waiting.append(self._turned(own))
+                if depth < e.scatterings:
+                    waiting.append(self._scattered_on(own, depth))
 
     def receive(self, receiver: ArrayLike) -> Received:
         """The spectrum of one receiver (3,)."""
