@@ -6,7 +6,7 @@ straight. All in float64, lengths in metres.
 
 import warp as wp
 
-from warprrf.kernels.radio.mirrors import Cones, Patches, cone_meets_ball, step_back
+from warprrf.kernels.radio.mirrors import Cones, Patches, cone_meets_ball, leads_through
 
 wp.set_module_options({"enable_backward": False})
 
@@ -64,12 +64,7 @@ def find_over_edges(
                 rb = wp.length(b - zb * e)
                 z = (za * rb + zb * ra) / (ra + rb)
                 inside = z >= -slack and z <= pieces.length[k] + slack
-                here = pieces.start[k] + z * e
-                source = apex
-                column = int(patch.shape[1])
-                while inside and column > 0:
-                    column -= 1
-                    here, source, inside = step_back(patches, patch[chain, column], here, source)
+                inside = inside and leads_through(patches, patch, chain, pieces.start[k] + z * e, apex)
             if inside:
                 word = word | (wp.uint32(1) << wp.uint32(bit))
     words[chain, leaf] = word

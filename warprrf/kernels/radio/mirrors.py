@@ -161,6 +161,21 @@ def step_back(patches: Patches, p: int, here: wp.vec3d, image: wp.vec3d):
     return point, image - wp.float64(2.0) * depth * n, inside
 
 
+@wp.func
+def leads_through(
+    patches: Patches, patch: wp.array2d(dtype=wp.int32), chain: int, end: wp.vec3d, last_image: wp.vec3d
+):
+    """Whether the way from ``end`` to the image in the last patch of a chain, unfolded, meets the boxes of all its patches."""
+    here = end
+    image = last_image
+    inside = bool(True)
+    column = int(patch.shape[1])
+    while inside and column > 0:
+        column -= 1
+        here, image, inside = step_back(patches, patch[chain, column], here, image)
+    return inside
+
+
 @wp.kernel
 def find_chains(
     offset: int,
@@ -183,14 +198,7 @@ def find_chains(
     apex = cones.apex[chain]
     if cone_meets_ball(apex, cones.axis[chain], cones.sine[chain], leaf_middle[leaf], leaf_radius[leaf]):
         for bit in range(wp.min(32, points.shape[0] - 32 * leaf)):
-            here = points[32 * leaf + bit]
-            source = apex
-            inside = bool(True)
-            column = int(patch.shape[1])
-            while inside and column > 0:
-                column -= 1
-                here, source, inside = step_back(patches, patch[chain, column], here, source)
-            if inside:
+            if leads_through(patches, patch, chain, points[32 * leaf + bit], apex):
                 word = word | (wp.uint32(1) << wp.uint32(bit))
     words[chain, leaf] = word
 
