@@ -57,10 +57,7 @@ def doppler_hz(
     departure, onward = paths.departure, -paths.arrival
     speed = (sent * departure).sum(axis=-1) - (heard * onward).sum(axis=-1)
     if moving:
-        there = np.isfinite(paths.vertices[..., 0])
-        speed = speed + np.where(there, _pushed(paths, moving, scene, there, departure, onward), 0.0).sum(
-            axis=-1
-        )
+        speed = speed + _pushed(paths, moving, scene, departure, onward)
     return np.where(paths.valid, speed * (paths.carrier_hz / SPEED_OF_LIGHT), np.nan)
 
 
@@ -79,19 +76,18 @@ def _pushed(
     paths: PathArrays,
     moving: Mapping[str, ArrayLike],
     scene: GeometryLike | None,
-    there: np.ndarray,
     departure: np.ndarray,
     onward: np.ndarray,
 ) -> np.ndarray:
-    """v . (k_i - k_(i-1)) of each interaction point [m/s], shape as ``there`` (..., depth)."""
-    velocity = np.zeros(paths.vertices.shape)
+    """v . (k_i - k_(i-1)) of each path's interaction points [m/s], their sum, shape as ``tau``."""
+    there, velocity = np.isfinite(paths.vertices[..., 0]), np.zeros(paths.vertices.shape)
     velocity[there] = _touched(scene, moving, paths.vertices[there])
     leg = np.diff(paths.vertices, axis=-2)
     leg = leg / np.maximum(np.linalg.norm(leg, axis=-1, keepdims=True), 1e-12)
     before = np.concatenate([departure[..., None, :], leg], axis=-2)
     after = np.concatenate([leg, onward[..., None, :]], axis=-2)
     after = np.where(np.isfinite(after), after, onward[..., None, :])  # of the last point, and past it
-    return np.asarray((velocity * (after - before)).sum(axis=-1))
+    return np.where(there, (velocity * (after - before)).sum(axis=-1), 0.0).sum(axis=-1)
 
 
 def _touched(scene: Any, moving: Mapping[str, ArrayLike], points: np.ndarray) -> np.ndarray:
