@@ -73,7 +73,7 @@ class SionnaPaths:
         a, tau = impulse_response(self._paths, normalize_delays=normalize_delays, **self._options)
         time_s = _times(num_time_steps, sampling_frequency)
         turn = carrier_phase(-time_s, self.doppler[:, None, :, None, :, None])
-        a = _one_transmitter(a)[..., None] * turn
+        a = a[:, :, None, ..., None] * turn
         return _as(a, out_type), _as(np.where(self.valid, tau[:, None], -1.0), out_type)
 
     def cfr(
@@ -253,11 +253,6 @@ def repeated(paths: PathArrays) -> np.ndarray:
     return np.asarray(np.tril(same, -1).any(axis=1))
 
 
-def _one_transmitter(h: np.ndarray) -> np.ndarray:
-    """``(R, M, N, ...)`` as ``(R, M, 1, N, ...)``."""
-    return h[:, :, None]
-
-
 def _times(count: int, per_second: float) -> np.ndarray:
     """Times [s] of ``count`` steps."""
     every = check_positive("sampling_frequency", per_second)
@@ -271,7 +266,7 @@ def _normalised(h: np.ndarray, normalize: bool, *, mean: bool) -> np.ndarray:
         energy = energy.mean(axis=-1) if mean else energy.sum(axis=-1)
         energy = energy.mean(axis=(1, 2, 3))[:, None, None, None, None]
         h = np.divide(h, np.sqrt(energy), out=np.zeros_like(h), where=energy > 0)
-    return _one_transmitter(h)
+    return h[:, :, None]
 
 
 def _as(values: np.ndarray, out_type: str) -> Any:
