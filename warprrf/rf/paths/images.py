@@ -308,14 +308,11 @@ class _Ends:
 
     def __init__(self, points: np.ndarray, where: wp.Device) -> None:
         self.positions, self.order = points, _along_curve(points)
-        first = np.arange(0, len(points), 32)
-        low, high = (f.reduceat(points[self.order], first) for f in (np.minimum, np.maximum))
-        self.leaf_radius = 1e-6 + 0.5 * np.linalg.norm(high - low, axis=1)
-        vectors = (
-            wp.array(a, dtype=wp.vec3d, device=where) for a in (points[self.order], 0.5 * (low + high))
-        )
+        ordered = points[self.order]
+        middle, self.leaf_radius = _leaves(ordered, ordered)
+        vectors = (wp.array(a, dtype=wp.vec3d, device=where) for a in (ordered, middle))
         self.on_device = *vectors, wp.array(self.leaf_radius, dtype=wp.float64, device=where)
-        low, high = low.min(axis=0), high.max(axis=0)
+        low, high = points.min(axis=0), points.max(axis=0)
         self.middle, self.radius = 0.5 * (low + high), 1e-6 + 0.5 * float(np.linalg.norm(high - low))
 
 
@@ -337,16 +334,22 @@ class EdgeLeaves:
         middle = start + 0.5 * piece[:, None] * edges.along[edge]
         order = _along_curve(middle)
         self.edge, start, piece, middle = edge[order], start[order], piece[order], middle[order]
-        own, first = edges.take(self.edge), np.arange(0, len(order), 32)
+        own = edges.take(self.edge)
         half = 0.5 * piece[:, None] * np.abs(own.along)
-        low, high = np.minimum.reduceat(middle - half, first), np.maximum.reduceat(middle + half, first)
-        self.radius = 1e-6 + 0.5 * np.linalg.norm(high - low, axis=1)
+        leaf_middle, self.radius = _leaves(middle - half, middle + half)
         below = np.cross(own.along, own.inward), own.n[:, None] * np.pi
         far = np.sin(below[1]) * own.inward - np.cos(below[1]) * below[0]
         self.on_device = _device.filled(
             edge_kernels.EdgePieces, where, start=start, along=own.along, first=below[0], last=far, length=piece,
-            leaf_middle=0.5 * (low + high), leaf_radius=self.radius,
+            leaf_middle=leaf_middle, leaf_radius=self.radius,
         )  # fmt: skip
+
+
+def _leaves(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Middles and radii of balls around each 32 of what lies between ``low`` and ``high`` (N, 3)."""
+    first = np.arange(0, len(low), 32)
+    low, high = np.minimum.reduceat(low, first), np.maximum.reduceat(high, first)
+    return 0.5 * (low + high), 1e-6 + 0.5 * np.linalg.norm(high - low, axis=1)
 
 
 def _set_bits(words: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
