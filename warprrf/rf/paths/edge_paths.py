@@ -119,17 +119,17 @@ class EdgeFinder:
         table: Radio properties of the patches' groups; None for a bare mesh: fields without polarisation, reflected
             without a sign change.
         walls: What may be passed, if anything.
-        group: Row of ``table`` of each face, if there are walls.
+        group: Row of ``table`` of each face; it is looked at if there are walls.
     """
 
     def __init__(
         self,
         images: MirrorImages,
         wavelength_m: float,
-        table: SurfaceTable | None = None,
+        table: SurfaceTable | None,
         *,
-        walls: Walls | None = None,
-        group: np.ndarray | None = None,
+        walls: Walls | None,
+        group: np.ndarray,
     ) -> None:
         self.images, self.wavelength_m, self.table = images, wavelength_m, table
         self.edges, self.walls, self.group = patch_edges(images.patches), walls, group
@@ -173,7 +173,7 @@ class EdgeFinder:
         """Those candidates that are paths to receivers at ``points`` (R, 3), unobstructed or through a slab."""
         row, edge, patch = (np.concatenate(column) for column in zip(*found, strict=True))
         ends = np.stack([np.broadcast_to(self.images.transmitter, (len(row), 3)), points[row]], axis=1)
-        ways = _Ways.over(self.edges, row, edge, patch, self.images.patches, ends)
+        ways = self._over(row, edge, patch, ends)
         for sieve in (self._in_reach, self._strong, self._on_mirrors):
             ways = ways.take(np.flatnonzero(sieve(ways)))
         free = self._unobstructed(ways)
@@ -183,16 +183,40 @@ class EdgeFinder:
         paths = self._described(ways.take(ways.distinct(3.0 * self.images.patches.tolerance_m)))
         return paths.take(np.lexsort((paths.length_m, paths.receiver)))
 
+    def _over(self, row: np.ndarray, edge: np.ndarray, patch: np.ndarray, end: np.ndarray) -> _Ways:
+        """Of receivers ``row`` (L,), between two points ``end`` (L, 2, 3) each, over the edges ``edge`` (L,), by images of either
+        in ``patch`` (L, 2)."""
+        e, patches = self.edges.take(edge), self.images.patches
+        normal, offset = patches.normal[patch], patches.offset[patch]
+        mirrored = (patch >= 0)[..., None]
+        height = ((end * normal).sum(axis=2) - offset)[..., None]
+        image = np.where(mirrored, end - 2.0 * height * normal, end)
+        way = image - e.start[:, None]
+        along = (way * e.along[:, None]).sum(axis=2)
+        across = way - along[..., None] * e.along[:, None]
+        reach = np.linalg.norm(across, axis=2)
+        at = (along[:, 0] * reach[:, 1] + along[:, 1] * reach[:, 0]) / np.maximum(reach.sum(axis=1), 1e-300)
+        point = e.start + at[:, None] * e.along
+        leg = np.hypot(reach, along - at[:, None])
+        third = np.cross(e.along, e.inward)
+        angle = np.arctan2((across * third[:, None]).sum(axis=2), (across * e.inward[:, None]).sum(axis=2))
+        angle = np.where(angle < -1e-12, angle + 2.0 * np.pi, np.maximum(angle, 0.0))
+        direction = np.array([-1.0, 1.0])[:, None] * (image - point[:, None])
+        direction /= np.maximum(leg, 1e-300)[..., None]
+        depth = ((point[:, None] * normal).sum(axis=2) - offset)[..., None]
+        between = depth + height  # the image is as far behind the plane as the end is before it
+        share = np.divide(depth, between, out=np.zeros_like(depth), where=between != 0)
+        stop = np.where(mirrored, point[:, None] + share * (image - point[:, None]), np.nan)
+        slab, solid = np.full(patch.shape, -1), np.full(patch.shape, np.nan)
+        return _Ways(row, edge, patch, slab, stop, solid, point, at, leg, angle, direction, end)
+
     def _in_reach(self, ways: _Ways) -> np.ndarray:
         """Whether the point lies on the edge, both legs in the air and what is mirrored not in the mirror's own plane."""
-        n = self.edges.n[ways.edge] * np.pi
-        found = (ways.at > 0) & (ways.at < self.edges.length[ways.edge])
-        found &= (ways.angle <= n[:, None]).all(axis=1)
-        for j in range(2):
-            plane = self.images.patches.normal[ways.patch[:, j]], self.images.patches.offset[ways.patch[:, j]]
-            height = np.abs((ways.point * plane[0]).sum(axis=1) - plane[1])
-            found &= (ways.patch[:, j] < 0) | (height > 2.0 * self.images.patches.tolerance_m)
-        return found
+        patches, n = self.images.patches, self.edges.n[ways.edge] * np.pi
+        height = (ways.point[:, None] * patches.normal[ways.patch]).sum(axis=2) - patches.offset[ways.patch]
+        apart = (ways.patch < 0) | (np.abs(height) > 2.0 * patches.tolerance_m)
+        on_edge = (ways.at > 0) & (ways.at < self.edges.length[ways.edge])
+        return np.asarray(on_edge & ((ways.angle <= n[:, None]) & apart).all(axis=1))
 
     def _strong(self, ways: _Ways) -> np.ndarray:
         """Whether paths reach -80 dB of an unobstructed straight path between the ends, even if every face and mirror reflects
@@ -201,11 +225,10 @@ class EdgeFinder:
         return np.asarray(20.0 * np.log10(np.maximum(most, 1e-300)) > -80.0)
 
     def _on_mirrors(self, ways: _Ways) -> np.ndarray:
-        found = np.ones(len(ways.edge), bool)
-        for j in range(2):
-            own = np.flatnonzero(ways.patch[:, j] >= 0)
-            found[own] = self.images.patches.contains(ways.patch[own, j], ways.stop[own, j])
-        return found
+        mirrored = ways.patch >= 0
+        found = np.ones(mirrored.shape, bool)
+        found[mirrored] = self.images.patches.contains(ways.patch[mirrored], ways.stop[mirrored])
+        return np.asarray(found.all(axis=1))
 
     def _beside(self, ways: _Ways) -> np.ndarray:
         """Points off the edges, halfway between their faces, so that rays to them do not meet these, shape ``(L, 3)``."""
@@ -274,7 +297,7 @@ class EdgeFinder:
         outer, excess = ways.direction.copy(), np.zeros(len(ways.edge))
         for j in range(2):
             own = np.flatnonzero(ways.slab[:, j] >= 0)
-            if len(own) and self.walls is not None and self.group is not None and self.table is not None:
+            if self.walls is not None and self.table is not None:
                 normal, way = self.walls.mesh.face_normals[ways.slab[own, j]], ways.direction[own, j]
                 cosine = np.abs((way * normal).sum(axis=1))
                 te, tm, excess[own] = self.table.passage(
@@ -326,42 +349,6 @@ class _Ways(Rows):
     angle: np.ndarray
     direction: np.ndarray
     end: np.ndarray
-
-    @classmethod
-    def over(
-        cls,
-        edges: Edges,
-        receiver: np.ndarray,
-        edge: np.ndarray,
-        patch: np.ndarray,
-        patches: PlanarPatches,
-        end: np.ndarray,
-    ) -> _Ways:
-        """Of indices ``receiver`` (L,), between two points ``end`` (L, 2, 3) each, over the edges ``edge`` (L,), by images of
-        either in ``patch`` (L, 2)."""
-        e = edges.take(edge)
-        normal, offset = patches.normal[patch], patches.offset[patch]
-        mirrored = (patch >= 0)[..., None]
-        height = ((end * normal).sum(axis=2) - offset)[..., None]
-        image = np.where(mirrored, end - 2.0 * height * normal, end)
-        way = image - e.start[:, None]
-        along = (way * e.along[:, None]).sum(axis=2)
-        across = way - along[..., None] * e.along[:, None]
-        reach = np.linalg.norm(across, axis=2)
-        at = (along[:, 0] * reach[:, 1] + along[:, 1] * reach[:, 0]) / np.maximum(reach.sum(axis=1), 1e-300)
-        point = e.start + at[:, None] * e.along
-        leg = np.hypot(reach, along - at[:, None])
-        third = np.cross(e.along, e.inward)
-        angle = np.arctan2((across * third[:, None]).sum(axis=2), (across * e.inward[:, None]).sum(axis=2))
-        angle = np.where(angle < -1e-12, angle + 2.0 * np.pi, np.maximum(angle, 0.0))
-        direction = np.array([-1.0, 1.0])[:, None] * (image - point[:, None])
-        direction /= np.maximum(leg, 1e-300)[..., None]
-        depth = ((point[:, None] * normal).sum(axis=2) - offset)[..., None]
-        between = depth + height  # the image is as far behind the plane as the end is before it
-        share = np.divide(depth, between, out=np.zeros_like(depth), where=between != 0)
-        stop = np.where(mirrored, point[:, None] + share * (image - point[:, None]), np.nan)
-        slab, solid = np.full(patch.shape, -1), np.full(patch.shape, np.nan)
-        return cls(receiver, edge, patch, slab, stop, solid, point, at, leg, angle, direction, end)
 
     @property
     def direct(self) -> np.ndarray:
