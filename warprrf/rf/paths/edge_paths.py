@@ -21,7 +21,7 @@ from warprrf.rf.channel.path_arrays import EDGE, MIRROR, SLAB
 from warprrf.rf.em.diffraction import EdgeRays, Pair, boundary_fields, diffraction_matrices
 from warprrf.rf.em.fresnel import SurfaceTable
 from warprrf.rf.paths.images import EdgeLeaves, MirrorImages
-from warprrf.rf.paths.mirror_paths import MirrorPaths, distinct, passed, unobstructed
+from warprrf.rf.paths.mirror_paths import MirrorPaths, distinct, met_at, passed, unobstructed
 from warprrf.rf.paths.slabs import Walls
 from warprrf.rf.spectra.spectrum import transverse_basis
 from warprrf.rows import Rows
@@ -247,11 +247,8 @@ class EdgeFinder:
         face, thickness = (
             np.stack([getattr(s, name)[:, 0] for s in legs], axis=1) for name in ("face", "thickness_m")
         )
-        mesh, way = self.walls.mesh, ways.end - ways.point[:, None]
-        normal, met = mesh.face_normals[face], face >= 0
-        depth = ((mesh.triangles[face, 0] - ways.point[:, None]) * normal).sum(axis=2)
-        part = np.divide(depth, (way * normal).sum(axis=2), out=np.full(met.shape, np.nan), where=met)
-        stop = ways.point[:, None] + part[..., None] * way
+        here = ways.point[:, None]
+        stop, _ = met_at(self.walls.mesh, face, here, ways.end - here)
         return replace(ways, slab=face, thickness_m=thickness, stop=stop)
 
     def _unobstructed(self, ways: _Ways) -> np.ndarray:

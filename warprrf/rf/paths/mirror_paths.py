@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from warprrf.device import DeviceLike, Progress
-from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
+from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, Mesh, vectors_across
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.rf.channel.path_arrays import EDGE, MIRROR, SLAB
 from warprrf.rf.paths.images import MirrorImages
@@ -432,24 +432,17 @@ def described(
     most = max(order, 1) + (walls.most if walls else 0)
     normal, slab = patches.normal[patch], np.full(patch.shape, -1, np.int32)
     thickness = np.full(patch.shape, np.nan)
-    if walls is not None and slabs is not None:
-        mesh, stops = patches.mesh, stops_of(source, point, receivers[row])
+    if slabs is not None:
+        stops = stops_of(source, point, receivers[row])
         columns: list[tuple[np.ndarray, ...]] = []
         for k, s in enumerate(s.take(kept) for s in slabs):
-            leg = stops[:, k + 1] - stops[:, k]
-            for j in range(walls.most):
-                met = s.face[:, j] >= 0
-                turned = np.where(met[:, None], mesh.face_normals[s.face[:, j]], np.nan)
-                corner = mesh.triangles[s.face[:, j], 0]
-                with np.errstate(invalid="ignore", divide="ignore"):  # where none is met
-                    part = ((corner - stops[:, k]) * turned).sum(axis=1) / (leg * turned).sum(axis=1)
-                at = stops[:, k] + part[:, None] * leg
-                columns.append(
-                    (np.full(len(row), -1, np.int32), s.face[:, j], at, turned, s.thickness_m[:, j])
-                )
-            if k < patch.shape[1]:
-                columns.append((patch[:, k], slab[:, k], point[:, k], normal[:, k], thickness[:, k]))
-        patch, slab, point, normal, thickness = (np.stack(c, axis=1) for c in zip(*columns, strict=True))
+            here = stops[:, k, None]
+            at, turned = met_at(patches.mesh, s.face, here, stops[:, k + 1, None] - here)
+            columns.append((np.full_like(s.face, -1), s.face, at, turned, s.thickness_m))
+            columns.append(tuple(a[:, k : k + 1] for a in (patch, slab, point, normal, thickness)))
+        patch, slab, point, normal, thickness = (
+            np.concatenate(c, axis=1) for c in zip(*columns, strict=True)
+        )
         first = np.argsort((patch < 0) & (slab < 0), axis=1, kind="stable")
         patch, slab, thickness = (np.take_along_axis(a, first, axis=1) for a in (patch, slab, thickness))
         point, normal = (np.take_along_axis(a, first[..., None], axis=1) for a in (point, normal))
@@ -470,6 +463,15 @@ def described(
     return MirrorPaths(
         row, patch, slab, point, share, length, 0.0 * length, arrival, normal, cosine, turn, thickness, code
     ).of_width(most)
+
+
+def met_at(mesh: Mesh, face: np.ndarray, start: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where ``way`` (..., 3) from ``start`` meets the planes of faces ``face`` (...), and their normals, shape ``(..., 3)``;
+    NaN for no face (-1)."""
+    normal = np.where((face >= 0)[..., None], mesh.face_normals[face], np.nan)
+    with np.errstate(invalid="ignore", divide="ignore"):  # where none is met
+        part = ((mesh.triangles[face, 0] - start) * normal).sum(axis=-1) / (way * normal).sum(axis=-1)
+    return start + part[..., None] * way, normal
 
 
 def stops_of(source: np.ndarray, point: np.ndarray, ends: np.ndarray) -> np.ndarray:
