@@ -106,7 +106,7 @@ class MirrorImages:
     def search(
         self, points: np.ndarray, order: int, progress: Progress | None = None
     ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """:meth:`candidates` of 1, 2 ... ``order`` reflections.
+        """The straight way to each of ``points``, then :meth:`candidates` of 1, 2 ... ``order`` reflections.
 
         Args:
             points: Where the chains end [m], shape ``(N, 3)``.
@@ -130,6 +130,8 @@ class MirrorImages:
                 behind = ends[k - 1] + share * (ends[k] - ends[k - 1])
                 progress("mirrors", round(parts * behind / max(ends[-1], 1.0)), parts)
 
+        nothing = np.zeros((len(points), 0), np.int32), np.zeros((len(points), 0, 3))
+        yield np.arange(len(points)), *nothing
         for k in range(1, order + 1):
             yield self.candidates(points, k, tick)
             tick(1.0)

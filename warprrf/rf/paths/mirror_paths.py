@@ -13,7 +13,6 @@ slab does not bend its way.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -133,10 +132,8 @@ def exact_paths(
     Raises:
         ValueError: before anything is traced, if more chains would be tried than ``images`` allow.
     """
-    patches, source = images.patches, images.transmitter
-    parts, none = [], np.zeros((len(receivers), 0))
-    direct = np.arange(len(receivers)), none.astype(np.int32), none[..., None].repeat(3, axis=2)
-    for k, (row, patch, point) in enumerate(chain([direct], images.search(receivers, order, progress))):
+    patches, source, parts = images.patches, images.transmitter, list[MirrorPaths]()
+    for k, (row, patch, point) in enumerate(images.search(receivers, order, progress)):
         for j in range(k):
             own = patches.contains(patch[:, j], point[:, j])
             row, patch, point = row[own], patch[own], point[own]
@@ -194,10 +191,9 @@ def zone_paths(
     """
     patches, source = images.patches, images.transmitter
     zone = ZoneRays(patches, source, wavelength_m, position_error_m, images.device)
-    through = ZoneRays(patches, source, wavelength_m, position_error_m, images.device, walls)
-    none, parts = np.zeros((len(receivers), 0)), list[MirrorPaths]()
-    direct = np.arange(len(receivers)), none.astype(np.int32), none[..., None].repeat(3, axis=2)
-    for k, (row, patch, point) in enumerate(chain([direct], images.search(receivers, order, progress))):
+    through = replace(zone, walls=walls)
+    parts = list[MirrorPaths]()
+    for k, (row, patch, point) in enumerate(images.search(receivers, order, progress)):
         kept = np.ones(len(row), bool)
         if k > 1 or walls is not None:
             free = zone.reached(receivers[row], patch, point)
@@ -218,29 +214,27 @@ def zone_paths(
     return MirrorPaths.joined(parts)
 
 
+_RINGS = (0.0, 1), (0.5, 6), (0.9, 8)
+"""Radii, as shares of a zone's, and numbers of rays: about equal areas each."""
+_SAMPLES = np.array(
+    [
+        (radius * np.cos(a), radius * np.sin(a))
+        for ring, (radius, count) in enumerate(_RINGS)
+        for a in 2 * np.pi * (np.arange(count) + 0.5 * (ring % 2)) / count
+    ]
+)
+
+
+@dataclass(frozen=True)
 class ZoneRays:
     """Rays that fill Fresnel zones on a surface with a position error; see :func:`zone_paths`."""
 
-    def __init__(
-        self,
-        patches: PlanarPatches,
-        source: np.ndarray,
-        wavelength_m: float,
-        position_error_m: float,
-        device: DeviceLike,
-        walls: Walls | None = None,
-    ) -> None:
-        self.patches, self.source, self.wavelength_m, self.walls = patches, source, wavelength_m, walls
-        self.position_error_m, self.device = position_error_m, device
-        # radii, as shares of the zone's, and numbers of rays: about equal areas each
-        rings = (0.0, 1), (0.5, 6), (0.9, 8)
-        self.samples = np.array(
-            [
-                (radius * np.cos(a), radius * np.sin(a))
-                for ring, (radius, count) in enumerate(rings)
-                for a in 2 * np.pi * (np.arange(count) + 0.5 * (ring % 2)) / count
-            ]
-        )
+    patches: PlanarPatches
+    source: np.ndarray
+    wavelength_m: float
+    position_error_m: float
+    device: DeviceLike
+    walls: Walls | None = None
 
     def radius(self, near: np.ndarray, far: np.ndarray) -> np.ndarray:
         """Radius of the first zone between two legs, widened by the mesh's error [m]."""
@@ -259,7 +253,7 @@ class ZoneRays:
         length = np.linalg.norm(way, axis=1)
         radius = self.radius(0.5 * length, 0.5 * length)
         u, v = vectors_across(way / np.maximum(length, 1e-12)[:, None])
-        offset = self.samples[:, 0, None] * u[:, None] + self.samples[:, 1, None] * v[:, None]
+        offset = _SAMPLES[:, 0, None] * u[:, None] + _SAMPLES[:, 1, None] * v[:, None]
         middle = (0.5 * (receivers + self.source))[:, None] + radius[:, None, None] * offset
         start = np.broadcast_to(receivers[:, None], middle.shape).reshape(-1, 3)
         middle = middle.reshape(-1, 3)
@@ -267,7 +261,7 @@ class ZoneRays:
         left = np.flatnonzero(free)
         end = np.broadcast_to(self.source, (len(left), 3))
         free[left] = self.clear(self._past(end, middle[left]), end)
-        return np.asarray(free.reshape(count, len(self.samples)).mean(axis=1))
+        return np.asarray(free.reshape(count, len(_SAMPLES)).mean(axis=1))
 
     def _past(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Points so far behind b, seen from a, that a ray to them misses nothing at b, where no surface is, shape ``(N, 3)``."""
@@ -283,7 +277,7 @@ class ZoneRays:
         along = legs / np.maximum(lengths, 1e-12)[..., None]
         before = np.cumsum(lengths, axis=1)[:, :-1]
         radius = self.radius(before, lengths.sum(axis=1)[:, None] - before)
-        around = np.repeat(point[:, None], len(self.samples), axis=1)
+        around = np.repeat(point[:, None], len(_SAMPLES), axis=1)
         for k in range(order):
             normal = self.patches.normal[patch[:, k]]
             cosine = np.abs((along[:, k] * normal).sum(axis=1))
@@ -291,11 +285,11 @@ class ZoneRays:
             size = np.linalg.norm(across, axis=1, keepdims=True)
             across = np.where(size > 1e-6, across / np.maximum(size, 1e-12), vectors_across(normal)[0])
             further = np.cross(normal, across) / np.maximum(cosine, 0.05)[:, None]
-            offset = self.samples[:, 0, None] * across[:, None] + self.samples[:, 1, None] * further[:, None]
+            offset = _SAMPLES[:, 0, None] * across[:, None] + _SAMPLES[:, 1, None] * further[:, None]
             around[:, :, k] += radius[:, k, None, None] * offset
-        each, which = (np.repeat(a, len(self.samples), axis=0) for a in (ends, patch))
+        each, which = (np.repeat(a, len(_SAMPLES), axis=0) for a in (ends, patch))
         met = self.reached(each, which, around.reshape(-1, order, 3))
-        return met.reshape(count, len(self.samples)).mean(axis=1)
+        return met.reshape(count, len(_SAMPLES)).mean(axis=1)
 
     def reached(
         self, ends: np.ndarray, patch: np.ndarray, point: np.ndarray, lift: np.ndarray | None = None
