@@ -104,11 +104,6 @@ class _Beams:
         """What they hit, by their rows."""
         return Rays(self.hits, np.arange(len(self.ray)))
 
-    def take(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where the rays ``rows`` hit, their directions, and the faces that they meet."""
-        directions = self.hits.directions[rows % len(self.hits.directions)]
-        return self.hits.points(rows), directions, self.hits.face[rows]
-
 
 class ExactEngine:
     """Propagation from one transmitter in a scene.
@@ -248,10 +243,9 @@ class ExactEngine:
         tracer, patches = self._tracer, self.mirrors.patches
         most = 4 if rays.sequence else 16  # each is a search: fewer after they hit first
         ray, every = self._some(rays, most)
-        point, direction, face = rays.take(ray)
+        point, _, normal = self._met(rays, ray)
         row, patch, met = self.mirrors.images.candidates(point, 1)
-        normal = self._toward(face, direction)[row]
-        own = ((met[:, 0] - point[row]) * normal).sum(axis=1) > 0
+        own = ((met[:, 0] - point[row]) * normal[row]).sum(axis=1) > 0
         own &= patches.contains(patch[:, 0], met[:, 0])
         row, patch, met = row[own], patch[own], met[own]
         free = unobstructed(patches, tracer.transmitter, point[row], patch, met, tracer.grid.device)
@@ -287,10 +281,9 @@ class ExactEngine:
     def _turned(self, rays: _Beams) -> _Beams:
         """Rays turned at the mirrors that they hit."""
         ray = np.flatnonzero((rays.hits.face >= 0) & (self.surface.patch[rays.hits.face] >= 0))
-        point, direction, face = rays.take(ray)
-        normal = self._toward(face, direction)
+        point, direction, normal = self._met(rays, ray)
         cosine = -(direction * normal).sum(axis=1)
-        mirror = Interactions.of_mirrors(self.surface.group[face], cosine)
+        mirror = Interactions.of_mirrors(self.surface.group[rays.hits.face[ray]], cosine)
         onward = direction + 2.0 * cosine[:, None] * normal
         records = Records(self._left(rays, ray), ray, mirror.index, mirror.angle, mirror.kind)
         return self._on(rays, ray, point, normal, onward, records, "M")
@@ -299,8 +292,7 @@ class ExactEngine:
         """Some of the rays scattered where they hit, one direction each, drawn by the cosine."""
         most = 9  # of a pixel
         ray, every = self._some(rays, most)
-        point, direction, face = rays.take(ray)
-        normal = self._toward(face, direction)
+        point, direction, normal = self._met(rays, ray)
         u, v = np.random.default_rng([self.seed, depth, len(rays.sequence)]).random((2, len(ray)))
         a, b = vectors_across(normal)
         radius, turn, up = np.sqrt(u), 2.0 * np.pi * v, np.sqrt(1.0 - u)
@@ -309,9 +301,9 @@ class ExactEngine:
         cos_out = np.clip(-(direction * normal).sum(axis=1), 0.0, 1.0)
         cos_mirror = np.clip(2.0 * up * cos_out + (onward * direction).sum(axis=1), -1.0, 1.0)
         angle = np.column_stack([up, cos_out, cos_mirror])[:, None]
+        group = self.surface.group[rays.hits.face[ray]]
         records = Records(
-            every * np.pi * self._left(rays, ray), ray, self.surface.group[face][:, None], angle,
-            one_kind(SCATTER),
+            every * np.pi * self._left(rays, ray), ray, group[:, None], angle, one_kind(SCATTER),
             half_width=self._tracer.grid.half_width,
         )  # fmt: skip
         return replace(self._on(rays, ray, point, normal, onward, records, "S"), times=every * rays.times)
@@ -339,10 +331,12 @@ class ExactEngine:
         angle = rays.hits.solid_angle[ray % len(rays.hits.solid_angle)]
         return np.asarray(angle * self._tracer.grid.transmittance(rays.hits.range_m[ray]))
 
-    def _toward(self, face: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Normals of faces on the side that a ray of ``direction`` (N, 3) meets."""
-        normal = self.surface.mesh.face_normals[face]
-        return np.where((normal * direction).sum(axis=1, keepdims=True) > 0, -normal, normal)
+    def _met(self, rays: _Beams, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where the rows ``ray`` hit, their directions, and normals of what they meet, on the side that they meet, (N, 3) each."""
+        direction = rays.hits.directions[ray % len(rays.hits.directions)]
+        normal = self.surface.mesh.face_normals[rays.hits.face[ray]]
+        away = (normal * direction).sum(axis=1, keepdims=True) > 0
+        return rays.hits.points(ray), direction, np.where(away, -normal, normal)
 
 
 def together(paths: Paths) -> Paths:
