@@ -39,9 +39,7 @@ def paths_of(view: View, beam_sigma_rad: float, frequency_hz: float, max_paths: 
     spectrum, shape = view.spectrum, view.spectrum.shape
     power = np.asarray(spectrum.path_gain, np.float64)
     total = float(power.sum())
-    toward = pixel_directions(shape)
     outward = view.receiver - view.transmitter
-    distance = float(np.linalg.norm(outward))
     line_of_sight = 0.0
     if view.beam is not None:
         line_of_sight, power = min(view.line_of_sight_gain, total), np.maximum(power - view.beam, 0.0)
@@ -58,13 +56,12 @@ def paths_of(view: View, beam_sigma_rad: float, frequency_hz: float, max_paths: 
         diffuse = diffuse * (max(rest, 0.0) / diffuse.sum())
     else:
         line_of_sight = total  # nothing else has power
-    delay = np.full(len(diffuse), np.nan) if spectrum.delay_s is None else spectrum.delay_s[row, column]
-    aod = np.full((len(diffuse), 2), np.nan) if spectrum.aod is None else spectrum.aod[row, column]
-    kinds = ["diffuse"] * len(diffuse)
-    parts: list[Any] = [diffuse, delay, toward[row, column], aod, view.points[row, column], kinds]
+    columns = spectrum.delay_s, pixel_directions(shape), spectrum.aod, view.points
+    known = [np.asarray(values)[row, column] for values in columns]
+    parts: list[Any] = [diffuse, *known, ["diffuse"] * len(diffuse)]
     if line_of_sight > 0:
         departure = np.stack(angles_from_directions(outward[None]), axis=-1)
-        flight, nowhere = distance / SPEED_OF_LIGHT, np.full((1, 3), np.nan)
+        flight, nowhere = np.linalg.norm(outward) / SPEED_OF_LIGHT, np.full((1, 3), np.nan)
         direct: list[Any] = [[line_of_sight], [flight], -outward[None], departure, nowhere, ["los"]]
         parts = [np.concatenate(pair) for pair in zip(parts, direct, strict=True)]
     amplitude = np.sqrt(parts[0])
