@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from warprrf.checks import check_count
 from warprrf.device import Progress, with_progress
 from warprrf.geometry.edges import Edges, mesh_edges
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
@@ -81,14 +80,12 @@ class EdgePaths(Rows):
         found = found.of_width(count)
         friis = self.wavelength_m / (4.0 * np.pi * self.length_m)
         share = np.sqrt(self.power) / friis
-        mirror = self.patch.max(axis=1, initial=-1)
-        own = np.where(found.order == 1, found.patch.max(axis=1, initial=-1), -1)
         parents = found.order + found.slabs <= 1
-        keys = found.receiver, own, found.slabs
+        keys = found.receiver, found.patch.max(axis=1, initial=-1), found.slabs
         free = dict(
             zip(zip(*(k[parents].tolist() for k in keys), strict=True), found.share[parents], strict=True)
         )
-        keys = self.receiver, mirror, (self.code == SLAB).sum(axis=1)
+        keys = self.receiver, self.patch.max(axis=1, initial=-1), (self.code == SLAB).sum(axis=1)
         left = np.array([1.0 - free.get(key, 0.0) for key in zip(*(k.tolist() for k in keys), strict=True)])
         near = self.detour_m < self.wavelength_m
         share = share * np.where(near & (left < 1.0), left, 1.0)
@@ -143,16 +140,14 @@ class EdgeFinder:
             mirrors: Most mirrors on a path, 0 or 1.
             progress: Called with the stage ``"edges"``.
         """
-        check_count("mirrors", mirrors, 0, 1)
-        points = np.asarray(receivers, float).reshape(-1, 3)
         nothing = np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2), int)
         parts, waiting = list[EdgePaths](), [nothing]
-        for k, receiver in enumerate(with_progress(points, "edges", progress)):
+        for k, receiver in enumerate(with_progress(receivers, "edges", progress)):
             waiting += self._candidates(k, receiver, mirrors)
             if sum(len(edge) for _, edge, _ in waiting) > AT_ONCE:
-                parts.append(self._paths(points, waiting))
+                parts.append(self._paths(receivers, waiting))
                 waiting = [nothing]
-        return EdgePaths.joined([*parts, self._paths(points, waiting)])
+        return EdgePaths.joined([*parts, self._paths(receivers, waiting)])
 
     def _candidates(
         self, k: int, receiver: np.ndarray, mirrors: int

@@ -116,7 +116,7 @@ class MirrorImages:
         Raises:
             ValueError: before anything is traced, if more than ``max_chains`` chains would be tried.
         """
-        work, seconds = self._work(np.asarray(points, float).reshape(-1, 3), order)
+        work, seconds = self._work(points, order)
         if sum(work) > self.max_chains:
             raise ValueError(
                 f"mirror_order: order {order} would try about {sum(work):.2g} chains of the mesh's {len(self.patches)} "
@@ -150,7 +150,6 @@ class MirrorImages:
             Index of the point ``(L,)``, patches ``(L, order)`` and mirror points [m] ``(L, order, 3)``, both from the
             transmitter on.
         """
-        points = np.asarray(points, float).reshape(-1, 3)
         parts = [(np.zeros(0, int), np.zeros((0, order), np.int32), np.zeros((0, order, 3)))]
         if len(points) and len(self.patches):
             ends, kept = _Ends(points, self.device), self._keep(order)
@@ -203,8 +202,7 @@ class MirrorImages:
 
     def affordable(self, points: np.ndarray, order: int) -> int:
         """The most reflections, up to ``order``, whose :meth:`search` is not refused."""
-        work, _ = self._work(np.asarray(points, float).reshape(-1, 3), order)
-        return int((np.cumsum(work) <= self.max_chains).sum())
+        return int((np.cumsum(self._work(points, order)[0]) <= self.max_chains).sum())
 
     def _work(self, points: np.ndarray, order: int) -> tuple[list[float], float]:
         """Number of chains that each search of 1, 2 ... ``order`` reflections tries, estimated if they are many, and the
