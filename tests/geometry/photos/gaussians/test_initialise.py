@@ -104,13 +104,12 @@ def test_photos_of_two_sizes_are_compared(sparse):
 
 
 def test_a_plane_whose_features_were_taken_for_two_is_one(sparse, monkeypatch):
-    def halves(points, *args, **kwargs):
-        floor, *others = detect_room_planes(points, *args, **kwargs)
-        left = points[floor.inliers, 0] < 0
+    def halves(cleaned, *args):
+        (floor, *others), normals = detect_room_planes(cleaned, *args)
+        left = cleaned.points[floor.inliers, 0] < 0
         parts = floor.inliers[left], floor.inliers[~left]
-        return [
-            replace(floor, inliers=own, offset=floor.offset + 0.01 * k) for k, own in enumerate(parts)
-        ] + others
+        halved = [replace(floor, inliers=own, offset=floor.offset + 0.01 * k) for k, own in enumerate(parts)]
+        return halved + others, normals
 
     images = [photo(camera) for camera in sparse.cameras.values()]
     config = ReconstructionConfig(plain=False, sweep=False, gaussians=3000)

@@ -11,23 +11,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from warprrf.checks import check_array
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.gaussians.cells import meeting, occupancy, plane_mesh, seen_cells, visible_from
 from warprrf.geometry.photos.gaussians.plain import plain_surfaces, with_plain
 from warprrf.geometry.photos.gaussians.sweep import choose_views, joined, level_planes, proven_cells, united
 from warprrf.geometry.photos.posed.images import GreyPhotos
-from warprrf.geometry.photos.posed.sparse import (
-    SparseModel,
-    clean_points,
-    detect_room_planes,
-    estimate_normals,
-)
+from warprrf.geometry.photos.posed.sparse import SparseModel, clean_points, detect_room_planes
 from warprrf.geometry.planes import Plane, aligned, directions, plane_axes
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Y00, Gaussians, quaternions_of
@@ -36,14 +29,13 @@ SPREAD = 0.65  # standard deviation of a disc in units of the spacing: little li
 
 
 def initial_gaussians(
-    points: ArrayLike,
-    colors: ArrayLike,
-    normals: ArrayLike,
-    planes: Sequence[Plane] = (),
-    cameras: Sequence[Camera] = (),
-    images: Sequence[np.ndarray] = (),
-    *,
-    count: int = 32_000,
+    points: np.ndarray,
+    colors: np.ndarray,
+    normals: np.ndarray,
+    planes: Sequence[Plane],
+    cameras: Sequence[Camera],
+    images: Sequence[np.ndarray],
+    count: int,
 ) -> Gaussians:
     """Flat Gaussians to start the photometric optimisation from, degree 0 colours.
 
@@ -57,24 +49,17 @@ def initial_gaussians(
         count: Gaussians wanted in all (about).
 
     Raises:
-        ValueError: when shapes or numbers do not fit, or nothing is there to start from.
+        ValueError: when nothing is there to start from.
     """
-    points = check_array("points", points, (None, 3))
-    colors = check_array("colors", colors, (len(points), 3))
-    normals = check_array("normals", normals, (len(points), 3))
-    if len(cameras) != len(images):
-        raise ValueError(f"images: got {len(images)} for {len(cameras)} cameras, expected one for each")
     free = np.ones(len(points), dtype=bool)
-    for plane in planes if len(cameras) else ():
+    for plane in planes:
         # 0.02: a sparse point this close to an occupied cell gives way to the plane's own discs
         free &= ~((np.abs(plane.distance(points)) < 0.02) & plane.covers(points))
     min_scale, max_scale = 0.004, 0.12  # of a disc on a sparse point [m]
-    radius = np.full(len(points), max_scale)
-    if len(points) > 3:
-        gap = cKDTree(points).query(points[free], k=4)[0][:, 1:]
-        radius[free] = np.clip(gap.mean(axis=1), min_scale, max_scale)
-    parts = [(points[free], normals[free], radius[free], colors[free])]
-    if len(planes) and len(cameras):
+    gap = cKDTree(points).query(points[free], k=4)[0][:, 1:]  # infinite where there are fewer
+    radius = np.clip(gap.mean(axis=1), min_scale, max_scale)
+    parts = [(points[free], normals[free], radius, colors[free])]
+    if planes:
         parts += _blocks(planes, cameras, images, max(count - int(free.sum()), 1))
     centres, facing, sizes, shades = (np.concatenate(p) for p in zip(*parts, strict=True))
     if not len(centres):
@@ -193,21 +178,14 @@ def initialise(
         raise ValueError(
             f"photos: only {len(sparse.points)} points were reconstructed; more overlap is needed"
         )
-    keep = clean_points(
-        sparse.points,
-        reprojection_error=sparse.reprojection_error,
-        track_length=sparse.track_length,
-    )
+    keep = clean_points(sparse, worst_px=1.0)
     if keep.sum() < 3:  # a handful of photos: few points are seen three times
         keep[:] = True
     sparse = sparse.subset(keep)
-    points, viewpoints = sparse.points, sparse.viewpoints()
-    normals = estimate_normals(points, viewpoints)
-    planes = detect_room_planes(points, normals, viewpoints, config=config.planes, seed=seed)
+    points, lines = sparse.points, sparse.lines_of_sight()
+    planes, normals = detect_room_planes(sparse, config.planes, seed)
     level = sparse.metric and sparse.upright
     planes = aligned(planes, points) if level else planes
-    eyes = np.array([c.position for c in sparse.cameras.values()])[sparse.track_camera]
-    lines = eyes, np.repeat(points, sparse.track_length, axis=0)
     planes = occupancy(planes, points, *lines, config=config.planes)
     report("planes", 1, 6)
     if config.sweep and len(cameras) > 2 and planes:
@@ -237,7 +215,7 @@ def initialise(
         planes,
         list(cameras.values()),
         images,
-        count=config.gaussians,
+        config.gaussians,
     )
     report("planes", 6, 6)
     return planes, gaussians

@@ -62,10 +62,14 @@ class SparseModel:
     photos: dict[str, Path] = field(default_factory=dict)
     lenses: dict[str, Lens] = field(default_factory=dict)
 
+    def lines_of_sight(self) -> tuple[np.ndarray, np.ndarray]:
+        """Eyes and points of all tracks [m], shape ``(sum of track lengths, 3)`` each."""
+        positions = np.array([camera.position for camera in self.cameras.values()])
+        return positions[self.track_camera], np.repeat(self.points, self.track_length, axis=0)
+
     def viewpoints(self) -> np.ndarray:
         """Mean position of the cameras that see each point, shape ``(P, 3)``: normals are turned towards it."""
-        positions = np.array([camera.position for camera in self.cameras.values()])
-        total = np.add.reduceat(positions[self.track_camera], self.track_start[:-1], axis=0)
+        total = np.add.reduceat(self.lines_of_sight()[0], self.track_start[:-1], axis=0)
         return total / self.track_length[:, None]
 
     def subset(self, keep: np.ndarray) -> SparseModel:
@@ -193,10 +197,8 @@ def scaled(sparse: SparseModel, scale: Scale) -> SparseModel:
 
 def assume_scale(sparse: SparseModel) -> SparseModel:
     """``sparse`` in a plausible size, axes as they are, where nobody measured any."""
-    positions = np.array([c.position for c in sparse.cameras.values()])
-    gap = np.linalg.norm(
-        np.repeat(sparse.points, sparse.track_length, axis=0) - positions[sparse.track_camera], axis=1
-    )
+    eyes, points = sparse.lines_of_sight()
+    gap = np.linalg.norm(points - eyes, axis=1)
     # Without surveyed positions the scale is unknown: the median distance from a camera to a point it sees becomes this.
     assumed_distance_m = 3.0
     scale = assumed_distance_m / float(np.median(gap)) if len(gap) else 1.0
@@ -250,79 +252,47 @@ def neighbours(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     return index, distance
 
 
-def clean_points(
-    points: ArrayLike,
-    *,
-    reprojection_error: ArrayLike | None = None,
-    track_length: ArrayLike | None = None,
-) -> np.ndarray:
+def clean_points(sparse: SparseModel, worst_px: float = np.inf) -> np.ndarray:
     """Which points to keep, shape ``(P,)`` bool: seen often enough, reprojected well, not far from all others.
 
     A point is an outlier when its mean distance to its neighbours exceeds the average of that figure over all points
     by 2.5 standard deviations (Rusu et al., "Towards 3D point cloud based object maps", 2008).
 
     Args:
-        points: shape ``(P, 3)``.
-        reprojection_error: mean reprojection error of each point [pixels], shape ``(P,)``.
-        track_length: number of photos that see each point, shape ``(P,)``.
+        worst_px: reprojection error of a point that is kept [pixels].
     """
-    points = check_array("points", points, (None, 3))
-    keep = np.ones(len(points), dtype=bool)
-    if reprojection_error is not None:
-        error = check_array("reprojection_error", reprojection_error, (len(points),))
-        # 1.0: of a sparse point that is kept [pixels]
-        keep &= error <= 1.0
     min_track_length = 3  # photos that see a point which is kept
-    if track_length is not None:
-        keep &= check_array("track_length", track_length, (len(points),)) >= min_track_length
+    keep = (sparse.reprojection_error <= worst_px) & (sparse.track_length >= min_track_length)
     chosen = np.flatnonzero(keep)
     deviations = 2.5  # by which an outlier is farther from its neighbours than others
     if len(chosen) > NEIGHBOURS:
-        spacing = neighbours(points[chosen], NEIGHBOURS)[1].mean(axis=1)
+        spacing = neighbours(sparse.points[chosen], NEIGHBOURS)[1].mean(axis=1)
         keep[chosen[spacing > spacing.mean() + deviations * spacing.std()]] = False
     return keep
 
 
-def estimate_normals(
-    points: ArrayLike, viewpoints: ArrayLike, *, neighbour_count: int = NEIGHBOURS
-) -> np.ndarray:
-    """Unit normals from the neighbourhood of each point, turned to the side of ``viewpoints``, shape ``(P, 3)``.
-
-    Args:
-        points: shape ``(P, 3)``.
-        viewpoints: a place each point was seen from, shape ``(P, 3)`` (or one for all, ``(3,)``).
-
-    Raises:
-        ValueError: for fewer than three points.
-    """
-    points = check_array("points", points, (None, 3))
-    if len(points) < 3:
-        raise ValueError(f"points: got {len(points)}, expected at least 3 to estimate normals")
-    index, gap = neighbours(points, neighbour_count)
+def estimate_normals(points: np.ndarray, viewpoints: np.ndarray, count: int) -> np.ndarray:
+    """Unit normals from ``count`` neighbours of each point, turned to the side of ``viewpoints``; all of shape ``(P, 3)``."""
+    index, gap = neighbours(points, count)
     # Weights fall off with distance, so that a far neighbour on another surface counts little.
     weight = 1 / (1 + (gap / np.maximum(np.median(gap, axis=1, keepdims=True), 1e-9)) ** 2)
     local = points[index] - points[:, None]
     local -= (weight[..., None] * local).sum(axis=1, keepdims=True) / weight.sum(axis=1)[:, None, None]
     normals: np.ndarray = np.linalg.eigh(np.einsum("nk,nki,nkj->nij", weight, local, local))[1][:, :, 0]
-    away = ((np.asarray(viewpoints, dtype=np.float64) - points) * normals).sum(axis=1) < 0
+    away = ((viewpoints - points) * normals).sum(axis=1) < 0
     normals[away] *= -1
     return normals
 
 
-def detect_room_planes(
-    points: np.ndarray,
-    normals: np.ndarray,
-    viewpoints: np.ndarray,
-    *,
-    config: PlaneConfig | None = None,
-    seed: int = 0,
-) -> list[Plane]:
-    """Planes among sparse points in two passes: the large ones, then small ones among the points left over.
+def detect_room_planes(sparse: SparseModel, config: PlaneConfig, seed: int) -> tuple[list[Plane], np.ndarray]:
+    """Planes among sparse points, three or more, in two passes: the large ones, then small ones among the points left over;
+    and the normals of all points.
 
     Beside a wall the neighbourhood of a small surface is full of the wall's points, and its normals are poor; without
     them they are good enough for small planes (compact ones: within 1.5 m of their middle).
     """
-    config = config or PlaneConfig()
+    points, viewpoints = sparse.points, sparse.viewpoints()
+    normals = estimate_normals(points, viewpoints, NEIGHBOURS)
     large = detect_planes(points, normals, config=config, seed=seed)
     # A point on a large plane, seen from its front, belongs to it even where its own normal is off.
     free = np.ones(len(points), dtype=bool)
@@ -333,8 +303,8 @@ def detect_room_planes(
     rest = np.flatnonzero(free)
     small_points = 16  # fewest points of a small plane, looked for among those that the large ones leave
     if len(rest) < small_points:
-        return large
-    again = estimate_normals(points[rest], viewpoints[rest], neighbour_count=10)
+        return large, normals
+    again = estimate_normals(points[rest], viewpoints[rest], 10)
     small = detect_planes(points[rest], again, config=replace(config, min_points=small_points), seed=seed)
     compact = []
     for plane in small:
@@ -342,4 +312,4 @@ def detect_room_planes(
         close = np.linalg.norm(own - np.median(own, axis=0), axis=1) < 1.5
         if close.sum() >= small_points and close.mean() > 0.6:
             compact.append(replace(plane, inliers=rest[plane.inliers[close]]))
-    return large + compact
+    return large + compact, normals

@@ -17,13 +17,7 @@ from scipy import ndimage
 from warprrf.device import require
 from warprrf.geometry.mesh_files import UP
 from warprrf.geometry.photos.posed.photo_files import spread
-from warprrf.geometry.photos.posed.sparse import (
-    SparseModel,
-    clean_points,
-    detect_room_planes,
-    estimate_normals,
-    transformed,
-)
+from warprrf.geometry.photos.posed.sparse import SparseModel, clean_points, detect_room_planes, transformed
 from warprrf.geometry.planes import Plane, PlaneConfig
 from warprrf.geometry.splats.camera import Camera
 
@@ -137,15 +131,11 @@ def _edge_planes(photo: np.ndarray, camera: Camera) -> np.ndarray:
 
 def _planes(sparse: SparseModel, seed: int) -> tuple[np.ndarray, list[Plane]]:
     """Cleaned points and the planes among them."""
-    keep = clean_points(sparse.points, track_length=sparse.track_length)
+    keep = clean_points(sparse)
     if keep.sum() < 3:
         return sparse.points, []
     sparse = sparse.subset(keep)
-    viewpoints = sparse.viewpoints()
-    normals = estimate_normals(sparse.points, viewpoints)
-    return sparse.points, detect_room_planes(
-        sparse.points, normals, viewpoints, config=PlaneConfig(), seed=seed
-    )
+    return sparse.points, detect_room_planes(sparse, PlaneConfig(), seed)[0]
 
 
 def _vertical_of_planes(up: np.ndarray, planes: Iterable[Plane]) -> np.ndarray:
