@@ -10,7 +10,7 @@ frame, whose axes are the three directions. Lengths in metres.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
@@ -118,6 +118,8 @@ class Segments:
         camera: which camera shows it, shape ``(N,)``.
         bearing: from the camera in the cross-section [rad], shape ``(N,)``.
         rise: where it begins and ends: metres along the direction per metre of distance, shape ``(N, 2)``.
+        across, along: place of the camera in the cross-section, shape ``(N, 2)``, and along the direction, ``(N,)`` [m].
+        towards: unit vector of the bearing, shape ``(N, 2)``.
         pixel: radians of bearing that a pixel is worth, shape ``(N,)``.
         length: [pixels], shape ``(N,)``.
         sides: colours on the side of smaller and of larger bearing, shape ``(2, 3, N)``.
@@ -129,6 +131,9 @@ class Segments:
     pixel: np.ndarray
     length: np.ndarray
     sides: np.ndarray
+    across: np.ndarray
+    along: np.ndarray
+    towards: np.ndarray
 
     def alike(self, k: int) -> np.ndarray:
         """Which have the colour of segment ``k`` on one side at least (an occluding edge keeps only one)."""
@@ -214,18 +219,18 @@ def find_lines(
             for row in find_segments(camera, k, image, edgels[k], axis)
         ]
         if rows:
-            segments = Segments(*(np.array(column) for column in zip(*rows, strict=True)))
-            segments = replace(segments, sides=np.moveaxis(segments.sides, 0, 2).copy())
-            lines += _placed(segments, positions, axis)
+            camera, bearing, rise, pixel, length, sides = map(np.array, zip(*rows, strict=True))
+            eye = positions[camera]
+            place = eye[:, [(axis + 1) % 3, (axis + 2) % 3]], eye[:, axis]
+            towards = np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+            sides = np.moveaxis(sides, 0, 2).copy()
+            lines += _placed(Segments(camera, bearing, rise, pixel, length, sides, *place, towards), axis)
     return lines
 
 
-def _placed(segments: Segments, positions: np.ndarray, axis: int) -> list[Line]:
+def _placed(segments: Segments, axis: int) -> list[Line]:
     """Lines where segments meet, the best supported first; each segment belongs to one."""
-    eye = positions[segments.camera]
-    across, along = eye[:, [(axis + 1) % 3, (axis + 2) % 3]], eye[:, axis]
-    towards = np.stack([np.cos(segments.bearing), np.sin(segments.bearing)], axis=1)
-    guesses = [_met(k, segments, across, along, towards) for k in range(len(segments.camera))]
+    guesses = [_met(segments, k) for k in range(len(segments.camera))]
     support = np.array([weight for weight, _ in guesses])
     free, lines = np.ones(len(support), dtype=bool), []
     for k in np.argsort(-support, kind="stable"):
@@ -236,23 +241,18 @@ def _placed(segments: Segments, positions: np.ndarray, axis: int) -> list[Line]:
             continue
         distance = guesses[k][1]
         alike = np.flatnonzero(free & segments.alike(k))
-        start = across[k] + distance * towards[k], along[k] + distance * segments.rise[k]
-        place, chosen = _fitted(alike, start, segments, across, along, towards)
-        line = _extent(place, chosen, segments, across, along, axis)
+        place = segments.across[k] + distance * segments.towards[k]
+        place, chosen = _fitted(segments, alike, place, segments.along[k] + distance * segments.rise[k])
+        line = _extent(segments, place, chosen, axis)
         if line is not None and len(line.views) >= LINE_VIEWS:
             free[chosen] = False
             lines.append(line)
     return lines
 
 
-def _met(
-    k: int,
-    segments: Segments,
-    across: np.ndarray,
-    along: np.ndarray,
-    towards: np.ndarray,
-) -> tuple[float, float]:
+def _met(segments: Segments, k: int) -> tuple[float, float]:
     """How many segments of other photos meet segment ``k`` at one place, by weight, and at which distance [m]."""
+    across, along, towards = segments.across, segments.along, segments.towards
     sine = towards[k, 0] * towards[:, 1] - towards[k, 1] * towards[:, 0]
     # 3.0: two bearings that differ by less meet nowhere for sure
     meet = np.abs(sine) > np.sin(np.radians(3.0))
@@ -277,16 +277,11 @@ def _met(
 
 
 def _fitted(
-    alike: np.ndarray,
-    start: tuple[np.ndarray, np.ndarray],
-    segments: Segments,
-    across: np.ndarray,
-    along: np.ndarray,
-    towards: np.ndarray,
+    segments: Segments, alike: np.ndarray, place: np.ndarray, ends: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Place in the cross-section that those of the segments ``alike`` near a first guess fix, and which segments those are."""
-    (place, (low, high)), chosen = start, np.ones(len(alike), dtype=bool)
-    across, along, towards = across[alike], along[alike], towards[alike]
+    low, high = ends
+    across, along, towards = (of[alike] for of in (segments.across, segments.along, segments.towards))
     rise, pixel, length = (of[alike] for of in (segments.rise, segments.pixel, segments.length))
     for step in range(REFITS):
         reach = place - across
@@ -306,19 +301,12 @@ def _fitted(
     return place, alike[chosen]
 
 
-def _extent(
-    place: np.ndarray,
-    picked: np.ndarray,
-    segments: Segments,
-    across: np.ndarray,
-    along: np.ndarray,
-    axis: int,
-) -> Line | None:
+def _extent(segments: Segments, place: np.ndarray, picked: np.ndarray, axis: int) -> Line | None:
     """The line at ``place``, from where to where two photos at least show it."""
     if not len(picked):
         return None
-    distance = np.linalg.norm(place - across[picked], axis=1)
-    ends = along[picked, None] + segments.rise[picked] * distance[:, None]
+    distance = np.linalg.norm(place - segments.across[picked], axis=1)
+    ends = segments.along[picked, None] + segments.rise[picked] * distance[:, None]
     bins = np.arange(ends.min(), ends.max() + 0.05, 0.05)
     views = np.unique(segments.camera[picked])
     shown = np.zeros(len(bins), dtype=int)
