@@ -51,10 +51,10 @@ def occupancy(
         empty = dilate(lines > 0, 2) & ~dilate(supported, 1)
         empty |= (lines > 2) & ~supported
         result.append(replace(grid, occupied=inside & ~empty))
-    return [_uncontested(k, result, points, CONTESTED_M) for k in range(len(result))]
+    return [_uncontested(k, result, points) for k in range(len(result))]
 
 
-def _uncontested(k: int, planes: Sequence[Plane], points: np.ndarray, contested_m: float) -> Plane:
+def _uncontested(k: int, planes: Sequence[Plane], points: np.ndarray) -> Plane:
     """Plane ``k`` without the cells that belong to a parallel plane close by, such as the wall behind a sign.
 
     Lines of sight cannot tell the two apart; of two planes the one with the nearest point of its own has the cell.
@@ -65,14 +65,25 @@ def _uncontested(k: int, planes: Sequence[Plane], points: np.ndarray, contested_
     own = cKDTree(plane.to_plane(points[plane.inliers])).query(uv)[0] if len(uv) else np.zeros(0)
     lost = np.zeros(len(cells), dtype=bool)
     for other in [*planes[:k], *planes[k + 1 :]]:
-        if other.normal @ plane.normal < PARALLEL:
-            continue
-        contested = (np.abs(other.distance(cells)) < contested_m) & other.covers(cells)
-        if contested.any():
-            theirs = cKDTree(plane.to_plane(points[other.inliers])).query(uv[contested])[0]
-            lost[contested] |= theirs < own[contested]
+        both = contested(plane, other, cells)
+        if both.any():
+            theirs = cKDTree(plane.to_plane(points[other.inliers])).query(uv[both])[0]
+            lost[both] |= theirs < own[both]
+    return with_cells(plane, ~lost)
+
+
+def contested(plane: Plane, other: Plane, cells: np.ndarray, held: np.ndarray | None = None) -> np.ndarray:
+    """Which of the places ``cells`` (K, 3) of ``plane`` lie close to an occupied (or ``held``) cell of ``other``, which faces
+    alike; shape ``(K,)`` bool."""
+    if other.normal @ plane.normal < PARALLEL:
+        return np.zeros(len(cells), dtype=bool)
+    return (np.abs(other.distance(cells)) < CONTESTED_M) & other.covers(cells, held)
+
+
+def with_cells(plane: Plane, kept: np.ndarray) -> Plane:
+    """``plane`` with those of its occupied cells that are ``kept``, in the order of :meth:`Plane.cells`."""
     occupied = plane.occupied.copy()
-    occupied[plane.occupied] = ~lost
+    occupied[plane.occupied] = kept
     return replace(plane, occupied=occupied)
 
 
@@ -102,23 +113,20 @@ def visible_from(
     points: np.ndarray,
     normal: np.ndarray,
     cameras: Sequence[Camera],
-    *,
     clearance_m: float = 0.05,
 ) -> np.ndarray:
     """Which cameras see which points, shape ``(P, cameras)`` bool: in the frame, from the front, nothing between.
 
-    The line of sight starts ``clearance_m`` above the surface, along ``normal`` (of all, shape ``(3,)``, or of each
-    point, ``(P, 3)``).
+    The line of sight starts ``clearance_m`` above the surface, along its ``normal`` (3,).
     """
-    normals = np.broadcast_to(normal, points.shape)
     seen = np.zeros((len(points), len(cameras)), dtype=bool)
     for c, camera in enumerate(cameras):
         inside, _ = camera.in_frame(points, 0.05)
-        seen[:, c] = inside & (((camera.position - points) * normals).sum(axis=1) > 0)
+        seen[:, c] = inside & (((camera.position - points) * normal).sum(axis=1) > 0)
     if surface is not None and seen.any():
         positions = np.array([camera.position for camera in cameras])
         point, eye = np.nonzero(seen)
-        seen[point, eye] = surface.visible(points[point] + clearance_m * normals[point], positions[eye])
+        seen[point, eye] = surface.visible(points[point] + clearance_m * normal, positions[eye])
     return seen
 
 
@@ -127,11 +135,15 @@ def seen_cells(planes: Sequence[Plane], cameras: Sequence[Camera]) -> list[Plane
     surface = plane_mesh(planes)
     result = []
     for plane in planes:
-        occupied = plane.occupied.copy()
         seen = visible_from(surface, plane.cells(), plane.normal, cameras)
-        occupied[plane.occupied] = seen.sum(axis=1) >= 2
-        result.append(replace(plane, occupied=occupied))
+        result.append(with_cells(plane, seen.sum(axis=1) >= 2))
     return result
+
+
+def pieces(mask: np.ndarray, smallest: int) -> np.ndarray:
+    """``mask`` without connected pieces (four neighbours) of fewer cells than ``smallest``."""
+    label, _ = ndimage.label(mask)
+    return mask & (np.bincount(label.ravel())[label] >= smallest)
 
 
 def meeting(planes: Sequence[Plane]) -> list[Plane]:

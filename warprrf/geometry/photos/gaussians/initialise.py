@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.photos.config import ReconstructionConfig
-from warprrf.geometry.photos.gaussians.cells import meeting, occupancy, plane_mesh, seen_cells, visible_from
+from warprrf.geometry.photos.gaussians.cells import meeting, occupancy, plane_mesh, seen_cells
 from warprrf.geometry.photos.gaussians.plain import plain_surfaces, with_plain
 from warprrf.geometry.photos.gaussians.sweep import choose_views, joined, level_planes, proven_cells, united
 from warprrf.geometry.photos.posed.images import GreyPhotos
@@ -87,12 +87,11 @@ def _blocks(
     cells = []
     for k, plane in enumerate(planes):
         centres = plane.cells()
-        seen = visible_from(surface, centres, plane.normal, cameras)
-        some = seen.any(axis=1)
+        views = choose_views(surface, centres, plane.normal, cameras)
+        some = views[:, 0] >= 0
         quarter = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]]) * plane.cell_m
         fine = centres[some, None, :] + quarter @ plane.axes
-        views = choose_views(centres[some], plane.normal, seen[some], cameras)
-        color = _median_colors(fine.reshape(-1, 3), np.repeat(views, 4, axis=0), cameras, images)
+        color = _median_colors(fine.reshape(-1, 3), np.repeat(views[some], 4, axis=0), cameras, images)
         key = np.insert(np.argwhere(plane.occupied)[some] // 2, 0, k, axis=1)
         cells.append((key, fine, color.reshape(-1, 4, 3)))
     key, fine, color = (np.concatenate(c) for c in zip(*cells, strict=True))

@@ -22,7 +22,7 @@ from scipy import ndimage
 
 from warprrf.device import threads
 from warprrf.geometry.photos.gaussians.cells import BEHIND_M as SEEN_BEHIND_M
-from warprrf.geometry.photos.gaussians.cells import CONTESTED_M, PARALLEL
+from warprrf.geometry.photos.gaussians.cells import contested, pieces
 from warprrf.geometry.photos.gaussians.edges import (
     EDGE_DEG,
     FARTHEST_M,
@@ -371,20 +371,21 @@ def _agreed(
     """The plane with the cells that more photos put on it than see through it; none where those are few."""
     axis, height, _, bounds = heights[number]
     some = STRIDE // 2
-    hits = []
-    for camera, view in zip(cameras, seen, strict=True):
+    photos = [x for x in zip(cameras, seen, strict=True) if side * (x[0].position[axis] - height) > 0.1]
+    found = [np.zeros((0, 3))]
+    for camera, view in photos:
         own = view.plane == number
-        if side * (camera.position[axis] - height) > 0.1 and own.any():
-            y, x = np.nonzero(own)
-            rays = lines_through(camera, np.stack([x, y], axis=1) * STRIDE + some + 0.5, axis)[0]
-            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-            hits.append(camera.position + view.range_m[own][:, None] * rays)
-    if not hits:
+        y, x = np.nonzero(own)
+        rays = lines_through(camera, np.stack([x, y], axis=1) * STRIDE + some + 0.5, axis)[0]
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        found.append(camera.position + view.range_m[own][:, None] * rays)
+    hits = np.concatenate(found)
+    if not len(hits):
         return []
     empty = Plane(
         side * np.eye(3)[axis], side * height, np.zeros(0, dtype=np.int64), cell_m=CELL_M, plain=True
     )
-    uv = empty.to_plane(np.concatenate(hits))
+    uv = empty.to_plane(hits)
     edges = empty.to_plane(bounds)  # a surface ends where its edges do
     low = np.maximum(uv.min(axis=0), edges.min(axis=0) - CELL_M)
     high = np.minimum(uv.max(axis=0), edges.max(axis=0) + CELL_M)
@@ -395,9 +396,7 @@ def _agreed(
     plane = replace(empty, corner=low, occupied=np.ones(shape, dtype=bool))
     cells = plane.cells()
     yes, no = (np.zeros(len(cells), dtype=int) for _ in range(2))
-    for camera, view in zip(cameras, seen, strict=True):
-        if side * (camera.position[axis] - height) < 0.1:
-            continue
+    for camera, view in photos:
         inside, pixels = camera.in_frame(cells, 0.1)
         own = np.flatnonzero(inside)
         y, x = pixels[own].T // STRIDE
@@ -406,12 +405,9 @@ def _agreed(
         away = np.linalg.norm(cells[own] - camera.position, axis=1)
         yes[own] += here
         no[own] += ~here & (view.range_m[y, x] > away + BEHIND_M)
-    # fewest photos that put a cell on its plane, and least area of a piece of one
-    agreeing, piece_m2 = 2, 0.1
-    occupied = ((yes >= agreeing) & (yes > no)).reshape(shape)
-    label, _ = ndimage.label(occupied)
-    size = np.bincount(label.ravel())
-    occupied &= size[label] * CELL_M**2 >= piece_m2
+    # fewest photos that put a cell on its plane, and fewest cells of a piece of one: 0.1 square metres
+    agreeing, piece_cells = 2, 10
+    occupied = pieces(((yes >= agreeing) & (yes > no)).reshape(shape), piece_cells)
     return [replace(plane, occupied=occupied)] if occupied.any() else []
 
 
@@ -456,6 +452,5 @@ def _covered(plane: Plane, others: Sequence[Plane]) -> np.ndarray:
     cells = plane.cells(np.ones_like(plane.occupied))
     covered = np.zeros(len(cells), dtype=bool)
     for other in others:
-        if other.normal @ plane.normal > PARALLEL:
-            covered |= (np.abs(other.distance(cells)) < CONTESTED_M) & other.covers(cells)
+        covered |= contested(plane, other, cells)
     return covered.reshape(plane.occupied.shape)

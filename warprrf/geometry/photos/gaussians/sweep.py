@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from warprrf.device import launch
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos.gaussians.cells import CONTESTED_M, PARALLEL, plane_mesh, visible_from
+from warprrf.geometry.photos.gaussians.cells import contested, pieces, plane_mesh, visible_from
 from warprrf.geometry.photos.posed.images import GreyPhotos, projections
 from warprrf.geometry.planes import AROUND, Plane, dilate, plane_axes
 from warprrf.geometry.splats.camera import Camera
@@ -36,29 +36,26 @@ def agreement_of(
     n, device = len(centres), photos.device
     result, contrast = (wp.zeros(n, dtype=wp.float32, device=device) for _ in range(2))
     patch_m = 0.12  # side of a patch
-    launch(
-        patch_agreement,
-        n,
-        [
-            wp.array(centres, dtype=wp.vec3, device=device), wp.vec3(*axes[0]), wp.vec3(*axes[1]), patch_m / (SIDE - 1),
-            wp.array(views, dtype=wp.int32, device=device),
-            wp.array(projections(photos.cameras), dtype=wp.vec4, device=device), photos.flat,
-            wp.array(photos.sizes, dtype=wp.vec3i, device=device), result, contrast,
-        ],
-        device=device,
-    )  # fmt: skip
+    patch = [centres, *(wp.vec3(*axis) for axis in axes), patch_m / (SIDE - 1)]
+    images = [projections(photos.cameras), photos.flat, photos.sizes]
+    launch(patch_agreement, n, [*patch, views, *images, result, contrast], device=device)
     return result.numpy(), contrast.numpy()
 
 
 def choose_views(
-    points: np.ndarray, normal: np.ndarray, seen: np.ndarray, cameras: Sequence[Camera]
+    surface: Mesh | None,
+    points: np.ndarray,
+    normal: np.ndarray,
+    cameras: Sequence[Camera],
+    clearance_m: float = 0.05,
 ) -> np.ndarray:
-    """For each point on a plane of this ``normal`` the photos that show it largest among those that see it, no two from
-    nearly the same direction.
+    """For each point on a plane of this ``normal`` the photos that show it largest among those that see it past ``surface``
+    (see :func:`visible_from`), no two from nearly the same direction.
 
     Returns:
         Camera indices, shape ``(N, VIEWS)`` int32, -1 padded.
     """
+    seen = visible_from(surface, points, normal, cameras, clearance_m)
     line = np.array([c.position for c in cameras])[None] - points[:, None]
     distance = np.linalg.norm(line, axis=2)
     line /= np.maximum(distance, 1e-9)[..., None]
@@ -100,7 +97,7 @@ def proven_cells(planes: Sequence[Plane], points: np.ndarray, photos: GreyPhotos
         lost, taken = _rivals(this, scored[:k] + scored[k + 1 :])
         grown = _majority(yes, 5) & ~this.before & ~taken
         kept = this.before & ~(_majority(no, 3) & ~dilate(this.own, 1)) & ~lost
-        attached = _pieces(grown | kept, 6) & grown
+        attached = pieces(grown | kept, 6) & grown
         result.append(replace(this.plane, occupied=(kept | attached) & this.visible))
     return result
 
@@ -110,18 +107,20 @@ def _scored(plane: Plane, surface: Mesh | None, points: np.ndarray, photos: Grey
     reach = int(round(reach_m / plane.cell_m)) if plane.area() >= large_m2 else 2
     wide = plane.widened(reach)
     full = replace(wide, occupied=dilate(wide.occupied, reach))
-    # Photos are chosen once for every 2 x 2 cells.
-    index = np.argwhere(full.occupied)
-    key, group = np.unique(index // 2, axis=0, return_inverse=True)
-    middle = full.to_world(full.corner + (2 * key + 1.0) * full.cell_m)
-    seen = visible_from(surface, middle, full.normal, photos.cameras)
-    views = choose_views(middle, full.normal, seen, photos.cameras)[group.ravel()]
+    middle, group = _blocks(full, 2)  # photos are chosen once for each
+    views = choose_views(surface, middle, full.normal, photos.cameras)[group]
     agreement, contrast = agreement_of(photos, full.cells(), full.axes, views)
     score = np.full(full.occupied.shape, np.nan)
     score[full.occupied] = np.where((contrast > CONTRAST) & (views[:, 1] >= 0), agreement, np.nan)
     visible = np.zeros_like(full.occupied)
-    visible[full.occupied] = np.asarray(seen.any(axis=1))[group.ravel()]
+    visible[full.occupied] = views[:, 0] >= 0
     return _Scored(full, wide.occupied, score, visible, full.count(points[plane.inliers]) > 0)
+
+
+def _blocks(plane: Plane, side: int) -> tuple[np.ndarray, np.ndarray]:
+    """Middles of the blocks of ``side`` x ``side`` cells of a plane, and the block of each occupied cell."""
+    key, group = np.unique(np.argwhere(plane.occupied) // side, axis=0, return_inverse=True)
+    return plane.to_world(plane.corner + (key + 0.5) * side * plane.cell_m), group.ravel()
 
 
 def _rivals(this: _Scored, others: Sequence[_Scored]) -> tuple[np.ndarray, np.ndarray]:
@@ -131,10 +130,8 @@ def _rivals(this: _Scored, others: Sequence[_Scored]) -> tuple[np.ndarray, np.nd
     unproven = 0.3  # what photos that prove nothing count as, between agreement and disagreement
     cells, mine = plane.cells(), np.nan_to_num(this.score[plane.occupied], nan=unproven)
     for other in others:
-        if other.plane.normal @ plane.normal < PARALLEL:
-            continue
-        place, inside = other.plane.cell_of(cells)
-        held = inside & (np.abs(other.plane.distance(cells)) < CONTESTED_M) & other.before[place]
+        place, _ = other.plane.cell_of(cells)
+        held = contested(plane, other.plane, cells, other.before)
         better = (np.nan_to_num(other.score[place], nan=unproven) > mine) | other.own[place]
         lost[plane.occupied] |= held & better
         taken[plane.occupied] |= held
@@ -184,9 +181,9 @@ def level_planes(
         mask = peak[band].any(axis=0)
         peak[max(0, k - 2) : k + 3] &= ~mask
         mask |= dilate(mask, 1) & (agreement[band].max(axis=0) > 0.8 * AGREES)
-        pieces, count = ndimage.label(_pieces(mask, min_cells))
+        label, count = ndimage.label(pieces(mask, min_cells))
         for number in range(1, count + 1):  # every connected piece has a height of its own
-            piece = replace(whole, offset=float(levels[k] * normal[2]), occupied=pieces == number)
+            piece = replace(whole, offset=float(levels[k] * normal[2]), occupied=label == number)
             level = _settled(piece, surface, photos)
             if level is not None:
                 crossed = (level.seen_through(*lines, 0.05) > 0) & level.occupied
@@ -199,16 +196,13 @@ def _swept(whole: Plane, levels: np.ndarray, surface: Mesh | None, photos: GreyP
 
     Photos are chosen once for blocks of 3 x 3 cells and 3 levels.
     """
-    index = np.argwhere(whole.occupied)
-    key, group = np.unique(index // 3, axis=0, return_inverse=True)
-    middle = whole.to_world(whole.corner + (key + 0.5) * 3 * whole.cell_m)
+    middle, group = _blocks(whole, 3)
     cells = whole.cells()
     agreement = np.full((len(levels), len(cells)), -1.0, dtype=np.float32)
     for k, z in enumerate(levels):
         if k % 3 == 0:
             middle[:, 2] = levels[min(k + 1, len(levels) - 1)]
-            seen = visible_from(surface, middle, whole.normal, photos.cameras, clearance_m=0.03)
-            views = choose_views(middle, whole.normal, seen, photos.cameras)[group.ravel()]
+            views = choose_views(surface, middle, whole.normal, photos.cameras, clearance_m=0.03)[group]
             some = np.flatnonzero(views[:, 2] >= 0)  # three photos at least
         cells[:, 2] = z
         value, contrast = agreement_of(photos, cells[some], whole.axes, views[some])
@@ -243,8 +237,7 @@ def _settled(piece: Plane, surface: Mesh | None, photos: GreyPhotos) -> Plane | 
     """A horizontal piece moved to the height where its photos agree best; None where no height within 5 cm does."""
     centres = piece.cells()
     z = piece.offset * piece.normal[2]
-    seen = visible_from(surface, centres, piece.normal, photos.cameras)
-    views = choose_views(centres, piece.normal, seen, photos.cameras)
+    views = choose_views(surface, centres, piece.normal, photos.cameras)
     steps = np.arange(-0.05, 0.0501, FINE_M)
     scores = [
         float(agreement_of(photos, centres + [0, 0, step], piece.axes, views)[0].mean()) for step in steps
@@ -302,9 +295,3 @@ def _closed(mask: np.ndarray) -> np.ndarray:
     """``mask`` with gaps of up to two cells closed."""
     grown = np.pad(mask, 2)
     return np.asarray(ndimage.binary_closing(grown, AROUND)[2:-2, 2:-2]) | mask
-
-
-def _pieces(mask: np.ndarray, smallest: int) -> np.ndarray:
-    """``mask`` without connected pieces (four neighbours) of fewer cells than ``smallest``."""
-    label, _ = ndimage.label(mask)
-    return mask & (np.bincount(label.ravel())[label] >= smallest)
