@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warprrf.checks import check_array
 from warprrf.device import DeviceLike, require, resolve
 from warprrf.geometry.splats.camera import Camera
 
@@ -24,30 +23,11 @@ class PosedPhotos:
         images: in [0, 1], each ``(H, W, 3)``.
         cameras: pinhole cameras of the same sizes.
         masks: True where a pixel takes no part, each ``(H, W)``, None for a photo without one; empty: none has one.
-
-    Raises:
-        ValueError: if they do not match.
     """
 
     images: Sequence[np.ndarray]
     cameras: Sequence[Camera]
     masks: Sequence[np.ndarray | None] = ()
-
-    def __post_init__(self) -> None:
-        if len(self.images) != len(self.cameras) or not self.images:
-            raise ValueError(
-                f"images: got {len(self.images)} for {len(self.cameras)} cameras, expected one each and at least one"
-            )
-        if len(self.masks) not in (0, len(self.images)):
-            raise ValueError(f"masks: got {len(self.masks)} for {len(self.images)} images, expected one each")
-        for k, (image, camera) in enumerate(zip(self.images, self.cameras, strict=True)):
-            if camera.kind != "pinhole":
-                raise ValueError(f"cameras[{k}]: got a {camera.kind} camera, expected pinhole")
-            shape = camera.height, camera.width
-            check_array(f"images[{k}]", image, (*shape, 3), np.float32)
-            mask = self.masks[k] if self.masks else None
-            if mask is not None:
-                check_array(f"masks[{k}]", mask, shape, np.uint8)
 
     def subset(self, chosen: Sequence[int]) -> PosedPhotos:
         """The photos of these numbers."""
@@ -62,7 +42,7 @@ class GreyPhotos:
     Attributes:
         cameras: pinhole cameras of the sizes at which photos are compared.
         pixels: of each, in [0, 1], ``(H, W)`` float32.
-        sizes: where each begins in ``flat``, its width and its height, shape ``(N, 3)`` int32.
+        sizes: their :func:`layout` in ``flat``.
         flat: all pixels, on the device.
     """
 
@@ -83,17 +63,20 @@ class GreyPhotos:
                 image = require("PIL.Image", extra="photos")
                 grey = np.asarray(image.fromarray(grey).resize(size, image.BOX))
             pixels.append(grey)
-        first = np.cumsum([0, *(grey.size for grey in pixels)])[:-1]
-        sizes = np.array(
-            [(start, c.width, c.height) for start, c in zip(first, cameras, strict=True)], dtype=np.int32
-        )
         flat = np.concatenate([grey.ravel() for grey in pixels])
-        return cls(cameras, pixels, sizes, wp.array(flat, dtype=wp.float32, device=resolve(device)))
+        return cls(cameras, pixels, layout(cameras), wp.array(flat, dtype=wp.float32, device=resolve(device)))
 
     @property
     def device(self) -> wp.Device:
         """Where they lie."""
         return self.flat.device
+
+
+def layout(cameras: Sequence[Camera]) -> np.ndarray:
+    """Of images one behind the other: where each begins, its width and its height, shape ``(N, 3)`` int32."""
+    sizes = np.array([(c.width, c.height) for c in cameras], dtype=np.int32)
+    pixels = sizes.prod(axis=1)
+    return np.column_stack([np.cumsum(pixels) - pixels, sizes]).astype(np.int32)
 
 
 def lens_matrix(camera: Camera) -> np.ndarray:

@@ -19,7 +19,7 @@ import numpy as np
 from scipy import ndimage
 
 from warprrf.geometry.mesh import Mesh, connected_pieces
-from warprrf.geometry.photos.gaussians.cells import BEHIND_M, plane_mesh
+from warprrf.geometry.photos.gaussians.cells import BEHIND_M, plane_mesh, with_cells
 from warprrf.geometry.photos.posed.photo_files import spread
 from warprrf.geometry.photos.surface.boxes import (
     FaceLevels,
@@ -60,12 +60,7 @@ def complete(
         The mesh with its patches, one for each plane and side; and whether that is all. It is not where most of the mesh
         lies on no planes along three perpendicular directions, or the photos show so little of the place that most would
         be a guess: then gaps of single planes are closed.
-
-    Raises:
-        ValueError: when the numbers of cameras and depth maps differ.
     """
-    if len(depths) != len(cameras):
-        raise ValueError(f"depths: got {len(depths)} maps for {len(cameras)} cameras, expected one for each")
     mesh = patches.mesh
     axes = directions(patches.normal, patches.area, float(mesh.areas.sum()))
     if axes is None:
@@ -139,9 +134,7 @@ def _without_gaps(patches: PlanarPatches, cameras: Sequence[Camera]) -> PlanarPa
             away = np.linalg.norm(ahead, axis=1)
             met = mesh.cast(np.broadcast_to(camera.position, ahead.shape), ahead)
             through[looked] |= met.valid & (np.where(met.valid, met.t, 0.0) > away + BEHIND_M)
-        occupied = plane.occupied.copy()
-        occupied[occupied] = ~through
-        squares = plane_mesh([replace(plane, occupied=occupied)])
+        squares = plane_mesh([with_cells(plane, ~through)])
         if squares is not None:
             meshes.append(squares)
             labels.append(np.full(len(squares.faces), k, dtype=np.int32))

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.checks import check_array
 from warprrf.device import DeviceLike, Progress, threads
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.config import ReconstructionConfig
@@ -169,7 +168,7 @@ def _with_voxels(
 
 
 def fuse_depth(
-    depths: Sequence[Any], cameras: Sequence[Camera], *, config: SurfaceConfig | None = None
+    depths: Sequence[np.ndarray], cameras: Sequence[Camera], *, config: SurfaceConfig | None = None
 ) -> Mesh:
     """One mesh from depth maps of pinhole cameras, by a truncated signed distance field.
 
@@ -179,13 +178,10 @@ def fuse_depth(
         config: sizes and limits.
 
     Raises:
-        ValueError: when the numbers of maps and cameras differ, a camera is not a pinhole, a map has another shape
-            than its camera, or no surface comes out.
+        ValueError: when no surface comes out.
     """
     config = config or SurfaceConfig()
     o3d = open3d()
-    if len(depths) != len(cameras) or not len(depths):
-        raise ValueError(f"depths: got {len(depths)} maps for {len(cameras)} cameras, expected one for each")
     core = o3d.core
     grid = o3d.t.geometry.VoxelBlockGrid(
         ("tsdf", "weight"), (core.float32, core.float32), ((1,), (1,)), config.voxel_m, BLOCK_VOXELS, BLOCKS
@@ -193,10 +189,7 @@ def fuse_depth(
     filled = False
     # Open3D looks for blocks along every so many-th row and column, and refuses a map that shows none
     touched = 4
-    for k, (given, camera) in enumerate(zip(depths, cameras, strict=True)):
-        if camera.kind != "pinhole":
-            raise ValueError(f"cameras[{k}]: got a {camera.kind} camera, expected pinhole cameras")
-        depth = check_array(f"depths[{k}]", given, (camera.height, camera.width), np.float64, finite=False)
+    for depth, camera in zip(depths, cameras, strict=True):
         z = range_to_depth(np.where(np.isfinite(depth), depth, 0.0), camera)
         z[(depth >= config.max_range_m) | ~_smooth(z, EDGE_TOLERANCE / camera.fx)] = 0.0
         if not (z[::touched, ::touched] > 0).any():

@@ -9,14 +9,13 @@ found takes the place of the old one; what one sees through is left out.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 from scipy import ndimage
 
 from warprrf.device import DeviceLike, Progress, filled, launch
-from warprrf.geometry.photos.posed.images import GreyPhotos, PosedPhotos, lens_matrix, projections
+from warprrf.geometry.photos.posed.images import GreyPhotos, PosedPhotos, layout, lens_matrix, projections
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.patch_match import UNKNOWN, Others, match
 from warprrf.kernels.photo_consistency import count_votes
@@ -49,18 +48,20 @@ def mended(
         return list(depths), [np.zeros(depth.shape, dtype=bool) for depth in depths]
     near, far = np.percentile(np.concatenate(known), [0.5, 99.5])
     bounds = 1 / (1.6 * float(far)), 1 / (0.6 * float(near))
-    comparison = _Comparison(GreyPhotos.upload(views, photos.images, device), bounds)
-    sharpness = comparison.sharpness
-    sources = 3  # photos that one is compared with
-    others = [_companions(k, views, depths, sharpness, sources) for k in range(len(views))]
-    started = [comparison.start(k, depth) for k, depth in enumerate(depths)]
-    planes = list(started)
-    work, costs = len(ROUNDS) * len(views), [np.zeros(0)] * len(views)
+    grey = GreyPhotos.upload(views, photos.images, device)
+    sharpness, compared = _sharpness(grey.pixels), 3  # photos that one is compared with
+    others = [_companions(k, views, depths, sharpness, compared) for k in range(len(views))]
+    started = [_start(k, *seen, bounds) for k, seen in enumerate(zip(views, depths, strict=True))]
+    planes, costs = list(started), [np.full(depth.shape, float(UNKNOWN)) for depth in depths]
+    work = len(ROUNDS) * len(views)
     for number, (turns, contradicting) in enumerate(ROUNDS):
-        told = comparison.upload(planes)
-        for k, others_of in enumerate(others):
+        flat = np.concatenate([p.reshape(-1, 3) for p in planes])
+        told = wp.array(flat, dtype=wp.vec3, device=grey.device)
+        for k in range(len(views)):
             progress("stereo", number * len(views) + k, work)
-            planes[k], costs[k] = comparison.match(k, planes[k], others_of, told, turns, contradicting)
+            if len(others[k]) >= 2:
+                sources = _others(grey, k, others[k], told, contradicting)
+                planes[k], costs[k] = _matched(grey, k, planes[k], sources, turns, bounds)
     progress("stereo", work, work)
     found = []
     for k, (view, depth, plane) in enumerate(zip(views, depths, planes, strict=True)):
@@ -95,84 +96,68 @@ def kept_pixels(photos: PosedPhotos, number: int, camera: Camera) -> np.ndarray:
     return np.asarray(np.asarray(mask)[np.ix_(*inside)] == 0)
 
 
-@dataclass(frozen=True)
-class _Comparison:
-    """Photos to compare, and how.
+def _sharpness(pixels: Sequence[np.ndarray]) -> np.ndarray:
+    """Of each grey photo, over the median."""
+    blur = np.array([ndimage.laplace(grey).var() for grey in pixels])
+    return np.clip(blur / max(float(np.median(blur)), 1e-12), 0.3, 1.5)
 
-    Attributes:
-        photos: at the size at which they are compared.
+
+def _start(number: int, camera: Camera, depth: np.ndarray, bounds: tuple[float, float]) -> np.ndarray:
+    """Planes along a depth map, ``(H, W, 3)``; at any inverse depth [1/m] within ``bounds`` where it is unknown."""
+    known = depth > 0
+    w = np.where(known, 1 / np.where(known, depth * ahead(camera), 1.0), 0.0)
+    planes = np.stack([w, *np.gradient(w)[::-1]], axis=-1)
+    bent = ~known | (np.abs(planes[..., 1:]).max(axis=-1) > 0.05 * w)  # across an edge
+    planes[bent, 1:] = 0.0
+    planes[~known, 0] = np.random.default_rng(number).uniform(*bounds, (~known).sum())
+    return planes.astype(np.float32)
+
+
+def _others(
+    photos: GreyPhotos, number: int, others: np.ndarray, told: wp.array, contradicting: float
+) -> Others:
+    """The photos ``others``, as photo ``number`` is compared with them.
+
+    Args:
+        told: planes of all photos, flat.
+        contradicting: cost of a plane that contradicts what is told of another photo.
+    """
+    cameras = photos.cameras
+    camera, turns, shifts = cameras[number], [], []
+    for other in others:
+        lens, turn = lens_matrix(cameras[other]), cameras[other].rotation @ camera.rotation.T
+        turns.append(lens @ turn @ np.linalg.inv(lens_matrix(camera)))
+        shifts.append(lens @ (cameras[other].world_to_camera[:3, 3] - turn @ camera.world_to_camera[:3, 3]))
+    return filled(
+        Others, photos.device, turns=np.array(turns), shifts=np.array(shifts), sizes=photos.sizes[others],
+        images=photos.flat, told=told, contradicting=contradicting,
+    )  # fmt: skip
+
+
+def _matched(
+    photos: GreyPhotos,
+    number: int,
+    first: np.ndarray,
+    others: Others,
+    turns: range,
+    bounds: tuple[float, float],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Better planes ``(H, W, 3)`` of a photo than ``first``, by comparison with ``others``, and their costs ``(H, W)``.
+
+    Args:
+        turns: in which planes are handed on between pixels.
         bounds: least and largest inverse depth [1/m].
     """
-
-    photos: GreyPhotos
-    bounds: tuple[float, float]
-
-    @property
-    def sharpness(self) -> np.ndarray:
-        """Of each photo, over the median."""
-        blur = np.array([ndimage.laplace(grey).var() for grey in self.photos.pixels])
-        return np.clip(blur / max(float(np.median(blur)), 1e-12), 0.3, 1.5)
-
-    def start(self, view: int, depth: np.ndarray) -> np.ndarray:
-        """Planes along a depth map, ``(H, W, 3)``; at any depth where it is unknown."""
-        known = depth > 0
-        w = np.where(known, 1 / np.where(known, depth * ahead(self.photos.cameras[view]), 1.0), 0.0)
-        planes = np.stack([w, *np.gradient(w)[::-1]], axis=-1)
-        bent = ~known | (np.abs(planes[..., 1:]).max(axis=-1) > 0.05 * w)  # across an edge
-        planes[bent, 1:] = 0.0
-        planes[~known, 0] = np.random.default_rng(view).uniform(*self.bounds, (~known).sum())
-        return planes.astype(np.float32)
-
-    def upload(self, planes: Sequence[np.ndarray]) -> wp.array:
-        """Planes of all photos, flat."""
-        flat = np.concatenate([p.reshape(-1, 3) for p in planes])
-        return wp.array(flat, dtype=wp.vec3, device=self.photos.device)
-
-    def match(
-        self,
-        view: int,
-        first: np.ndarray,
-        others: np.ndarray,
-        told: wp.array,
-        turns: range,
-        contradicting: float,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Better planes ``(H, W, 3)`` of one photo than ``first``, by comparison with ``others``, and their costs ``(H, W)``.
-
-        Args:
-            told: planes of all photos (see :meth:`upload`).
-            turns: in which planes are handed on between pixels.
-            contradicting: cost of a plane that contradicts what is told of another photo.
-        """
-        cameras, sizes, device = self.photos.cameras, self.photos.sizes, self.photos.device
-        camera = cameras[view]
-        if len(others) < 2:
-            return first, np.full(first.shape[:2], float(UNKNOWN))
-        planes = wp.array(first.reshape(-1, 3), dtype=wp.vec3, device=device)
-        costs = wp.full(len(planes), float(UNKNOWN), dtype=wp.float32, device=device)
-        inverse = np.linalg.inv(lens_matrix(camera))
-        turn = [cameras[s].rotation @ camera.rotation.T for s in others]
-        shift = [
-            cameras[s].world_to_camera[:3, 3] - r @ camera.world_to_camera[:3, 3]
-            for s, r in zip(others, turn, strict=True)
-        ]
-        lenses = [lens_matrix(cameras[s]) for s in others]
-        rotations = np.array([k @ r @ inverse for k, r in zip(lenses, turn, strict=True)], dtype=np.float32)
-        shifts = np.array([k @ t for k, t in zip(lenses, shift, strict=True)], dtype=np.float32)
-        sources = filled(
-            Others, device, turns=rotations, shifts=shifts, sizes=sizes[others], images=self.photos.flat, told=told,
-            contradicting=contradicting,
-        )  # fmt: skip
-        settled = 0.05  # a plane of less cost (one minus a correlation) stays as it is
-        for number in (-1, *turns):
-            for colour in (0, 1):
-                settings = [
-                    colour, number, view, 1 / camera.fx, wp.vec2(*self.bounds), settled,
-                    wp.vec3i(*map(int, sizes[view])),
-                ]  # fmt: skip
-                count = camera.height * ((camera.width + 1) // 2)
-                launch(match, count, [*settings, sources, planes, costs], device=device, grain=32)
-        return planes.numpy().reshape(first.shape), costs.numpy().reshape(first.shape[:2])
+    camera, size, device = photos.cameras[number], wp.vec3i(*map(int, photos.sizes[number])), photos.device
+    planes = wp.array(first.reshape(-1, 3), dtype=wp.vec3, device=device)
+    costs = wp.full(len(planes), float(UNKNOWN), dtype=wp.float32, device=device)
+    settled = 0.05  # a plane of less cost (one minus a correlation) stays as it is
+    for turn in (-1, *turns):
+        for colour in (0, 1):
+            settings = [colour, turn, number, 1 / camera.fx, wp.vec2(*bounds), settled, size]
+            count = camera.height * ((camera.width + 1) // 2)
+            launch(match, count, [*settings, others, planes, costs], device=device, grain=32)
+    return planes.numpy().reshape(first.shape), costs.numpy().reshape(first.shape[:2])
 
 
 def _companions(
@@ -221,12 +206,9 @@ def _votes(
     if not known.any() or not cameras:
         return agreed, crossed
     points = camera.position + depth[known][:, None] * camera.directions()[known]
-    first = np.cumsum([0, *map(len, ranges)])[:-1]
-    sizes = np.array([(at, c.width, c.height) for at, c in zip(first, cameras, strict=True)], dtype=np.int32)
+    eyes = np.array([c.position for c in cameras])
     found = [wp.zeros(len(points), dtype=wp.int32, device=device) for _ in range(2)]
-    maps = [
-        np.concatenate(ranges).astype(np.float32), projections(cameras), np.array([c.position for c in cameras]), sizes
-    ]  # fmt: skip
+    maps = [np.concatenate(ranges).astype(np.float32), projections(cameras), eyes, layout(cameras)]
     launch(count_votes, len(points), [points, *maps, tolerance, *found], device=device)
     agreed[known], crossed[known] = (votes.numpy() for votes in found)
     return agreed, crossed
