@@ -96,6 +96,12 @@ def _in_hull(queries: np.ndarray, points: np.ndarray, margin: float) -> np.ndarr
     return np.asarray((queries @ sides[:, :2].T + sides[:, 2] <= margin).all(axis=1))
 
 
+def quarters(plane: Plane) -> np.ndarray:
+    """World centres of the four quarters of each occupied cell [m], shape ``(K, 4, 3)``."""
+    off = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]]) * plane.cell_m
+    return plane.cells()[:, None] + off @ plane.axes
+
+
 def plane_mesh(planes: Sequence[Plane]) -> Mesh | None:
     """The occupied cells of all planes as one mesh of squares; None when there are none."""
     corners = []

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.photos.config import ReconstructionConfig
-from warprrf.geometry.photos.gaussians.cells import meeting, occupancy, plane_mesh, seen_cells
+from warprrf.geometry.photos.gaussians.cells import meeting, occupancy, plane_mesh, quarters, seen_cells
 from warprrf.geometry.photos.gaussians.plain import plain_surfaces, with_plain
 from warprrf.geometry.photos.gaussians.sweep import choose_views, joined, level_planes, proven_cells, united
 from warprrf.geometry.photos.posed.images import GreyPhotos
@@ -86,11 +86,9 @@ def _blocks(
     surface = plane_mesh(planes)
     cells = []
     for k, plane in enumerate(planes):
-        centres = plane.cells()
-        views = choose_views(surface, centres, plane.normal, cameras)
+        views = choose_views(surface, plane.cells(), plane.normal, cameras)
         some = views[:, 0] >= 0
-        quarter = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]]) * plane.cell_m
-        fine = centres[some, None, :] + quarter @ plane.axes
+        fine = quarters(plane)[some]
         color = _median_colors(fine.reshape(-1, 3), np.repeat(views[some], 4, axis=0), cameras, images)
         key = np.insert(np.argwhere(plane.occupied)[some] // 2, 0, k, axis=1)
         cells.append((key, fine, color.reshape(-1, 4, 3)))
@@ -115,11 +113,11 @@ def _blocks(
     normal, side = np.array([p.normal for p in planes]), np.array([p.cell_m for p in planes])
     plane_of, parent_plane = key[:, 0], np.zeros(whole, dtype=int)
     parent_plane[parent] = plane_of
-    quarters = np.repeat(plane_of[cut_again], 4)
+    quartered = np.repeat(plane_of[cut_again], 4)
     return [
         (mean(fine.mean(axis=1))[~cut], normal[parent_plane[~cut]], 2 * SPREAD * side[parent_plane[~cut]], coarse[~cut]),
         (fine.mean(axis=1)[kept], normal[plane_of[kept]], SPREAD * side[plane_of[kept]], middle[kept]),
-        (fine[cut_again].reshape(-1, 3), normal[quarters], 0.5 * SPREAD * side[quarters],
+        (fine[cut_again].reshape(-1, 3), normal[quartered], 0.5 * SPREAD * side[quartered],
          color[cut_again].reshape(-1, 3)),
     ]  # fmt: skip
 

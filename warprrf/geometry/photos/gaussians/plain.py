@@ -22,7 +22,7 @@ from scipy import ndimage
 
 from warprrf.device import threads
 from warprrf.geometry.photos.gaussians.cells import BEHIND_M as SEEN_BEHIND_M
-from warprrf.geometry.photos.gaussians.cells import contested, pieces
+from warprrf.geometry.photos.gaussians.cells import contested, pieces, quarters
 from warprrf.geometry.photos.gaussians.edges import (
     EDGE_DEG,
     FARTHEST_M,
@@ -415,9 +415,7 @@ def _in_world(plane: Plane, axes: np.ndarray) -> Plane:
     """A plane of the room's frame in the world's, on a grid of its own."""
     normal = plane.normal @ axes
     result = replace(plane, normal=normal, occupied=np.zeros((0, 0), dtype=bool))
-    step = plane.cell_m / 2
-    quarters = np.array([[i, j] for i in (-0.5, 0.5) for j in (-0.5, 0.5)]) * step
-    points = (plane.cells()[:, None] + quarters @ plane.axes).reshape(-1, 3) @ axes
+    points = quarters(plane).reshape(-1, 3) @ axes
     uv = result.to_plane(points)
     corner = np.floor(uv.min(axis=0) / plane.cell_m) * plane.cell_m
     shape = np.ceil((uv.max(axis=0) - corner) / plane.cell_m).astype(int) + 1

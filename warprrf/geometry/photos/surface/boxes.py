@@ -14,6 +14,7 @@ from scipy.sparse import csgraph
 
 from warprrf.cache import cached_property
 from warprrf.geometry.mesh import Mesh, connected_pieces, smoothed_normals
+from warprrf.geometry.photos.gaussians.cells import quarters
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.planes import ALIGNED_DEG, Plane
 from warprrf.geometry.splats.camera import Camera
@@ -365,7 +366,7 @@ def votes(
     A line of sight counts where its depth agrees with the mesh. It votes free at samples along it, and where it ends on
     a plane also right before the plane, and solid right behind.
     """
-    o, d, ranges = _lines_of_sight(cameras, depths, STRIDE)
+    o, d, ranges = _lines_of_sight(cameras, depths)
     hit = mesh.cast(o, d)
     snap_m = 0.12  # a depth agrees with the mesh when both are this close
     agree = hit.valid & (np.abs(np.where(hit.valid, hit.t, 0.0) - ranges) < snap_m)
@@ -395,12 +396,11 @@ def votes(
 
 
 def _lines_of_sight(
-    cameras: Sequence[Camera], depths: Sequence[np.ndarray], stride: int
+    cameras: Sequence[Camera], depths: Sequence[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Origins and directions, shape ``(N, 3)``, and ranges [m] of every ``stride``-th known pixel in rows and columns."""
-    parts = []
+    """Origins and directions, shape ``(N, 3)``, and ranges [m] of known pixels."""
+    parts, some = [], (slice(STRIDE // 2, None, STRIDE),) * 2
     for camera, depth in zip(cameras, depths, strict=True):
-        some = (slice(stride // 2, None, stride),) * 2
         ranges = np.asarray(depth, dtype=np.float64)[some].ravel()
         seen = np.isfinite(ranges) & (ranges > 0)
         towards = camera.directions()[some].reshape(-1, 3)[seen]
@@ -411,8 +411,7 @@ def _lines_of_sight(
 
 def vote_proven(grid: Grid, plane: Plane, level: Level) -> tuple[np.ndarray, np.ndarray]:
     """Four votes of each occupied cell for free space before it, and for a solid behind, shape ``grid.shape`` each."""
-    quarter = np.array([[i, j] for i in (-0.25, 0.25) for j in (-0.25, 0.25)]) * plane.cell_m
-    points = (plane.cells()[:, None] + quarter @ plane.axes).reshape(-1, 3)
+    points = quarters(plane).reshape(-1, 3)
     axis = grid.axes[level.axis]
     points += (level.height - points @ axis)[:, None] * axis
     before = level.sign * BESIDE_M * axis
