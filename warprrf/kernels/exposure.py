@@ -21,7 +21,7 @@ def show(
     gain: wp.vec3,
     out: wp.array(dtype=float),
 ):
-    """The image as the photo's camera would have taken it; ``kept`` is 0 at masked pixels, or empty."""
+    """The image as the photo's camera would have taken it; ``kept`` is 0 at masked pixels, else 1."""
     p = offset + wp.tid()
     first = (p / width) * stride + wp.static(MARGIN) + 3 * (p % width)
     for k in range(3):
@@ -29,9 +29,7 @@ def show(
         value = gain[k] * image[3 * p + k]
         if photo[e] >= wp.static(CLIPPED):
             value = wp.min(value, photo[e])
-        if kept.shape[0] > 0:
-            value = value * kept[p]
-        out[e] = value
+        out[e] = value * kept[p]
 
 
 @wp.kernel(enable_backward=False)
@@ -54,9 +52,7 @@ def show_adjoint(
         value = gain[k] * slope[e]
         if photo[e] >= wp.static(CLIPPED) and gain[k] * image[3 * p + k] > photo[e]:
             value = 0.0
-        if kept.shape[0] > 0:
-            value = value * kept[p]
-        out[3 * p + k] = value
+        out[3 * p + k] = value * kept[p]
 
 
 @wp.kernel(enable_backward=False)
@@ -79,13 +75,10 @@ def gain_sums(
     squares = wp.vec3(0.0)
     for column in range(width):
         p = row * width + column
-        taken = 1.0
-        if kept.shape[0] > 0:
-            taken = kept[p]
         for k in range(3):
             x = image[3 * p + k]
             t = photo[row * stride + wp.static(MARGIN) + 3 * column + k]
-            if taken > 0.0 and t < wp.static(CLIPPED):
+            if kept[p] > 0.0 and t < wp.static(CLIPPED):
                 w = knee / wp.max(wp.abs(gain[k] * x - t), knee)
                 products[k] += w * x * t
                 squares[k] += w * x * x

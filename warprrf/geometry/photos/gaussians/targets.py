@@ -28,7 +28,7 @@ class Target:
         view: number of the photo.
         camera: of this size.
         pixels: in [0, 1], masked ones 0, a plane.
-        kept: 0 at masked pixels, 1 at others, shape ``(H * W,)``; empty without a mask.
+        kept: 0 at masked pixels, 1 at others, shape ``(H * W,)``.
         moments: window averages of ``pixels`` and their squares, planes.
     """
 
@@ -58,21 +58,13 @@ class Targets:
             self.scale = scale
         if view in self.made:
             return self.made[view]
-        made = self.make(view, scale)
-        most_kept = 60_000_000  # numbers of photos kept on the device: with their moments 720 MB
-        if len(self.made) * made.pixels.size < most_kept:
-            self.made[view] = made
-        return made
-
-    def make(self, view: int, scale: int) -> Target:
-        """As :meth:`at`, anew."""
         image, camera = np.asarray(self.photos.images[view], dtype=np.float32), self.photos.cameras[view]
         mask = self.photos.masks[view] if self.photos.masks else None
         height, width = image.shape[0] // scale, image.shape[1] // scale
         rows, columns = height * scale, width * scale
         blocks = image[:rows, :columns].reshape(height, scale, width, scale, 3)
         small = image if scale == 1 else blocks.mean(axis=(1, 3), dtype=np.float32)
-        kept = np.zeros(0, np.float32)
+        kept = np.ones((height, width), dtype=np.float32)
         if mask is not None:
             masked = np.asarray(mask)[:rows, :columns].reshape(height, scale, width, scale) != 0
             kept = (~masked.any(axis=(1, 3))).astype(np.float32)
@@ -81,7 +73,11 @@ class Targets:
         smaller = Camera.pinhole(width, height, world_to_camera=camera.world_to_camera, **lens)
         pixels = self.loss.plane(small, (height, width))
         weights = wp.array(kept.reshape(-1), dtype=float, device=self.loss.device)
-        return Target(view, smaller, pixels, weights, self.loss.moments(pixels, (height, width)))
+        made = Target(view, smaller, pixels, weights, self.loss.moments(pixels, (height, width)))
+        most_kept = 60_000_000  # numbers of photos kept on the device: with their moments 720 MB
+        if len(self.made) * pixels.size < most_kept:
+            self.made[view] = made
+        return made
 
 
 PRIOR = 1e-3  # weight of a gain of one, in squared display values per pixel
