@@ -178,13 +178,6 @@ def _continued(values: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def _joined(a: Gaussians, b: Gaussians) -> Gaussians:
-    """All Gaussians of both; ``b`` has degree 0."""
-    sh = np.zeros((len(b), *a.sh.shape[1:]), np.float32)
-    sh[:, :1] = b.sh
-    pairs = (
-        (a.means, b.means),
-        (a.quaternions, b.quaternions),
-        (a.scales, b.scales),
-        (a.opacities, b.opacities),
-    )
-    return Gaussians(*(np.concatenate(pair) for pair in (*pairs, (a.sh, sh))))
+    """All Gaussians of both, which are of one degree."""
+    names = ("means", "quaternions", "scales", "opacities", "sh")
+    return Gaussians(*(np.concatenate([getattr(a, name), getattr(b, name)]) for name in names))

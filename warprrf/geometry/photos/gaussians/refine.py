@@ -279,8 +279,7 @@ def _initial(g: Gaussians) -> Arrays:
     rotations[:, :, 2] *= np.linalg.det(rotations)[:, None]
     # 1: of the colours: rooms are nearly matt
     sh = np.zeros((len(g), COEFFICIENTS[1], 3))
-    kept = min(sh.shape[1], g.sh.shape[1])
-    sh[:, :kept] = g.sh[:, :kept]
+    sh[:, :1] = g.sh[:, :1]
     opacity = np.clip(g.opacities.astype(np.float64), 1e-4, 1 - 1e-4)
     values = {
         "means": g.means,
