@@ -62,15 +62,13 @@ def patch_agreement(
                 p = center + first_axis * (a * step) + second_axis * (b * step)
                 h = wp.vec4(p[0], p[1], p[2], 1.0)
                 z = wp.dot(projections[c, 2], h)
-                if z > 0.05:
-                    u = wp.dot(projections[c, 0], h) / z
-                    v = wp.dot(projections[c, 1], h) / z
-                    if u > 0.5 and v > 0.5 and u < float(shape[1]) - 0.51 and v < float(shape[2]) - 0.51:
-                        grey = bilinear(images, shape[0], shape[1], u, v)
-                        values[k] = grey
-                        mean = mean + grey
-                    else:
-                        inside = int(0)
+                u = wp.dot(projections[c, 0], h) / z
+                v = wp.dot(projections[c, 1], h) / z
+                right = float(shape[1]) - 0.51
+                low = float(shape[2]) - 0.51
+                if z > 0.05 and u > 0.5 and v > 0.5 and u < right and v < low:
+                    values[k] = bilinear(images, shape[0], shape[1], u, v)
+                    mean = mean + values[k]
                 else:
                     inside = int(0)
             if inside == 1:
