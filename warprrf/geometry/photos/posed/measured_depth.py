@@ -57,14 +57,15 @@ def with_points(sparse: SparseModel, files: Mapping[str, DepthFile]) -> SparseMo
         ValueError: if the maps contradict one another: their unit or the poses are wrong.
     """
     maps = range_maps(sparse, files)
-    names = list(maps)
     points, colors = _cloud(maps, sparse.photos)
     seen = np.zeros((len(points), len(maps)), dtype=bool)
     shown = through = 0
     near_m = 0.02  # a map shows a point that it measures this near to,
     near_share = 0.02  # or within this part of its range
     for k, (view, measured) in enumerate(maps.values()):
-        here, there = _compared(points, view, measured)
+        inside, place = view.in_frame(points)
+        here = np.linalg.norm(points - view.position, axis=1)
+        there = np.where(inside, measured[place[:, 0], place[:, 1]], 0.0)
         known = there > 0
         off = there - here
         seen[:, k] = known & (np.abs(off) < near_m + near_share * here)
@@ -80,8 +81,7 @@ def with_points(sparse: SparseModel, files: Mapping[str, DepthFile]) -> SparseMo
         )
     keep = seen.sum(axis=1) >= 3
     seen = seen[keep]
-    position = {name: k for k, name in enumerate(sparse.cameras)}
-    index = np.array([position[n] for n in names])
+    index = np.flatnonzero([name in maps for name in sparse.cameras])
     length = seen.sum(axis=1).astype(np.int64)
     return replace(
         sparse,
@@ -119,10 +119,3 @@ def _cloud(
     _, group, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     total = [[np.bincount(group.ravel(), weights=of[:, k]) for k in range(3)] for of in (xyz, rgb)]
     return np.array(total[0]).T / count[:, None], np.array(total[1]).T / count[:, None]
-
-
-def _compared(points: np.ndarray, view: Camera, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Range of each point from a camera, and that measured at its pixel, 0 where it is out of sight or unknown."""
-    inside, place = view.in_frame(points)
-    there = np.where(inside, measured[place[:, 0], place[:, 1]], 0.0)
-    return np.linalg.norm(points - view.position, axis=1), there
