@@ -16,6 +16,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
@@ -123,21 +124,6 @@ def structure_from_motion(
             known = _known_model(colmap, poses, first_lens)
         match = not poses.depth and not known.num_points3D()
 
-    def features(attempt: Attempt) -> dict[str, Any]:
-        check_photos(named)
-        _extract(colmap, folder, named, (max_features, first_lens), attempt)
-        return {}
-
-    def matches(attempt: Attempt) -> dict[str, Any]:
-        _match(colmap, folder, list(named), seed, attempt)
-        return {}
-
-    def model(attempt: Attempt) -> dict[str, Any]:
-        if known is None:
-            return {"pieces": _map(colmap, folder, named, (lens, seed), attempt)}
-        _keep_known(colmap, folder, named, (known, match, seed), attempt)
-        return {"pieces": []}
-
     folder = Path(workspace).absolute() / "sfm"
     kept = folder / "photos"
     if any(path.resolve().is_relative_to(kept.resolve()) for path in named.values()):
@@ -148,17 +134,19 @@ def structure_from_motion(
         if match:
             masks = {name: mask for name, path in named.items() if (mask := mask_beside(path))}
             inputs = [list(named), list(named.values()), masks, max_features, first_lens, colmap.__version__]
-            steps.run(
-                "features", features, version=VERSIONS["features"], inputs=inputs, outputs=["features.db"]
-            )
-            inputs = [steps.key("features"), seed]
-            steps.run("matches", matches, version=VERSIONS["matches"], inputs=inputs, outputs=["matches.db"])
+            make = partial(_extract, colmap, folder, named, max_features, first_lens)
+            steps.run("features", make, version=VERSIONS["features"], inputs=inputs, outputs=["features.db"])
+            inputs, make = [steps.key("features"), seed], partial(_match, colmap, folder, list(named), seed)
+            steps.run("matches", make, version=VERSIONS["matches"], inputs=inputs, outputs=["matches.db"])
             inputs = [steps.key("matches"), lens, seed]
-        if known is not None:
+        if known is None:
+            make = partial(_map, colmap, folder, named, lens, seed)
+        else:
+            make = partial(_keep_known, colmap, folder, named, known, match, seed)
             inputs += [list(named.values()), *_content(known)]
-        made = steps.run("model", model, version=VERSIONS["model"], inputs=inputs, outputs=["model"])
+        made = steps.run("model", make, version=VERSIONS["model"], inputs=inputs, outputs=["model"])
         result = _straightened(colmap, steps, named, max_pixels)
-        unposed = [name for name in named if name not in result.cameras]
+        unposed = [*result.unposed]
         if poses is not None:
             unposed += poses.unposed(everything)
             causes = dict.fromkeys(unposed, "the poses given have none of it")
@@ -300,23 +288,25 @@ def _copied(source: Path, target: Path) -> Path:
     return target
 
 
-def _settle(working: Path, final: Path) -> None:
-    """Move a finished database into place, with nothing left in SQLite's write-ahead log."""
+def _settled(working: Path, final: Path) -> dict[str, Any]:
+    """Move a finished database into place, with nothing left in SQLite's write-ahead log; a step's figures: none."""
     with closing(sqlite3.connect(working)) as connection:
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         connection.execute("PRAGMA journal_mode=DELETE")
     os.replace(working, final)
+    return {}
 
 
 def _extract(
     colmap: ModuleType,
     folder: Path,
     named: Mapping[str, Path],
-    settings: tuple[int, str | dict[str, Lens]],
+    max_features: int,
+    lens: str | dict[str, Lens],
     attempt: Attempt,
-) -> None:
-    """Features of the photos, into ``features.db``; settings are their number, and lenses or the model of all lenses."""
-    max_features, lens = settings
+) -> dict[str, Any]:
+    """Features of the photos, into ``features.db``; ``lens``: lenses, or the model of all lenses."""
+    check_photos(named)
     names = list(named)
     images = _root(named)
     working = attempt.folder / "features.db"
@@ -350,7 +340,7 @@ def _extract(
             device=colmap.Device.cpu,
         )
     attempt.progress("features", len(names), len(names))
-    _settle(working, folder / "features.db")
+    return _settled(working, folder / "features.db")
 
 
 def _write_masks(named: Mapping[str, Path], folder: Path) -> Path:
@@ -367,12 +357,10 @@ def _write_masks(named: Mapping[str, Path], folder: Path) -> Path:
     return folder
 
 
-def _match(colmap: ModuleType, folder: Path, names: list[str], seed: int, attempt: Attempt) -> None:
+def _match(colmap: ModuleType, folder: Path, names: list[str], seed: int, attempt: Attempt) -> dict[str, Any]:
     """Verified matches of pairs of photos, into ``matches.db``."""
-    working, listing = (
-        _copied(folder / "features.db", attempt.folder / "matches.db"),
-        attempt.folder / "pairs.txt",
-    )
+    working = _copied(folder / "features.db", attempt.folder / "matches.db")
+    listing = attempt.folder / "pairs.txt"
     with colmap.Database.open(str(working)) as database:
         counts = {i.name: database.num_keypoints_for_image(i.image_id) for i in database.read_all_images()}
         blank = [n for n in names if counts[n] < FEWEST_FEATURES]
@@ -399,7 +387,7 @@ def _match(colmap: ModuleType, folder: Path, names: list[str], seed: int, attemp
             device=colmap.Device.cpu,
         )
     attempt.progress("matching", len(chosen), len(chosen))
-    _settle(working, folder / "matches.db")
+    return _settled(working, folder / "matches.db")
 
 
 def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[tuple[str, str]]:
@@ -416,11 +404,10 @@ def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[
         k = database.read_keypoints(ids[name])  # x, y and the 2x2 shape
         area = np.abs(k[:, 2] * k[:, 5] - k[:, 3] * k[:, 4])
         d = d[np.argsort(-area, kind="stable")[:coarse_features]]
-        descriptors.append(d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-9))
+        d = d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-9)
+        # So that all photos go through one product; zeros match nothing.
+        descriptors.append(np.pad(d, ((0, coarse_features - len(d)), (0, 0))))
     votes = np.zeros((len(names), len(names)))
-    fewest = min(len(d) for d in descriptors)
-    if fewest < coarse_features:  # pad, so that all photos go through one product; zeros match nothing
-        descriptors = [np.pad(d, ((0, coarse_features - len(d)), (0, 0))) for d in descriptors]
     stack = np.stack(descriptors)
     for i in range(len(names) - 1):
         report("comparing", i, len(names))
@@ -451,11 +438,10 @@ def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[
 
 
 def _map(
-    colmap: ModuleType, folder: Path, named: Mapping[str, Path], settings: tuple[str, int], attempt: Attempt
-) -> list[list[str]]:
+    colmap: ModuleType, folder: Path, named: Mapping[str, Path], lens: str, seed: int, attempt: Attempt
+) -> dict[str, Any]:
     """Poses and points from the matches, into the folder ``model``: the largest of the models found, with those that
-    photos join to it; the others into ``model-2`` and so on. Names of the photos of each."""
-    lens, seed = settings
+    photos join to it; the others into ``model-2`` and so on. Names of the photos of each, as ``pieces``."""
     working = _copied(folder / "matches.db", attempt.folder / "matches.db")
     images, report = _root(named), attempt.progress
     options = colmap.IncrementalPipelineOptions()
@@ -515,7 +501,7 @@ def _map(
         pieces.append(names)
         os.replace(whole, folder / ("model" if len(pieces) == 1 else f"model-{len(pieces)}"))
     report("mapping", len(named), len(named))
-    return pieces
+    return {"pieces": pieces}
 
 
 def _calibrate(colmap: ModuleType, matches: Path, scratch: Path, seed: int) -> None:
@@ -659,11 +645,12 @@ def _keep_known(
     colmap: ModuleType,
     folder: Path,
     photos: Mapping[str, Path],
-    settings: tuple[Any, bool, int],
+    model: Any,
+    match: bool,
+    seed: int,
     attempt: Attempt,
-) -> None:
-    """A model of known poses into the folder ``model``, its points triangulated from the matches where asked."""
-    model, match, seed = settings
+) -> dict[str, Any]:
+    """The ``model`` of known poses into the folder ``model``, its points triangulated from the matches where asked."""
     whole = _fresh(attempt.folder / "model")
     if match:
         attempt.progress("triangulating", 0, 1)
@@ -676,6 +663,7 @@ def _keep_known(
     model.write_binary(str(whole))
     shutil.rmtree(folder / "model", ignore_errors=True)
     os.replace(whole, folder / "model")
+    return {"pieces": []}
 
 
 def lenses_of(model: Any) -> dict[str, Lens]:
