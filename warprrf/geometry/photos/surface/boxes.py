@@ -27,13 +27,12 @@ SAME_SIDE_M = 0.035  # planes facing one way and closer than this are two fits o
 
 class Level(NamedTuple):
     """Where a plane crosses one of the directions: ``height`` [m] along direction ``axis``, seen from the side of
-    ``sign`` times it. Its exact equation is ``normal . x = offset``, the normal nearly the direction itself."""
+    ``sign`` times it. Its exact equation is ``plane[:3] . x = plane[3]``, the normal nearly the direction itself."""
 
     axis: int
     sign: int
     height: float
-    normal: np.ndarray
-    offset: float
+    plane: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -72,9 +71,9 @@ def known_levels(
         # The area that photos proved counts in full; of a plane fitted to the mesh alone, a third.
         proven = planes[k].area() if k < len(planes) else 0.0
         strength = proven or patches.area[k] / 3
-        level = Level(axis, sign, height, axes[axis], height)
+        level = Level(axis, sign, height, np.append(axes[axis], height))
         if abs(fit) > np.cos(np.radians(EXACT_DEG)) and strength > STRONG_M2:
-            level = level._replace(normal=sign * patches.normal[k], offset=sign * patches.offset[k])
+            level = level._replace(plane=sign * np.append(patches.normal[k], patches.offset[k]))
         candidates.append((strength, level, faces))
     chosen: list[Level] = []
     found = FaceLevels(np.full(count, -1), np.zeros(count, dtype=np.int64), np.zeros(count))
@@ -135,10 +134,8 @@ def _gatherings(
                     break
                 height = float(x[k : last[k]] @ area[k : last[k]] / gathered[k])
                 gap = np.abs(x - height)
-                yield (
-                    Level(axis, sign, height, axes[axis], height),
-                    own[(gap < SAME_SIDE_M) & (area > 0)],
-                )
+                level = Level(axis, sign, height, np.append(axes[axis], height))
+                yield level, own[(gap < SAME_SIDE_M) & (area > 0)]
                 area = np.where(gap < 2 * SAME_SIDE_M, 0.0, area)
 
 
@@ -195,14 +192,13 @@ class Grid:
     Attributes:
         axes: the directions, unit rows, shape ``(3, 3)``.
         heights: for each direction where its dividing planes lie, ascending [m], shape ``(N,)``.
-        normals, offsets: the exact equations of the planes, ``normal . x = offset``, shapes ``(N, 3)`` and ``(N,)``.
+        planes: their exact equations as :class:`Level` has them, shape ``(N, 4)``.
         known: whether a dividing plane is a surface (else it only makes boxes smaller), shape ``(N,)`` bool.
     """
 
     axes: np.ndarray
     heights: list[np.ndarray]
-    normals: list[np.ndarray] = field(repr=False)
-    offsets: list[np.ndarray] = field(repr=False)
+    planes: list[np.ndarray] = field(repr=False)
     known: list[np.ndarray] = field(repr=False)
 
     @property
@@ -238,7 +234,7 @@ class Grid:
 def divide(mesh: Mesh, axes: np.ndarray, levels: Sequence[Level]) -> Grid:
     """Boxes between ``levels``, and between further planes where those are more than a cell apart."""
     corners = mesh.vertices[np.unique(mesh.faces)] @ axes.T
-    grid = Grid(axes, [], [], [], [])
+    grid = Grid(axes, [], [], [])
     for axis in range(3):
         own = sorted((level for level in levels if level.axis == axis), key=lambda level: level.height)
         # A few stray vertices must not blow up the space.
@@ -249,12 +245,11 @@ def divide(mesh: Mesh, axes: np.ndarray, levels: Sequence[Level]) -> Grid:
         between = zip(stops[:-1], stops[1:], steps, strict=True)
         parts = [np.linspace(a, b, n + 1)[:-1] for a, b, n in between]
         height = np.append(np.concatenate(parts), stops[-1])
-        normal, offset, known = np.tile(axes[axis], (len(height), 1)), height.copy(), height < -np.inf
+        plane, known = np.column_stack([np.tile(axes[axis], (len(height), 1)), height]), height < -np.inf
         for k, level in zip(np.cumsum(steps), own, strict=False):
-            normal[k], offset[k], known[k] = level.normal, level.offset, True
+            plane[k], known[k] = level.plane, True
         grid.heights.append(height)
-        grid.normals.append(normal)
-        grid.offsets.append(offset)
+        grid.planes.append(plane)
         grid.known.append(known)
     return grid
 
@@ -339,16 +334,13 @@ def surface_of(grid: Grid, filled: np.ndarray, tolerance_m: float) -> tuple[Plan
             tags += [np.stack([np.full(len(index), a), index[:, a], np.full(len(index), sign)], axis=1)] * 2
     used, face = np.unique(np.concatenate(faces), return_inverse=True)
     node = np.unravel_index(used, nodes)
-    normal = np.stack([grid.normals[a][node[a]] for a in range(3)], axis=1)
-    offset = np.stack([grid.offsets[a][node[a]] for a in range(3)], axis=1)
-    vertices = np.linalg.solve(normal, offset[..., None])[..., 0]
+    meeting = np.stack([grid.planes[a][node[a]] for a in range(3)], axis=1)
+    vertices = np.linalg.solve(meeting[..., :3], meeting[..., 3:])[..., 0]
     kinds, which = np.unique(np.concatenate(tags), axis=0, return_inverse=True)
+    mesh = Mesh(vertices, face.reshape(-1, 3))
+    plane = np.array([sign * grid.planes[a][k] for a, k, sign in kinds])
     patches = PlanarPatches.from_planes(
-        Mesh(vertices, face.reshape(-1, 3)),
-        which.ravel(),
-        [sign * grid.normals[a][k] for a, k, sign in kinds],
-        [sign * grid.offsets[a][k] for a, k, sign in kinds],
-        tolerance_m=tolerance_m,
+        mesh, which.ravel(), plane[:, :3], plane[:, 3], tolerance_m=tolerance_m
     )
     known = np.array([grid.known[a][k] for a, k, _ in kinds])
     return patches, known[which.ravel()]
