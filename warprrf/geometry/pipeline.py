@@ -33,9 +33,9 @@ from warprrf.geometry.photos.posed.photo_files import (
     find_photos,
     mask_beside,
     match_names,
+    photo_facts,
     read_mask,
     read_photo,
-    turns_of,
 )
 from warprrf.geometry.photos.posed.poses import DepthFile, KnownPoses, find_depth, match_photos, read_poses
 from warprrf.geometry.photos.posed.sparse import (
@@ -220,7 +220,7 @@ def _known_poses(poses: Path, depth: Path | None, photos: Mapping[str, Path], wa
     files = {photo: camera.depth for photo, camera in found.items() if camera.depth is not None}
     if depth is not None:
         files = {photo: DepthFile(path) for photo, path in find_depth(depth, found).items()}
-    files = {photo: replace(file, turns=turns_of(photos[photo])) for photo, file in files.items()}
+    files = {photo: replace(file, turns=photo_facts(photos[photo]).turns) for photo, file in files.items()}
     return KnownPoses(found, model, names, files)
 
 

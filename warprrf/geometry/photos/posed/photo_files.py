@@ -123,11 +123,6 @@ def photo_facts(path: Path) -> PhotoFacts:
     return PhotoFacts(width, height, TURNS[orientation], taken_with)
 
 
-def turns_of(path: Path) -> int:
-    """Quarter turns clockwise that bring the photo upright."""
-    return photo_facts(path).turns
-
-
 def cameras_of(named: Mapping[str, Path]) -> list[list[str]]:
     """Names of the photos that each camera took.
 

@@ -36,7 +36,6 @@ from warprrf.geometry.photos.posed.photo_files import (
     open_photo,
     photo_facts,
     some,
-    turns_of,
 )
 from warprrf.geometry.photos.posed.poses import KnownCamera, KnownPoses
 from warprrf.geometry.photos.posed.sparse import SparseModel, fit_similarity, posed_in_words
@@ -181,7 +180,7 @@ def _straightened(
     outputs = [f"photos/{name}" for name in lenses]
     inputs = [steps.key("model"), max_pixels]
     steps.run("photos", straight, version=VERSIONS["photos"], inputs=inputs, outputs=outputs)
-    turns = {name: turns_of(named[name]) for name in lenses}
+    turns = {name: photo_facts(named[name]).turns for name in lenses}
     result = _sparse_model(model, list(named), turns, max_pixels)
     return replace(result, photos={name: kept / name for name in lenses}, lenses=lenses)
 

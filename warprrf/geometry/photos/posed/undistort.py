@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_choice, check_count, check_number, check_positive, checked
 from warprrf.device import require
-from warprrf.geometry.photos.posed.photo_files import mask_beside, mask_name, open_photo, turns_of
+from warprrf.geometry.photos.posed.photo_files import mask_beside, mask_name, open_photo, photo_facts
 from warprrf.geometry.splats.camera import Camera
 
 COEFFICIENTS = {
@@ -120,7 +120,7 @@ def write_undistorted(source: Path, target: Path, lens: Lens, max_pixels: int) -
         ValueError: if a file does not read as an image, or is not of the lens's size.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
-    turns, mask, small = turns_of(source), mask_beside(source), _reduced(lens, max_pixels)
+    turns, mask, small = photo_facts(source).turns, mask_beside(source), _reduced(lens, max_pixels)
     if lens.straight and turns == 0 and small == lens:
         shutil.copyfile(source, target)
     else:
