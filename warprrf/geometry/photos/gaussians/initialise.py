@@ -205,15 +205,8 @@ def initialise(
         real = np.add.reduceat(reflected, sparse.track_start[:-1]) < 0.5 * sparse.track_length
     report("planes", 5, 6)
     planes = seen_cells(meeting(united((), planes)), list(sparse.cameras.values()))
-    gaussians = initial_gaussians(
-        points[real],
-        sparse.colors[real],
-        normals[real],
-        planes,
-        list(cameras.values()),
-        images,
-        config.gaussians,
-    )
+    own = points[real], sparse.colors[real], normals[real]
+    gaussians = initial_gaussians(*own, planes, list(cameras.values()), images, config.gaussians)
     report("planes", 6, 6)
     return planes, gaussians
 

@@ -122,15 +122,8 @@ class KnownPoses:
     def unposed(self, photos: Mapping[str, Path]) -> tuple[str, ...]:
         """Which of ``photos`` have no pose and are no depth images."""
         depth = {file.path.resolve() for file in self.depth.values()}
-        return tuple(
-            n
-            for n, p in photos.items()
-            if n not in self.cameras and not _is_depth(p) and p.resolve() not in depth
-        )
-
-
-def _is_depth(path: Path) -> bool:
-    return path.name.lower().endswith(DEPTH_FILE)
+        rest = {n: p for n, p in photos.items() if n not in self.cameras and p.resolve() not in depth}
+        return tuple(n for n, p in rest.items() if not p.name.lower().endswith(DEPTH_FILE))
 
 
 def match_photos(cameras: Iterable[str], photos: Iterable[str], *, warn: bool = True) -> dict[str, str]:
