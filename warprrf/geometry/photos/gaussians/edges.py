@@ -77,6 +77,11 @@ class Line:
         """Its place on another axis than its own."""
         return float(self.at[(axis - self.axis) % 3 - 1])
 
+    @property
+    def ends(self) -> np.ndarray:
+        """Where it begins and ends [m], shape ``(2, 3)``."""
+        return self.points(np.array([self.low, self.high]))
+
     def points(self, along: np.ndarray) -> np.ndarray:
         """Points at these places along its axis, shape ``(N, 3)``."""
         result = np.empty((len(along), 3))

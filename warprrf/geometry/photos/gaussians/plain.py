@@ -148,7 +148,7 @@ def _heights(lines: Sequence[Line]) -> list[Height]:
     for axis in range(3):
         own = [line for line in lines if line.axis != axis]
         place = np.array([line.height(axis) for line in own])
-        weight = np.array([line.weight for line in own])
+        weight, ends = np.array([line.weight for line in own]), np.array([line.ends for line in own])
         left = np.ones(len(own), dtype=bool)
         while left.any():
             near = (np.abs(place[:, None] - place) < SAME_M) & left & left[:, None]
@@ -156,14 +156,7 @@ def _heights(lines: Sequence[Line]) -> list[Height]:
             group = near[k]
             middle = float(np.average(place[group], weights=weight[group]))
             group = left & (np.abs(place - middle) < SAME_M) | group
-            ends = np.array(
-                [
-                    line.points(np.array([line.low, line.high]))
-                    for line, on in zip(own, group, strict=True)
-                    if on
-                ]
-            )
-            bounds = np.stack([ends.min(axis=(0, 1)), ends.max(axis=(0, 1))])
+            bounds = np.stack([ends[group].min(axis=(0, 1)), ends[group].max(axis=(0, 1))])
             result.append(Height(axis, middle, float(weight[group].sum()), bounds))
             left &= ~group
     return sorted(result, key=lambda h: -h.weight)
@@ -203,8 +196,7 @@ def _parted(pane: Pane, line: Line) -> list[Line]:
 
 def _is_behind(pane: Pane, line: Line) -> bool:
     """Whether a line lies behind the plane of a pane, by its middle."""
-    middle = line.points(np.array([(line.low + line.high) / 2]))[0, pane.axis]
-    return bool(pane.side * (middle - pane.height) < -0.1)
+    return bool(pane.side * (line.ends.mean(axis=0)[pane.axis] - pane.height) < -0.1)
 
 
 def _only_through(pane: Pane, lines: Sequence[Line], positions: np.ndarray) -> np.ndarray:
