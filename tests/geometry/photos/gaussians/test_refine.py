@@ -81,13 +81,11 @@ def test_a_run_continued_from_a_checkpoint_equals_one_never_stopped(problem, tmp
         assert np.array_equal(getattr(resumed, name), getattr(whole, name)), name
 
 
-def test_a_checkpoint_of_other_settings_or_a_damaged_one_is_refused(problem, tmp_path):
+def test_a_damaged_checkpoint_is_refused(problem, tmp_path):
     start, photos, cameras = problem
     file = tmp_path / "refine.safetensors"
     short = RefineConfig(iterations=20, downscale=1, checkpoint_every=20)
     refine(start, PosedPhotos(photos, cameras), config=short, checkpoint=file)
-    with pytest.raises(ValueError, match="other settings"):
-        refine(start, PosedPhotos(photos, cameras), config=CONFIG, checkpoint=file)
     file.write_bytes(file.read_bytes()[:100])
     with pytest.raises(ValueError, match="cannot be read"):
         refine(start, PosedPhotos(photos, cameras), config=short, checkpoint=file)

@@ -36,7 +36,6 @@ from warprrf.geometry.splats.photo_loss import PhotoLoss
 from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
 from warprrf.kernels import adam as optimize
 from warprrf.kernels.raster.sh import COEFFICIENTS
-from warprrf.steps import digest
 
 ENOUGH_TO_FILL = 100
 """Iterations from which on holes are filled: new Gaussians stand at a guessed depth until photos have moved them."""
@@ -65,17 +64,16 @@ def refine(
     Args:
         photos: with their cameras and masks.
         planes: detected planes; Gaussians on them are kept flat.
-        checkpoint: file to continue from if it exists and to keep up to date; of the same photos.
+        checkpoint: file to continue from if it exists and to keep up to date; of the same arguments.
 
     Raises:
-        ValueError: if a checkpoint is of other arguments or damaged.
+        ValueError: if a checkpoint is damaged.
         RuntimeError: if the loss becomes NaN.
     """
     config = config or RefineConfig()
     run = _Refinement(photos, config, planes, resolve(device))
-    key = "" if checkpoint is None else digest(config, gaussians, list(photos.cameras), list(planes))
     if checkpoint is not None and Path(checkpoint).exists():
-        run.restore(Path(checkpoint), key)
+        run.restore(Path(checkpoint))
     else:
         run.start(gaussians)
     report = progress or (lambda stage, done, total: None)
@@ -83,7 +81,7 @@ def refine(
     while run.iteration < config.iterations:
         run.step()
         if checkpoint is not None and run.iteration % config.checkpoint_every == 0:
-            run.store(Path(checkpoint), key)
+            run.store(Path(checkpoint))
         if run.iteration % 20 == 0 or run.iteration == config.iterations:
             report("refine", run.done(), PARTS)
     return run.result()
@@ -252,21 +250,17 @@ class _Refinement:
         sh = arrays["sh"].reshape(self.count, -1, 3)
         return Gaussians(arrays["means"], arrays["quaternions"], scales, opacity, sh)[keep]
 
-    def store(self, path: Path, key: str) -> None:
-        """Write the whole state; ``key`` tells what it was made from."""
+    def store(self, path: Path) -> None:
+        """Write the whole state."""
         arrays = {**self.arrays(), "log_gains": self.exposures.log_gains}
-        tensor_files.write(path, arrays, {"iteration": self.iteration, "key": key}, CHECKPOINT)
+        tensor_files.write(path, arrays, {"iteration": self.iteration}, CHECKPOINT)
 
-    def restore(self, path: Path, key: str) -> None:
+    def restore(self, path: Path) -> None:
         """Continue from a checkpoint."""
         try:
             arrays, header = tensor_files.read(path, CHECKPOINT)
         except ValueError as error:
             raise ValueError(f"checkpoint: it cannot be read; delete it to start over ({error})") from error
-        if header.get("key") != key:
-            raise ValueError(
-                f"checkpoint: {path} is of other settings or inputs; delete it or give another file"
-            )
         self.iteration = check_count("iteration", header.get("iteration"), 0)
         self.exposures.log_gains = arrays.pop("log_gains")
         self.load(arrays)
