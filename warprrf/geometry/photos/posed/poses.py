@@ -328,22 +328,16 @@ def _read_frames(folder: Path) -> dict[str, KnownCamera]:
     k = _numbers(lens, 3)
     if not (k[0, 0] > 0 and k[1, 1] > 0) or k[2, 2] != 1 or np.abs(k[[0, 1, 2, 2], [1, 0, 0, 1]]).max() > 0:
         raise ValueError(f"poses: {lens}: expected rows fx 0 cx, 0 fy cy, 0 0 1 [pixels]")
-    cameras = {}
+    numbers, cameras = (k[0, 0], k[1, 1], k[0, 2], k[1, 2]), {}
     for file in files:
         pose = _numbers(file, 4, finite=False)
         if not np.isfinite(pose).all():
             continue  # where tracking was lost
         stem = file.name.removesuffix(POSE_FILE)
-        depth = file.with_name(stem + DEPTH_FILE)
+        path = file.with_name(stem + DEPTH_FILE)
+        depth = DepthFile(path) if path.is_file() else None
         with naming(file, "expected a 4 x 4 pose, camera to world"):
-            cameras[stem + COLOUR_FILE] = KnownCamera(
-                "PINHOLE",
-                (0, 0),
-                (k[0, 0], k[1, 1], k[0, 2], k[1, 2]),
-                0.0,
-                _inverse(pose),
-                DepthFile(depth) if depth.is_file() else None,
-            )
+            cameras[stem + COLOUR_FILE] = KnownCamera("PINHOLE", (0, 0), numbers, 0.0, _inverse(pose), depth)
     return cameras
 
 

@@ -585,16 +585,11 @@ def read_known(folder: Path) -> dict[str, KnownCamera]:
         model = _open_model(colmap, folder)
         lenses = lenses_of(model)
         poses = {i.name: _pose(i) for i in model.images.values() if i.name in lenses}
-    return {
-        name: KnownCamera(
-            lens.model,
-            (lens.width, lens.height),
-            (lens.fx, lens.fy, lens.cx, lens.cy, *lens.coefficients),
-            0.0,
-            poses[name],
-        )
-        for name, lens in lenses.items()
-    }
+    cameras = {}
+    for name, lens in lenses.items():
+        numbers = lens.fx, lens.fy, lens.cx, lens.cy, *lens.coefficients
+        cameras[name] = KnownCamera(lens.model, (lens.width, lens.height), numbers, 0.0, poses[name])
+    return cameras
 
 
 def _known_lenses(poses: KnownPoses, photos: Mapping[str, Path]) -> dict[str, Lens]:
