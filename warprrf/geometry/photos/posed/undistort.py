@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_choice, check_count, check_number, check_positive, checked
+from warprrf.checks import Count, check_array, checked, one_of, positive, within
 from warprrf.device import require
 from warprrf.geometry.photos.posed.photo_files import mask_beside, mask_name, open_photo, photo_facts
 from warprrf.geometry.splats.camera import Camera
@@ -49,23 +49,16 @@ class Lens:
         TypeError, ValueError: for another model, or numbers that are no lens.
     """
 
-    model: str
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+    model: Annotated[str, one_of(*COEFFICIENTS)]
+    width: Count
+    height: Count
+    fx: Annotated[float, positive("focal length in pixels")]
+    fy: Annotated[float, positive("focal length in pixels")]
+    cx: Annotated[float, within()]
+    cy: Annotated[float, within()]
     coefficients: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        check_choice("model", self.model, COEFFICIENTS)
-        for name in ("width", "height"):
-            check_count(name, getattr(self, name))
-        for name in ("fx", "fy"):
-            check_positive(name, getattr(self, name), "focal length in pixels")
-        for name in ("cx", "cy"):
-            check_number(name, getattr(self, name))
         found = check_array("coefficients", self.coefficients, (COEFFICIENTS[self.model],))
         object.__setattr__(self, "coefficients", tuple(float(c) for c in found))
 
