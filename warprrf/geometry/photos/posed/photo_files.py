@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -98,23 +99,34 @@ class PhotoFacts:
     taken_with: tuple[str, ...]
 
 
+@contextmanager
+def opened(path: str | os.PathLike[str], argument: str = "photos", kind: str = "an image") -> Iterator[Any]:
+    """A picture file, as a Pillow image whose pixels are not read yet.
+
+    Raises:
+        ValueError: if it does not read, there or in the block: it is no such ``kind`` of picture.
+    """
+    image = require("PIL.Image", extra="photos")
+    try:
+        with image.open(path) as picture:
+            yield picture
+    except (*UNREADABLE, image.DecompressionBombError) as error:
+        raise ValueError(f"{argument}: {path} does not read as {kind}: {error}") from error
+
+
 def photo_facts(path: Path) -> PhotoFacts:
     """Size, orientation and camera of a photo, from its header.
 
     Raises:
         ValueError: if the header does not read, or the photo is stored mirrored.
     """
-    image = require("PIL.Image", extra="photos")
-    try:
-        with image.open(path) as photo:
-            exif = photo.getexif()
-            width, height = photo.size
-            lens = exif.get_ifd(0x8769)
-            orientation = exif.get(0x0112, 1)
-            names = [str(exif.get(tag, "")).strip("\0 ") for tag in (0x010F, 0x0110)]
-            taken_with = (*names, str(lens.get(0x920A, ""))) if any(names) else ()
-    except (*UNREADABLE, image.DecompressionBombError) as error:
-        raise ValueError(f"photos: {path} does not read as an image: {error}") from error
+    with opened(path) as photo:
+        exif = photo.getexif()
+        width, height = photo.size
+        lens = exif.get_ifd(0x8769)
+        orientation = exif.get(0x0112, 1)
+        names = [str(exif.get(tag, "")).strip("\0 ") for tag in (0x010F, 0x0110)]
+        taken_with = (*names, str(lens.get(0x920A, ""))) if any(names) else ()
     if orientation not in TURNS:
         raise ValueError(
             f"photos: {path} has EXIF orientation {orientation}, expected 1, 3, 6 or 8: it is stored mirrored, or the "
@@ -208,14 +220,10 @@ def open_photo(path: str | os.PathLike[str], mode: str) -> Any:
     Raises:
         ValueError: if the file does not read as an image.
     """
-    image = require("PIL.Image", extra="photos")
-    try:
-        with image.open(path) as photo:
-            if photo.mode[0] in "IF":
-                raise ValueError(f"its pixels have more than 8 bits ({photo.mode}); save it with 8")
-            return photo.convert(mode)
-    except (*UNREADABLE, image.DecompressionBombError) as error:
-        raise ValueError(f"photos: {path} does not read as an image: {error}") from error
+    with opened(path) as photo:
+        if photo.mode[0] in "IF":
+            raise ValueError(f"its pixels have more than 8 bits ({photo.mode}); save it with 8")
+        return photo.convert(mode)
 
 
 def read_photo(path: str | os.PathLike[str]) -> np.ndarray:

@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_count, check_number, check_positive, check_type
-from warprrf.device import require
 from warprrf.files import read_json
-from warprrf.geometry.photos.posed.photo_files import MIN_PHOTOS, UNREADABLE, some
+from warprrf.geometry.photos.posed.photo_files import MIN_PHOTOS, opened, some
 from warprrf.geometry.photos.posed.undistort import Lens
 from warprrf.tensor_files import named as naming
 
@@ -176,14 +175,10 @@ def read_depth(file: DepthFile) -> np.ndarray:
     Raises:
         ValueError: if the file does not read as such an image.
     """
-    image = require("PIL.Image", extra="photos")
-    try:
-        with image.open(file.path) as picture:
-            if picture.mode not in ("I;16", "I;16B", "I"):
-                raise ValueError(f"got an image of mode {picture.mode}, expected grey of 16 bits")
-            raw = np.asarray(picture, dtype=np.int64)
-    except (*UNREADABLE, image.DecompressionBombError) as error:
-        raise ValueError(f"depth: {file.path} does not read as a depth image: {error}") from error
+    with opened(file.path, "depth", "a depth image") as picture:
+        if picture.mode not in ("I;16", "I;16B", "I"):
+            raise ValueError(f"got an image of mode {picture.mode}, expected grey of 16 bits")
+        raw = np.asarray(picture, dtype=np.int64)
     unknown = (raw <= 0) | (raw >= 65535)  # 7-Scenes marks them by the largest number
     return np.where(unknown, 0.0, raw * file.unit_m).astype(np.float32)
 
