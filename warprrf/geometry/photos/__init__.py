@@ -4,8 +4,8 @@ In the order in which :func:`warprrf.reconstruct` runs them:
 
 - ``photo_files``, ``sfm``: image files to lenses, camera poses, sparse points and undistorted photos (``undistort``);
   ``sparse`` brings them to metres.
-- ``initialise``: the points cleaned (``points``), planes found among them (``planes``), the cells of each plane that
-  hold a surface (``cells``), corrected and completed by comparing photos (``sweep``), joined by surfaces without
+- ``initialise``: the points cleaned, planes found among them (``sparse``), the cells of each plane that hold a surface
+  (``cells``), corrected and completed by comparing photos (``sweep``), joined by surfaces without
   features that edges show (``edges``, ``plain``), covered with Gaussians (``initial_gaussians``).
 - ``refine``: Gaussians moved until they render the photos (``photo_loss``, ``densify``).
 - ``fusion``: depth maps rendered and compared with photos (``stereo``), made flat where one colour shows one surface

@@ -76,14 +76,9 @@ def pinhole_of(lens: Lens, world_to_camera: ArrayLike, turns: int, max_pixels: i
         turns: quarter turns clockwise that bring the stored photo upright.
         max_pixels: of the result, about; smaller photos keep their size.
     """
-    small = _reduced(lens, max_pixels)
-    width, height, fx, fy, cx, cy = small.width, small.height, small.fx, small.fy, small.cx, small.cy
-    if not small.straight:
-        found = _undistorted(small)
-        width, height = found.width, found.height
-        fx, fy, cx, cy = found.params
-    pose = check_array("world_to_camera", world_to_camera, (4, 4))
-    camera = Camera.pinhole(width, height, fx=fx, fy=fy, cx=cx, cy=cy, world_to_camera=pose)
+    flat = _undistorted(_reduced(lens, max_pixels))
+    numbers = {name: getattr(flat, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    camera = Camera.pinhole(**numbers, world_to_camera=world_to_camera)
     for _ in range(turns % 4):
         camera = _turned(camera)
     return camera
@@ -153,7 +148,7 @@ def colmap_camera(lens: Lens, number: int = 1) -> Any:
 
 def _reduced(lens: Lens, max_pixels: int) -> Lens:
     """``lens`` over fewer pixels, so that undistorted photos have ``max_pixels`` at most."""
-    whole = lens if lens.straight else _undistorted(lens)
+    whole = _undistorted(lens)
     share = (max_pixels / (whole.width * whole.height)) ** 0.5
     if share >= 1:
         return lens
@@ -163,10 +158,13 @@ def _reduced(lens: Lens, max_pixels: int) -> Lens:
     return replace(lens, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
 
-def _undistorted(lens: Lens) -> Any:
-    """COLMAP's pinhole camera of photos of ``lens``, undistorted."""
+def _undistorted(lens: Lens) -> Lens:
+    """The pinhole lens of photos of ``lens``, undistorted."""
+    if lens.straight:
+        return lens
     colmap = load_colmap()
-    return colmap.undistort_camera(colmap.UndistortCameraOptions(), colmap_camera(lens))
+    found = colmap.undistort_camera(colmap.UndistortCameraOptions(), colmap_camera(lens))
+    return Lens("PINHOLE", found.width, found.height, *found.params)
 
 
 def _resampled(picture: Any, path: Path, lens: Lens, small: Lens) -> Any:
