@@ -134,13 +134,13 @@ class Steps:
         Raises:
             RuntimeError: if ``make`` returns and an output is missing.
         """
-        inputs = list(inputs)
-        kept = self.kept(name, version=version, inputs=inputs, outputs=outputs)
-        if kept is not None:
-            return kept
-        key, scratch = digest(name, version, inputs), self._own / name
+        key, scratch = digest(name, version, list(inputs)), self._own / name
         known = self._read(name)
-        going_on = known.get("key") == key and not known["finished"]
+        same = known.get("key") == key
+        if same and known["finished"] and all((self.folder / file).exists() for file in outputs):
+            self._records[name] = known
+            return dict(known["figures"])
+        going_on = same and not known["finished"]
         record: dict[str, Any] = {"key": key, "finished": False, "seconds": 0.0, "attempts": 0, "stages": {}}
         record |= {k: known[k] for k in ("seconds", "attempts", "stages") if going_on}
         record |= {"attempts": record["attempts"] + 1, "figures": {}}
@@ -178,17 +178,6 @@ class Steps:
         write(finished=True, figures=plain(figures))
         shutil.rmtree(scratch)
         return dict(record["figures"])
-
-    def kept(
-        self, name: str, *, version: int, inputs: Iterable[Any], outputs: Sequence[str] = ()
-    ) -> dict[str, Any] | None:
-        """Figures of step ``name`` if it was finished with this version and these inputs, else None; see :meth:`run`."""
-        known = self._read(name)
-        same = known.get("key") == digest(name, version, list(inputs)) and known["finished"]
-        if not same or not all((self.folder / file).exists() for file in outputs):
-            return None
-        self._records[name] = known
-        return dict(known["figures"])
 
     def arrays(
         self,
