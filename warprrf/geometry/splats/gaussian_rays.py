@@ -24,7 +24,7 @@ from warprrf.checks import check_array, check_choice, check_count, checked
 from warprrf.device import DeviceLike, active_tape, gradient, launch, record, resolve
 from warprrf.geometry.rays import check_rows
 from warprrf.geometry.splats.gaussians import Gaussians
-from warprrf.geometry.splats.rasterizer import RADIO, Blending
+from warprrf.geometry.splats.rasterizer import RADIO, Blending, Rasterizer, uploaded
 from warprrf.kernels.rays import gaussians as kernels
 
 CPU_PIECES = 4  # gradient sums on a CPU, one writer each: the result does not depend on the thread count
@@ -97,12 +97,7 @@ class GaussianRays:
         self.blending = blending or RADIO
         if isinstance(gaussians, Gaussians):
             self.device = resolve(device)
-            self.inputs: tuple[wp.array, ...] = (
-                wp.array(gaussians.means, dtype=wp.vec3, device=self.device),
-                wp.array(gaussians.quaternions, dtype=wp.vec4, device=self.device),
-                wp.array(gaussians.scales, dtype=wp.vec3, device=self.device),
-                wp.array(gaussians.opacities, dtype=wp.float32, device=self.device),
-            )
+            self.inputs: tuple[wp.array, ...] = Rasterizer(device=self.device).upload(gaussians)
         elif len(gaussians) == 4 and all(isinstance(a, wp.array) for a in gaussians):
             self.device = gaussians[0].device if device is None else resolve(device)
             self.inputs = tuple(gaussians)
@@ -283,11 +278,5 @@ def _rows(one: np.ndarray, other: np.ndarray) -> int:
 
 def _rebuilt(arrays: tuple[np.ndarray, ...], blending: Blending, device: str) -> GaussianRays:
     """What was pickled or copied, with a hierarchy of its own."""
-    vec3, vec4, real = (
-        (wp.vec3d, wp.vec4d, wp.float64) if arrays[3].dtype == np.float64 else (wp.vec3, wp.vec4, wp.float32)
-    )
-    means, quaternions, scales, opacities = (
-        wp.array(a, dtype=kind, device=device)
-        for a, kind in zip(arrays, (vec3, vec4, vec3, real), strict=True)
-    )
-    return GaussianRays((means, quaternions, scales, opacities), blending=blending)
+    real = wp.float64 if arrays[3].dtype == np.float64 else wp.float32
+    return GaussianRays(uploaded(arrays, real, device), blending=blending)

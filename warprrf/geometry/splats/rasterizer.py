@@ -7,7 +7,7 @@ NumPy face.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -33,6 +33,16 @@ WARP = 32  # threads, which all take part where a GPU's add up
 RULES = {"product": PRODUCT, "exp": EXPONENTIAL}
 Parameters = tuple[wp.array, wp.array, wp.array, wp.array]
 """Means, quaternions, scales and opacities."""
+
+
+def uploaded(arrays: Sequence[np.ndarray], real: type, device: DeviceLike) -> Parameters:
+    """Means, quaternions, scales and opacities as arrays of the precision ``real``."""
+    vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
+    means, quaternions, scales, opacities = (
+        wp.array(array, dtype=kind, device=device)
+        for array, kind in zip(arrays, (vec3, vec4, vec3, real), strict=True)
+    )
+    return means, quaternions, scales, opacities
 
 
 @checked
@@ -161,12 +171,7 @@ class Rasterizer:
 
     def upload(self, g: Gaussians) -> Parameters:
         """Means, quaternions, scales and opacities as arrays of this precision."""
-        return (
-            wp.array(g.means, dtype=self._vector(3), device=self.device),
-            wp.array(g.quaternions, dtype=self._vector(4), device=self.device),
-            wp.array(g.scales, dtype=self._vector(3), device=self.device),
-            wp.array(g.opacities, dtype=self.real, device=self.device),
-        )
+        return uploaded((g.means, g.quaternions, g.scales, g.opacities), self.real, self.device)
 
     def rasterize(
         self,
