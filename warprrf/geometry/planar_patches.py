@@ -179,13 +179,11 @@ class PlanarPatches:
             flat = ~np.isfinite(grown).all(axis=(1, 2))
             low, high = grown.min(axis=1) - reach, grown.max(axis=1) + reach
             low[flat], high[flat] = -np.inf, np.inf
-            put = partial(wp.array, dtype=wp.vec3d, device="cpu")
-            faces, wide = PatchFaces(), slack_m + self.tolerance_m
-            faces.ends = wp.array(ends, dtype=wp.int32, device="cpu")
-            faces.normal, faces.corners = put(self.normal), put(corner)
-            faces.low, faces.high = put(self.boxes[:, 0] - wide), put(self.boxes[:, 1] + wide)
-            faces.face_low, faces.face_high = put(low), put(high)
-            return faces
+            wide = slack_m + self.tolerance_m
+            return _device.filled(
+                PatchFaces, "cpu", ends=ends, normal=self.normal, corners=corner, low=self.boxes[:, 0] - wide,
+                high=self.boxes[:, 1] + wide, face_low=low, face_high=high,
+            )  # fmt: skip
 
         return self._grown.get(slack_m, make)
 
@@ -346,17 +344,15 @@ def _overlaps(faces: _Faces, piece: np.ndarray) -> np.ndarray:
     one of the largest such piece."""
     own = np.flatnonzero(piece >= 0)
     where = _device.resolve("cpu")
-    put = partial(wp.array, device=where)
     corners = faces.mesh.triangles[own] - faces.mesh.center
     margin = 2.0 * faces.distance_m  # float32's rounding is less
     low, high = corners.min(axis=1) - margin, corners.max(axis=1) + margin
-    bvh = wp.Bvh(*(put(x.astype(np.float32), dtype=wp.vec3) for x in (low, high)))
-    held = OverlapFaces()
-    held.corners = put(corners, dtype=wp.vec3d)
-    held.normal = put(faces.mesh.face_normals[own], dtype=wp.vec3d)
-    held.area = put(faces.mesh.areas[own], dtype=wp.float64)
-    held.part, held.group = (put(x[own], dtype=wp.int32) for x in (piece, faces.group))
-    held.part_area = put(np.bincount(piece[own], faces.mesh.areas[own]), dtype=wp.float64)
+    bvh = wp.Bvh(*(wp.array(x.astype(np.float32), dtype=wp.vec3, device=where) for x in (low, high)))
+    area = faces.mesh.areas[own]
+    held = _device.filled(
+        OverlapFaces, where, corners=corners, normal=faces.mesh.face_normals[own], area=area, part=piece[own],
+        group=faces.group[own], part_area=np.bincount(piece[own], area),
+    )  # fmt: skip
     other = wp.full(len(own), -1, dtype=wp.int32, device=where)
     _device.launch(find_overlaps, len(own), [bvh.id, held, faces.distance_m, other], device=where)
     found = other.numpy()
