@@ -12,7 +12,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Protocol, TypeAlias
+from typing import Annotated, Any, Protocol, TypeAlias
 
 import numpy as np
 import warp as wp
@@ -25,12 +25,13 @@ from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
 from warprrf.checks import (
     LARGEST_M,
+    Count,
+    NotNegative,
     check_array,
-    check_count,
-    check_number,
     check_similarity,
     checked,
     one_line,
+    within,
 )
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh_files import MeshOptions, load_mesh
@@ -328,7 +329,7 @@ class Mesh:
         origins: ArrayLike,
         directions: ArrayLike,
         *,
-        per_origin: int = 1,
+        per_origin: Count = 1,
         device: DeviceLike = None,
         backend: str = "auto",
     ) -> Hit:
@@ -350,7 +351,6 @@ class Mesh:
             ValueError: on a wrong shape, NaN, a direction of length zero, an unknown back end, or Embree on a GPU.
             ImportError: if Embree is asked for and Open3D is not installed.
         """
-        per_origin = check_count("per_origin", per_origin)
         o, d = check_rows(("origins", origins), ("directions", directions), per_origin)
         where = _device.resolve(device)
         t, face = self._rays.nearest(o, d, per_origin=per_origin, device=where, backend=backend)
@@ -365,7 +365,7 @@ class Mesh:
         b: ArrayLike,
         *,
         device: DeviceLike = None,
-        clearance: float = ENDPOINT_CLEARANCE,
+        clearance: NotNegative = ENDPOINT_CLEARANCE,
         backend: str = "auto",
     ) -> np.ndarray:
         """Whether nothing lies strictly between points.
@@ -382,7 +382,6 @@ class Mesh:
             Shape ``(N,)``, bool.
         """
         start, end = check_rows(("a", a), ("b", b))
-        clearance = check_number("clearance", clearance, 0.0)
         where = _device.resolve(device)
         return self._rays.free(start, end, clearance=clearance, device=where, backend=backend)
 
@@ -397,7 +396,7 @@ class Mesh:
         _device.launch(
             closest_faces,
             len(p),
-            [self.on_device(where).id, self._local(p, where), reach, face],
+            [self.on_device(where).id, p - self.center, reach, face],
             device=where,
         )
         index = face.numpy()
@@ -423,13 +422,12 @@ class Mesh:
         where = _device.resolve(device)
         bvh, corners = self._boxes(where)
         winding, side = (wp.zeros(len(p) * len(d), dtype=wp.int32, device=where) for _ in range(2))
-        start, toward = (wp.array(x, dtype=wp.vec3d, device=where) for x in (p - self.center, d))
-        inputs = [bvh.id, corners, start, toward, winding, side]
+        inputs = [bvh.id, corners, p - self.center, d, winding, side]
         _device.launch(find_crossings, len(p) * len(d), inputs, device=where)
         return winding.numpy().reshape(len(p), len(d)), side.numpy().reshape(len(p), len(d))
 
     def faces_at(
-        self, points: ArrayLike, reach_m: float, *, device: DeviceLike = None
+        self, points: ArrayLike, reach_m: NotNegative, *, device: DeviceLike = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """All faces that ``points`` (N, 3) [m] lie on, to ``reach_m``: index of the point and face, by point, ``(L,)`` each.
 
@@ -440,10 +438,9 @@ class Mesh:
         bvh, corners = self._boxes(where)
         put = wp.array(p - self.center, dtype=wp.vec3d, device=where)
         start, count, face = (wp.zeros(n, dtype=wp.int32, device=where) for n in (len(p), len(p), 0))
-        reach = wp.float64(check_number("reach_m", reach_m, 0.0))
         for _ in range(2):  # how many, then which
             _device.launch(
-                find_touching, len(p), [bvh.id, corners, put, reach, start, count, face], device=where
+                find_touching, len(p), [bvh.id, corners, put, reach_m, start, count, face], device=where
             )
             many = count.numpy()
             start = wp.array(np.cumsum(many) - many, dtype=wp.int32, device=where)
@@ -481,9 +478,9 @@ class Mesh:
         scale, turn, moved = check_similarity(scale, rotation, shift)
         return Mesh(**self.__getstate__() | {"vertices": scale * self.vertices @ turn.T + moved})
 
-    def cross_section(self, height: float) -> np.ndarray:
+    def cross_section(self, height: Annotated[float, within()]) -> np.ndarray:
         """Line segments in which the surface meets the plane z = ``height`` [m]: a floor plan, shape ``(S, 2, 2)`` [m]."""
-        above = self.triangles[:, :, 2] > check_number("height", height)
+        above = self.triangles[:, :, 2] > height
         cut = (above.sum(axis=1) % 3) > 0
         corners, above = self.triangles[cut], above[cut]
         ends = []
@@ -494,9 +491,6 @@ class Mesh:
             ends.append(a[:, :2] + share[:, None] * (b - a)[:, :2])
         points = np.stack(ends, axis=1)  # exactly two of the three edges cross
         return points[~np.isnan(points[:, :, 0])].reshape(-1, 2, 2)
-
-    def _local(self, points: np.ndarray, device: wp.Device) -> wp.array:
-        return wp.array((points - self.center).astype(np.float32), dtype=wp.vec3, device=device)
 
 
 def vectors_across(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

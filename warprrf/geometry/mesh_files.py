@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import LARGEST_M, check_array, check_count
+from warprrf.checks import LARGEST_M, check_array, check_choice, check_count
 from warprrf.geometry.gltf_files import read_gltf
 from warprrf.geometry.mesh_content import LARGEST_BYTES, Folder, MeshContent, to_linear, to_srgb
 from warprrf.geometry.obj_files import read_obj
@@ -53,8 +53,8 @@ class MeshOptions:
 
     def __post_init__(self) -> None:
         for name, value, known in (("unit", self.unit, METRES), ("up", self.up, UP)):
-            if value is not None and value not in (*known,):
-                raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(known)}")
+            if value is not None:
+                check_choice(name, value, known)
         if self.simplify is not None:
             check_count("simplify", self.simplify, 4)
 

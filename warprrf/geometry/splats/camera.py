@@ -8,19 +8,20 @@ centres lie at +0.5. A spherical image has zenith ``(i + 0.5) pi / H`` in row i 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import (
+    Count,
     check_array,
-    check_choice,
-    check_count,
     check_number,
     check_positive,
     check_similarity,
     check_type,
     checked,
+    one_of,
 )
 
 KINDS = ("pinhole", "spherical")
@@ -42,9 +43,9 @@ class Camera:
             not rigid.
     """
 
-    kind: str
-    width: int
-    height: int
+    kind: Annotated[str, one_of(*KINDS)]
+    width: Count
+    height: Count
     world_to_camera: np.ndarray = field(repr=False)
     fx: float = 0.0
     fy: float = 0.0
@@ -52,12 +53,7 @@ class Camera:
     cy: float = 0.0
 
     def __post_init__(self) -> None:
-        check_choice("kind", self.kind, KINDS)
-        checked: dict[str, object] = {
-            "width": check_count("width", self.width),
-            "height": check_count("height", self.height),
-            "world_to_camera": _check_pose(self.world_to_camera),
-        }
+        checked: dict[str, object] = {"world_to_camera": _check_pose(self.world_to_camera)}
         for name in ("fx", "fy", "cx", "cy"):
             value = getattr(self, name)
             if self.kind == "spherical":
@@ -129,10 +125,9 @@ class Camera:
             )
         return inside, np.where(inside[:, None], uv[:, ::-1], 0).astype(int)
 
-    def resized(self, width: int, height: int) -> Camera:
+    def resized(self, width: Count, height: Count) -> Camera:
         """The same view at another resolution; pinhole intrinsics scale along."""
-        sx = check_count("width", width) / self.width
-        sy = check_count("height", height) / self.height
+        sx, sy = width / self.width, height / self.height
         return Camera(
             self.kind,
             width,
