@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import json
-import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -19,6 +18,7 @@ from urllib.parse import unquote
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from warprrf.checks import warn
 from warprrf.geometry.mesh_content import (
     LARGEST_FACES,
     Folder,
@@ -194,14 +194,12 @@ class _File:
             try:
                 picture = self.picture(image["uri"] if "uri" in image else image.get("bufferView"))
             except FileNotFoundError as error:
-                warnings.warn(f"{error}; its colours stay unknown", UserWarning, stacklevel=8)
+                warn(f"{error}; its colours stay unknown")
                 factor = np.full(4, np.nan)
         if "KHR_texture_transform" in entry.get("extensions", {}):
-            warnings.warn(
+            warn(
                 f"path: {path}: material {name or index} turns or repeats its texture by KHR_texture_transform, "
-                "which is not read: colours of its faces may be off",
-                UserWarning,
-                stacklevel=8,
+                "which is not read: colours of its faces may be off"
             )
         return _Material(material_name(name, picture is not None), factor[:3], picture)
 

@@ -7,7 +7,6 @@ on a texture seam is stored once per side.
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import LARGEST_M, check_array, check_choice, check_count
+from warprrf.checks import LARGEST_M, check_array, check_choice, check_count, warn
 from warprrf.geometry.gltf_files import read_gltf
 from warprrf.geometry.mesh_content import LARGEST_BYTES, Folder, MeshContent, to_linear, to_srgb
 from warprrf.geometry.obj_files import read_obj
@@ -78,10 +77,8 @@ def load_mesh(path: str | os.PathLike[str], options: MeshOptions) -> MeshContent
         raise ValueError(f"unit: in {options.unit!r} {path} holds vertices beyond {LARGEST_M:g} m")
     size = float(np.ptp(vertices, axis=0).max())
     if options.unit is None and not USUAL_SIZE_M[0] <= size <= USUAL_SIZE_M[1]:
-        warnings.warn(
-            f"path: {path} is {size:.3g} m in size if its unit is the metre; give unit= ({', '.join(METRES)})",
-            UserWarning,
-            stacklevel=3,
+        warn(
+            f"path: {path} is {size:.3g} m in size if its unit is the metre; give unit= ({', '.join(METRES)})"
         )
     content = replace(content, vertices=vertices, faces=faces, uv=None)
     if options.simplify is None or len(faces) <= options.simplify:

@@ -5,7 +5,6 @@ What a line states is held against what the format gives it: a damaged line is a
 
 from __future__ import annotations
 
-import warnings
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -14,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from warprrf.checks import warn
 from warprrf.geometry.mesh_content import (
     Folder,
     MeshContent,
@@ -99,7 +99,7 @@ def read_obj(folder: Folder) -> MeshContent:
         try:
             known |= _read_materials(folder, library)
         except FileNotFoundError as error:
-            warnings.warn(f"{error}; its colours stay unknown", UserWarning, stacklevel=4)
+            warn(f"{error}; its colours stay unknown")
     pages = {name for name, (_, picture) in known.items() if picture is not None}
     counts = np.subtract(ends, starts).tolist()
     names = numbered([material_name(name, name in pages) for name in material], counts)
@@ -168,7 +168,7 @@ def _read_materials(folder: Folder, library: str) -> dict[str, _Material]:
                     file = parts[-1] if parts[0].startswith("-") else " ".join(parts)
                     known[name] = (known[name][0], picture(folder.find(file)))
         except FileNotFoundError as error:
-            warnings.warn(f"{error}; its colours stay unknown", UserWarning, stacklevel=5)
+            warn(f"{error}; its colours stay unknown")
         except ValueError as error:
             raise ValueError(f"{error} (line {number} of {library}, which {folder.path} names)") from error
     return known

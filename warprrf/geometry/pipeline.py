@@ -8,7 +8,6 @@ run continues, a change starts over from the first step that it changes.
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
@@ -19,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import tensor_files
-from warprrf.checks import checked
+from warprrf.checks import checked, warn
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh_files import UP
 from warprrf.geometry.photos.config import ReconstructionConfig
@@ -130,8 +129,8 @@ def reconstruct(
         check_scale(scale, list(named))
     known = None
     if poses is not None:
-        warn = isinstance(photos, str | os.PathLike)  # of a list, the rest was left out on purpose
-        known = _known_poses(Path(poses), None if depth is None else Path(depth), named, warn)
+        every = isinstance(photos, str | os.PathLike)  # of a list, the rest was left out on purpose
+        known = _known_poses(Path(poses), None if depth is None else Path(depth), named, every)
 
     sparse = sfm.structure_from_motion(
         photos,
@@ -207,15 +206,15 @@ def _placed(
     return sparse if sparse.upright else upright(sparse, lambda name: read_photo(photos[name]), seed=seed)
 
 
-def _known_poses(poses: Path, depth: Path | None, photos: Mapping[str, Path], warn: bool) -> KnownPoses:
+def _known_poses(poses: Path, depth: Path | None, photos: Mapping[str, Path], every: bool) -> KnownPoses:
     """Poses of ``photos``, and their depth where it is known.
 
     Args:
-        warn: whether every pose should have a photo.
+        every: whether every pose should have a photo.
     """
     model = poses if poses.is_dir() and sfm.is_colmap(poses) else None
     cameras = sfm.read_known(poses) if model else read_poses(poses)
-    names = match_photos(cameras, photos, warn=warn)
+    names = match_photos(cameras, photos, warn=every)
     found = {photo: cameras[name] for photo, name in names.items()}
     files = {photo: camera.depth for photo, camera in found.items() if camera.depth is not None}
     if depth is not None:
@@ -326,9 +325,7 @@ def _said_of_surface(unseen: float, plain: float, skipped: float) -> tuple[str, 
         "and closes what is seen"
     )
     if unseen + plain > MUCH_UNKNOWN:
-        warnings.warn(
-            f"{said}; look at the mesh there, and take more photos of what is missing", stacklevel=3
-        )
+        warn(f"{said}; look at the mesh there, and take more photos of what is missing")
     return (said, *open_ones)
 
 

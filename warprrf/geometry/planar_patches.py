@@ -9,7 +9,6 @@ own. Lengths in metres.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -19,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
-from warprrf.checks import check_similarity
+from warprrf.checks import check_similarity, warn
 from warprrf.geometry.mesh import Mesh, components, edge_pairs, vectors_across
 from warprrf.kernels.rays.mesh import OverlapFaces, find_overlaps
 from warprrf.kernels.rays.patches import PatchFaces, lie_in_patches
@@ -226,7 +225,10 @@ def planar_patches(mesh: Mesh, groups: ArrayLike | None = None) -> PlanarPatches
     if group.shape != (count,):
         raise ValueError(f"groups: got shape {group.shape}, expected ({count},), one index a face")
     rounding, corner, first = mesh.rounding_m, mesh.welded_faces, mesh.first_at_place
-    _check_repeats(first, group)
+    if differ := int((group[first] != group).sum()):
+        warn(
+            f"mesh: {differ} faces lie on another of a different material or group; the first of each is taken"
+        )
     once = first == np.arange(count)
     longest = np.linalg.norm(mesh.triangles - np.roll(mesh.triangles, 1, axis=1), axis=2).max(axis=1)
     height = 2.0 * mesh.areas / np.maximum(longest, 1e-300)
@@ -291,17 +293,6 @@ class _Faces:
         """Largest distance of the corners of each face from its plane [m], shape ``(N,)``."""
         return np.abs(np.einsum("nki,ni->nk", self.mesh.triangles[face], normal) - offset[:, None]).max(
             axis=1, initial=0.0
-        )
-
-
-def _check_repeats(first: np.ndarray, group: np.ndarray) -> None:
-    """Warn of faces that lie on one of another group."""
-    differ = int((group[first] != group).sum())
-    if differ:
-        warnings.warn(
-            f"mesh: {differ} faces lie on another of a different material or group; the first of each is taken",
-            UserWarning,
-            stacklevel=3,
         )
 
 
