@@ -57,12 +57,10 @@ class Attempt:
         progress: ``progress(stage, done, total)``; the time since the last call is put down to ``stage``.
         folder: scratch of this step: empty at the first attempt, kept for the next one if this is killed or fails,
             removed when the step is finished or its inputs change.
-        key: the step's key.
     """
 
     progress: Progress
     folder: Path
-    key: str
 
 
 class Steps:
@@ -168,7 +166,7 @@ class Steps:
 
         write()
         try:
-            figures = make(Attempt(progress, scratch, key))
+            figures = make(Attempt(progress, scratch))
         except BaseException:
             write()
             raise
