@@ -157,3 +157,14 @@ def test_things_are_sorted_by_what_they_are(tmp_path, field):
 def test_what_cannot_be_shown_is_refused(things, error, said):
     with pytest.raises(error, match=said):
         np.asarray(Subject.of(things).bounds)
+
+
+def test_a_file_of_splats_is_shown_as_gaussians(tmp_path):
+    count = 3
+    splats = wr.Gaussians(
+        np.eye(3), np.tile([1.0, 0, 0, 0], (count, 1)), np.ones((count, 3)), np.full(count, 0.5), np.zeros((count, 1, 3))
+    )  # fmt: skip
+    splats.save_ply(tmp_path / "splats.ply")
+    found = Subject.of([tmp_path / "splats.ply"])
+    assert found.mesh is None
+    np.testing.assert_allclose(found.gaussians.means, np.eye(3))

@@ -142,7 +142,7 @@ def _opened(path: Path) -> list[Any]:
         return _folder(path)
     if not path.is_file():
         raise ValueError(f"things: {path}: no such file or folder")
-    if path.suffix == ".ply" and "opacity" in ply_columns(path):
+    if path.suffix == ".ply" and "opacity" in ply_columns(path).get("vertex", ()):
         return [Gaussians.load_ply(path)]
     kind: Any = _FILES.get(path.suffix, Mesh if is_mesh_file(path) else None)
     if kind is None:
