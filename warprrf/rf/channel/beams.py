@@ -26,10 +26,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import Count, check_array, check_count, check_positive, checked, one_line, positive
-from warprrf.rf.channel.arrays import ISOTROPIC, End, PlanarArray, array_of, check_unpolarised
+from warprrf.rf.channel.arrays import End, PlanarArray, array_of, check_unpolarised
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.waves import carrier_phase
-from warprrf.rf.spectra.antenna import Antenna
 from warprrf.rf.spectra.spectrum import Spectrum, directions_from_angles, pixel_directions, unit_vectors
 
 
@@ -425,14 +424,8 @@ def _dft(count: int, oversampling: int) -> np.ndarray:
 
 def codebook_of(name: str, value: Ends) -> Codebook:
     """The beams of an end; ``name`` is the argument that ``value`` came by."""
-    if value is None:
-        return Codebook(ISOTROPIC, (np.ones((1, 1), dtype=complex),))
     if isinstance(value, Codebook):
         return value
-    if not isinstance(value, PlanarArray | Antenna):
-        raise TypeError(
-            f"{name}: got {type(value).__name__}, expected a PlanarArray, an Antenna or a Codebook"
-        )
     array = array_of(name, value)
     check_unpolarised(name, array)
     return dft_codebook(array)
