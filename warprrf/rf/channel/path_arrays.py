@@ -245,14 +245,11 @@ class PathArrays:
             excess_m: By what slabs make a path longer than it is [m], shape ``(L,)``.
             interactions: As of :class:`PathArrays`.
         """
-        count, depth = vertices.shape[:2]
         bounces = np.isfinite(vertices[..., 0]).sum(axis=1)
         points = points_along(transmitter, vertices, receiver)
-        each = np.arange(count)
-        steps = np.linalg.norm(np.diff(points, axis=1), axis=2)
-        length = np.where(np.arange(depth + 1) <= bounces[:, None], steps, 0.0).sum(axis=1)
+        last, length = points[np.arange(len(points)), bounces], length_along(points, bounces)
         tau = (length if excess_m is None else length + excess_m) / SPEED_OF_LIGHT
-        theta_r, phi_r = angles_from_directions(points[each, bounces] - receiver)
+        theta_r, phi_r = angles_from_directions(last - receiver)
         theta_t, phi_t = angles_from_directions(points[:, 1] - transmitter)
         turned = carrier_phase(frequency_hz, tau)
         return cls(
@@ -264,7 +261,7 @@ class PathArrays:
             phi_t=phi_t,
             vertices=vertices,
             kind=kind,
-            valid=np.ones(count, dtype=bool),
+            valid=np.ones(len(points), dtype=bool),
             jones=None if jones is None else jones * turned[:, None, None],
             frequency_hz=frequency_hz,
             transmitter=transmitter.copy(),
@@ -319,6 +316,12 @@ def points_along(transmitter: np.ndarray, vertices: np.ndarray, receiver: np.nda
     points = np.concatenate([start, vertices, np.zeros((count, 1, 3))], axis=1)
     points[np.arange(count), np.isfinite(vertices[..., 0]).sum(axis=1) + 1] = receiver
     return points
+
+
+def length_along(points: np.ndarray, bounces: np.ndarray) -> np.ndarray:
+    """Length from end to end [m], shape ``(L,)``, of paths along ``points`` as of :func:`points_along`, with ``bounces`` (L,)."""
+    steps = np.linalg.norm(np.diff(points, axis=1), axis=2)
+    return np.where(np.arange(steps.shape[1]) <= bounces[:, None], steps, 0.0).sum(axis=1)
 
 
 def _columns(parts: Sequence[PathArrays]) -> dict[str, list[np.ndarray]]:

@@ -28,7 +28,7 @@ import scipy.fft
 from scipy.sparse import csr_array
 
 from warprrf.device import threads
-from warprrf.rf.channel.path_arrays import EDGE, MIRROR, PathArrays, points_along
+from warprrf.rf.channel.path_arrays import EDGE, MIRROR, PathArrays, length_along, points_along
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 
 TAPS = 8
@@ -269,14 +269,11 @@ def spherical_lengths(paths: PathArrays, sending: np.ndarray, receiving: np.ndar
     """Paths that do not scatter: distances from the transmitting elements' images. An edge counts as the mirror that turns
     the way as it does: right to first order in the elements' places, but for the waves' bend across the edge."""
     tx, rx, bounces = _ends(paths)
-    each, some = np.arange(len(bounces)), bounces > 0
-    last = np.where(some[:, None], paths.vertices[each, np.maximum(bounces - 1, 0)], tx)
+    points = points_along(tx, paths.vertices, rx)
+    last, length = points[np.arange(len(points)), bounces], length_along(points, bounces)
     toward = (last - rx) / np.linalg.norm(last - rx, axis=1, keepdims=True)
-    points = np.concatenate([np.broadcast_to(tx, (len(each), 1, 3)), paths.vertices], axis=1)
-    step = np.linalg.norm(np.diff(points, axis=1), axis=2)
-    length = np.where(np.isfinite(step), step, 0.0).sum(axis=1) + np.linalg.norm(rx - last, axis=1)
     # The image lies ``length`` away along the arrival; its array is mirrored at every turn of the way.
-    mirrored = np.einsum("pij,nj->npi", _mirrorings(paths, tx, rx), sending)
+    mirrored = np.einsum("pij,nj->npi", _mirrorings(points, paths.interactions), sending)
     target = length[:, None] * toward + mirrored
     far = np.linalg.norm(target, axis=2)
     return PairLengths(receiving, target, extra=far - length, scale=length / far, spherical=True)
@@ -302,14 +299,13 @@ def _ends(paths: PathArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return paths.transmitter, paths.receiver, bounces
 
 
-def _mirrorings(paths: PathArrays, tx: np.ndarray, rx: np.ndarray) -> np.ndarray:
+def _mirrorings(points: np.ndarray, interactions: np.ndarray) -> np.ndarray:
     """What mirrors and edges do to directions, shape ``(P, 3, 3)``: a product of reflections; slabs do nothing."""
-    count, depth = paths.vertices.shape[:2]
-    legs = np.diff(points_along(tx, paths.vertices, rx), axis=1)
+    legs = np.diff(points, axis=1)
     legs = legs / np.linalg.norm(legs, axis=2, keepdims=True)
-    turned = np.broadcast_to(np.eye(3), (count, 3, 3))
-    turns = np.isin(paths.interactions, (MIRROR, EDGE))
-    for k in range(depth):
+    turned = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    turns = np.isin(interactions, (MIRROR, EDGE))
+    for k in range(turns.shape[1]):
         normal = legs[:, k + 1] - legs[:, k]
         there = turns[:, k] & (np.linalg.norm(np.nan_to_num(normal), axis=1) > 1e-9)
         unit = np.where(there[:, None], normal, 1.0)
