@@ -553,20 +553,16 @@ def library_material(name: str) -> Material | None:
     return itu_material(name, name=name).extrapolated() if itu_name(name) else None
 
 
+@lru_cache(maxsize=64)
 def assumed_permittivity(name: str, frequency_hz: float) -> float:
     """Magnitude of the relative permittivity that a surface called ``name`` is taken for before any measurement: that of
     P.2040's material of this name, else the geometric mean of those that rooms are made of, less one."""
     known = itu_name(name)
-    return _mean_permittivity(BUILDING if known is None else (known,), frequency_hz)
+    found = [abs(itu_permittivity(one, frequency_hz)) for one in (BUILDING if known is None else (known,))]
+    return 1.0 + float(np.exp(np.mean(np.log(np.maximum(np.array(found) - 1.0, 1e-3)))))
 
 
 @lru_cache(maxsize=64)
 def itu_permittivity(itu: str, frequency_hz: float) -> complex:
     """Complex relative permittivity of a material of ITU-R P.2040, by the law of the nearest band."""
     return itu_material(itu).extrapolated().permittivity(frequency_hz)
-
-
-@lru_cache(maxsize=64)
-def _mean_permittivity(names: tuple[str, ...], frequency_hz: float) -> float:
-    found = [abs(itu_permittivity(one, frequency_hz)) for one in names]
-    return 1.0 + float(np.exp(np.mean(np.log(np.maximum(np.array(found) - 1.0, 1e-3)))))
