@@ -21,15 +21,12 @@ def table(methods: dict[str, dict[str, Any]]) -> str:
     }
     shown = [key for key in columns if any(figures.get(key) is not None for figures in methods.values())]
     rows = [["method", *(columns[key] for key in shown)]]
-    for name, figures in methods.items():
-        cells = [figures.get(key) for key in shown]
-        rows.append(
-            [
-                name,
-                *("-" if cell is None else f"{cell:.3g}" if cell < 10 else f"{cell:.2f}" for cell in cells),
-            ]
-        )
+    rows += [[name, *(_cell(figures.get(key)) for key in shown)] for name, figures in methods.items()]
     return aligned(rows)
+
+
+def _cell(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}" if value < 10 else f"{value:.2f}"
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
