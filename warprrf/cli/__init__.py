@@ -14,19 +14,15 @@ import sys
 from collections.abc import Callable, Sequence
 
 import warprrf as wr
+from warprrf.cli import steps, views
 from warprrf.cli.inputs import Add, Parser
 from warprrf.cli.output import INTERRUPTED, Output
-from warprrf.cli.steps import (
-    add_evaluate,
-    add_fit,
-    add_locate,
-    add_reconstruct,
-    add_relevance,
-    add_sample,
-    add_simulate,
-    add_suggest,
-)
-from warprrf.cli.views import add_map, add_render, add_twin, add_view
+
+COMMANDS = (
+    steps.add_reconstruct, steps.add_sample, steps.add_simulate, steps.add_fit, steps.add_suggest, steps.add_locate,
+    steps.add_relevance, views.add_render, steps.add_evaluate, views.add_map, views.add_twin, views.add_view,
+)  # fmt: skip
+"""What defines a command each, in the order of the help."""
 
 EPILOG = """\
 a walk through:
@@ -86,25 +82,8 @@ def _one_line(error: Exception) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    return make_parser(
-        "warprrf",
-        "Radio radiance fields from photos and a few radio measurements.",
-        EPILOG,
-        (
-            add_reconstruct,
-            add_sample,
-            add_simulate,
-            add_fit,
-            add_suggest,
-            add_locate,
-            add_relevance,
-            add_render,
-            add_evaluate,
-            add_map,
-            add_twin,
-            add_view,
-        ),
-    )
+    about = "Radio radiance fields from photos and a few radio measurements."
+    return make_parser("warprrf", about, EPILOG, COMMANDS)
 
 
 def make_parser(
