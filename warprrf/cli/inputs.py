@@ -250,8 +250,9 @@ def add_effects(parser: argparse.ArgumentParser, text: str) -> None:
     )  # fmt: skip
 
 
-def read_effects(value: object) -> Any:
-    """Effects by a mapping of fields, or the name of a set as it is."""
+def read_effects(text: str) -> Any:
+    """Effects by a mapping of fields in JSON, or the name of a set as it is."""
+    value = read_json_or_text(text)
     if not isinstance(value, dict):
         return value
     known = [f.name for f in fields(wr.Effects)]

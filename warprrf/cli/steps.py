@@ -210,7 +210,7 @@ def _simulate(args: argparse.Namespace, out: Output) -> None:
     if args.effects is not None:
         if args.engine != "exact":
             refuse(args, ["effects"], f"engine {args.engine} has its own: --depth, --refraction")
-        effects = read_effects(read_json_or_text(args.effects))
+        effects = read_effects(args.effects)
         how["effects"] = SETS.get(effects, effects)
     unfinished = Path(f"{args.out}.receivers")
     out.resumes(unfinished)
@@ -317,14 +317,12 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
         options["relevance"] = wr.Relevance.load(existing(args.relevance))
     options |= {name: True for name in ("quick", "reciprocal") if getattr(args, name)}
     if args.effects is not None:
-        options["effects"] = read_json_or_text(args.effects)
+        options["effects"] = read_effects(args.effects)
     for option in ("relevance", "quick", "reciprocal", "effects"):
         if option in options and args.model != "bistatic":
             raise ValueError(f"--{option}: only the bistatic model takes it, got --model {args.model}")
     if args.iterations is not None:
         options["iterations"] = args.iterations
-    if "effects" in options:
-        options["effects"] = read_effects(options["effects"])
     field = wr.RadioField.fit(
         geometry,
         data[0] if len(data) == 1 else data,
@@ -362,7 +360,7 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
 def _option(text: str) -> tuple[str, Any]:
     """Name and value of an option."""
     name, _, value = text.partition("=")
-    return name, read_json_or_text(value)
+    return name, (read_effects if name == "effects" else read_json_or_text)(value)
 
 
 def add_suggest(add: Add) -> None:
@@ -460,12 +458,9 @@ def _locate(args: argparse.Namespace, out: Output) -> None:
             one = ds.subset([args.receiver or 0])
         measured.append(one)
     found = field.locate(measured, store=args.map, progress=out)
-    result = {
-        name: getattr(found, name)
-        for name in ("position", "covariance", "candidates", "likelihoods", "known", "misfit")
-    }
-    result |= {"gains_db": dict(found.gains_db), "azimuth_zeros": dict(found.azimuth_zeros)}
-    result |= {"clock_offsets_s": dict(found.clock_offsets_s)}
+    figures = "position", "covariance", "candidates", "likelihoods", "known", "misfit"
+    zeros = "gains_db", "azimuth_zeros", "clock_offsets_s"
+    result = {name: getattr(found, name) for name in (*figures, *zeros)}
     if args.out:
         write_json(args.out, plain(result))
     said = "known" if found.known else "not known: see candidates"
