@@ -135,14 +135,9 @@ def splats(gaussians: Gaussians) -> dict[str, np.ndarray]:
     }
 
 
-def lobe_mesh(
-    centre: np.ndarray,
-    directions: np.ndarray,
-    lobe: np.ndarray,
-    radius_m: float = 1.5,
-    range_db: float = 20.0,
-) -> tuple[np.ndarray, np.ndarray]:
-    """A beam's power gain (K, M) along ``directions`` (K, M, 3) as triangles: the radius falls to 0 over ``range_db``."""
+def lobe_mesh(centre: np.ndarray, directions: np.ndarray, lobe: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A beam's power gain (K, M) along ``directions`` (K, M, 3) as triangles: the radius falls to 0 over 20 dB."""
+    radius_m, range_db = 1.5, 20.0
     gain_db = 10.0 * np.log10(np.maximum(lobe / lobe.max(), 1e-9))
     radius = radius_m * np.clip(1.0 + gain_db / range_db, 0.0, 1.0)
     rows, columns = lobe.shape

@@ -4,6 +4,7 @@ was read was read."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -11,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import Progress
-from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fields.base import RadioField
+from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.maps.radio_map import QUANTITIES
 from warprrf.rf.positions import is_free
 from warprrf.rf.spectra.antenna import horn
@@ -83,13 +84,14 @@ class Survey:
             )
             table = gui.add_upload_button("find a receiver by its table (.csv)", mime_type=".csv,text/csv")
             table.on_upload(lambda _: self.locate(table.value.name, table.value.content))
-        if subject.spectra is not None:
-            self.errors = self._add("errors at measured places", self._spectrum_errors)
-        if subject.readings is not None:
-            self.reading_errors = self._add("errors of readings", self._reading_errors)
+        truth, readings = subject.spectra, subject.readings
+        if truth is not None:
+            self.errors = self._add("errors at measured places", partial(self._spectrum_errors, truth))
+        if readings is not None:
+            self.reading_errors = self._add("errors of readings", partial(self._reading_errors, readings))
         self._folder = gui.add_folder("Places", visible=False)
 
-    def _add(self, label: str, work: Callable[[RadioField, Progress], None]) -> Callable[[], None]:
+    def _add(self, label: str, work: Callable[[Any, Progress], None]) -> Callable[[], None]:
         """A button for ``work``; returns what it does."""
 
         def run() -> None:
@@ -143,9 +145,8 @@ class Survey:
         free, down = found.positions[found.free], np.array([0.0, 0.0, -1.0])
         floor = 0.0
         if self._subject.mesh is not None:  # a little above what is drawn
-            floor = 0.03 + float(
-                np.nanmedian(self._subject.mesh.cast(free, np.tile(down, (len(free), 1))).point[:, 2])
-            )
+            below = self._subject.mesh.cast(free, np.tile(down, (len(free), 1))).point[:, 2]
+            floor = 0.03 + float(np.nanmedian(below))
         self._page.scene.add_image(
             "/map", np.dstack([picture, seen]), width, height,
             position=(float(found.x.mean()), float(found.y.mean()), floor), wxyz=(0.0, 1.0, 0.0, 0.0),
@@ -154,17 +155,15 @@ class Survey:
         title = f"{self._quantity.value} at {found.height_m:g} m"
         self._explain(title, pictures.colour_bar(low, high, ""), "map")
 
-    def candidates(self, field: RadioField) -> np.ndarray:
+    def candidates(self, field: BistaticField) -> np.ndarray:
         """Places (C, 3) in the air, at the height that is set."""
         mesh = field.mesh
-        if not isinstance(mesh, Mesh):
-            raise ValueError("field: got one without a mesh, expected one that knows walls from air")
         axes = [np.arange(a + 0.5 * CANDIDATE_M, b, CANDIDATE_M) for a, b in mesh.bounds[:, :2].T]
         places = np.stack(np.meshgrid(*axes, [float(self.height.value)]), axis=-1).reshape(-1, 3)
         places = places[is_free(mesh, places, field.transmitter, device=field.device)]
         return np.asarray(places[np.linalg.norm(places - field.transmitter, axis=1) > CLEAR_M])
 
-    def _suggest(self, field: RadioField, progress: Progress) -> None:
+    def _suggest(self, field: BistaticField, progress: Progress) -> None:
         places = self.candidates(field)
         if not len(places):
             raise ValueError(f"height: no place at {self.height.value:g} m is in the air")
@@ -200,10 +199,7 @@ class Survey:
         self._explain(f"{name}: at {at} m, give or take {found.std_m:.2f} m{sure}", "", "located")
         self._go_to(found.position)
 
-    def _spectrum_errors(self, field: RadioField, progress: Progress) -> None:
-        truth = self._subject.spectra
-        if truth is None:
-            return
+    def _spectrum_errors(self, truth: SpectrumDataset, field: RadioField, progress: Progress) -> None:
         _check_carrier(field, truth)
         found = evaluate(truth, lambda at: field.spectrum(at), progress=progress)  # fitted ones are marked
         psnr, fitted = found["per_receiver"]["psnr_db"], field.was_fitted_on(truth)
@@ -216,10 +212,7 @@ class Survey:
         )
         self._list(truth.receivers[worst], labels)
 
-    def _reading_errors(self, field: RadioField, progress: Progress) -> None:
-        readings = self._subject.readings
-        if readings is None:
-            return
+    def _reading_errors(self, readings: Readings, field: RadioField, progress: Progress) -> None:
         _check_carrier(field, readings)
         error = answers.reading_errors(field, readings, progress)
         places, own = np.unique(readings.receivers, axis=0, return_inverse=True)
