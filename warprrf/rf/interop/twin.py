@@ -234,20 +234,17 @@ def project_reflection(
     row, column = np.unravel_index(coarse.argmin(), coarse.shape)
     start = np.array([excess[row], trials[column]])[: 2 if certain is None else 1]
 
-    def parts(found: np.ndarray) -> np.ndarray:
-        odds = found[1] if certain is None else certain
-        return errors(np.clip(found[0], *excess[[0, -1]]), np.asarray(odds))
+    def within(trial: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The trial's ln(epsilon_r - 1), within the family, and its logit of S^2."""
+        odds = trial[1] if certain is None else certain
+        return np.clip(trial[0], *excess[[0, -1]]), np.asarray(odds)
 
-    best = minimize(
-        lambda trial: share @ parts(trial),
-        start,
-        method="Nelder-Mead",
-        options={"xatol": 1e-9, "fatol": 1e-14},
-    ).x
-    rms = np.sqrt(parts(best))
-    odds = best[1] if certain is None else certain
+    fine = {"xatol": 1e-9, "fatol": 1e-14}
+    best = minimize(lambda trial: share @ errors(*within(trial)), start, method="Nelder-Mead", options=fine)
+    x, odds = within(best.x)
+    rms = np.sqrt(errors(x, odds))
     return Reflection(
-        relative_permittivity=1.0 + float(np.exp(np.clip(best[0], *excess[[0, -1]]))),
+        relative_permittivity=1.0 + float(np.exp(x)),
         scattering=float(np.exp(-0.5 * np.logaddexp(0.0, -odds))),
         scattering_error_db=float(rms[0]) if scattered > 0 else 0.0,
         mirror_error_db=float(rms[1]) if mirrored > 0 else 0.0,
