@@ -258,7 +258,7 @@ class ExactEngine:
             found = point, (row[chosen], patch[chosen], met[chosen], np.ones(len(row))[chosen])
             mirrors = described(patches, tracer.transmitter, *found, 1, walls, slabs)
             image = self.surface.images(tracer.transmitter)[0][patch[chosen, 0]]
-            light = tracer.grid.light_through(rays.hits, image, ray[row[chosen]])
+            light = tracer.grid.unshadowed(rays.hits, image, ray[row[chosen]])
             k = np.flatnonzero(light.strength > 0)
             own, image, mirrors = row[chosen][k], image[k], mirrors.take(k)
             way, plane = point[own] - image, self.surface.plane_normal[patch[chosen, 0][k]]

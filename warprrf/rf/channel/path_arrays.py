@@ -20,12 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warprrf.checks import Shaped, check_chosen, check_count, check_items, checked, one_line
+from warprrf.kernels.radio.records import EDGE, MIRROR, SCATTER, SLAB
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 from warprrf.rf.spectra.spectrum import angles_from_directions, directions_from_angles
 
-MIRROR, SCATTER, SLAB, EDGE = 1, 2, 4, 8
-"""Codes of interactions, those of ``sionna.rt.InteractionType``; 0 for none."""
 _LAST = {"diffuse": SCATTER, "slab": SLAB, "edge": EDGE}
 MOST_PATHS = 10_000_000
 """Longest list that is asked for: 2 GB of a receiver."""

@@ -28,7 +28,8 @@ import scipy.fft
 from scipy.sparse import csr_array
 
 from warprrf.device import threads
-from warprrf.rf.channel.path_arrays import EDGE, MIRROR, PathArrays, length_along, points_along
+from warprrf.kernels.radio.records import EDGE, MIRROR
+from warprrf.rf.channel.path_arrays import PathArrays, length_along, points_along
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 
 TAPS = 8

@@ -20,7 +20,7 @@ import numpy as np
 
 from warprrf.checks import Count, checked
 from warprrf.files import write_arrays, write_text
-from warprrf.rf.channel.path_arrays import EDGE, MIRROR, SCATTER, SLAB
+from warprrf.kernels.radio.records import EDGE, MIRROR, SCATTER, SLAB
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.scene import Scene
 

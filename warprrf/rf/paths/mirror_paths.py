@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, Mesh, vectors_across
 from warprrf.geometry.planar_patches import PlanarPatches
-from warprrf.rf.channel.path_arrays import EDGE, MIRROR, SLAB
+from warprrf.kernels.radio.records import EDGE, MIRROR, SLAB
 from warprrf.rf.paths.images import MirrorImages
 from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.paths.slabs import Slabs, Walls

@@ -18,8 +18,9 @@ from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.checks import check_array, check_count, check_positive, checked, one_line
+from warprrf.kernels.radio.records import EDGE, SCATTER, SLAB
 from warprrf.rf.channel.arrays import End
-from warprrf.rf.channel.path_arrays import EDGE, SCATTER, SLAB, PathArrays, turned
+from warprrf.rf.channel.path_arrays import PathArrays, turned
 from warprrf.rf.channel.response import channel_taps, frequency_response, impulse_response
 from warprrf.rf.em.waves import carrier_phase
 

@@ -21,7 +21,7 @@ from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import default_floor, pixel_solid_angles, to_db
 from warprrf.rf.tracing.model import Effects, Parameters
-from warprrf.rf.tracing.render import images
+from warprrf.rf.tracing.render import spectra_of
 from warprrf.rf.tracing.tracer import View
 
 EVERYTHING = Effects(mirrors=2)
@@ -183,7 +183,7 @@ class FullModel:
                 length = view.paths.length_m if name == "specular" else single[gains.records[name].ray]
                 tables[name] = power * 10.0 ** (-0.1 * self.gas_db_per_m * length)
             gains = replace(gains, tables=tables)
-        return np.asarray(images(gains, self.beam)[0])
+        return np.asarray(spectra_of(gains, self.beam)[0])
 
     def power(self, lost: frozenset[str]) -> float:
         """Share of all receivers' power that goes with the effects ``lost``."""

@@ -147,7 +147,7 @@ class RayGrid:
 
     def light(self, hits: Hits, source: np.ndarray) -> Light:
         """How a transmitter at ``source`` (3,) [m] illuminates what was hit, and where shadows fall."""
-        found = self.light_through(hits, source)
+        found = self.unshadowed(hits, source)
         ray = np.flatnonzero(found.strength > 0)
         free = self.surface.mesh.visible(
             np.asarray(source, float), found.point.take(ray, axis=0), clearance=self.surface.position_error_m, device=self.device,
@@ -155,7 +155,7 @@ class RayGrid:
         )  # fmt: skip
         return replace(found, lit=ray[free])
 
-    def light_through(self, hits: Hits, sources: np.ndarray, ray: np.ndarray | None = None) -> Light:
+    def unshadowed(self, hits: Hits, sources: np.ndarray, ray: np.ndarray | None = None) -> Light:
         """How transmitters at ``sources`` (3,) or (K, 3) [m] would illuminate what rays of index ``ray`` (K,), by default
         all, hit if nothing threw a shadow."""
         count, where = len(hits.face) if ray is None else len(ray), self.device

@@ -104,7 +104,7 @@ def path_gains(view: View, model: Model) -> PathGains:
     return PathGains(view, found, tables, model.parameters)
 
 
-def images(gains: PathGains, beam: BeamOperator) -> np.ndarray:
+def spectra_of(gains: PathGains, beam: BeamOperator) -> np.ndarray:
     """Spectra (R, H, W) of the receivers: path gains through the receivers' beam.
 
     Raises:

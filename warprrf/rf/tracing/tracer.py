@@ -340,7 +340,7 @@ class Tracer:
                 table = self.lit(rays, lights[sight])
             else:
                 row = np.flatnonzero(np.unpackbits(view.lit[0], count=len(first.ray)))
-                known = self.grid.light_through(first.hits, self.transmitter, row)
+                known = self.grid.unshadowed(first.hits, self.transmitter, row)
                 table = self.scattered(first, row, known.strength, known.angle)
             made[Sequence(light, sight, most).name] = table
         return made
@@ -386,7 +386,7 @@ class Tracer:
         m = self.mirrored(most)
         row, image = m.pairs(rays.hits.face[chosen])
         row = chosen[row]
-        light = self.grid.light_through(rays.hits, m.image[image], row)
+        light = self.grid.unshadowed(rays.hits, m.image[image], row)
         k = np.flatnonzero(light.strength > 0)
         before = m.before.take(image[k])
         if not most:

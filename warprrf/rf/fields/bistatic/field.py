@@ -78,7 +78,7 @@ from warprrf.rf.spectra.readings import antenna_of, check_turned
 from warprrf.rf.spectra.spectrum import Spectrum, default_floor, to_db
 from warprrf.rf.tracing.model import ARRAYS as PARAMETER_ARRAYS
 from warprrf.rf.tracing.model import MOST_NEPERS, SETS, Effects, Layout, Model, Parameters
-from warprrf.rf.tracing.render import PathGains, images, materials_of, path_gains
+from warprrf.rf.tracing.render import PathGains, materials_of, path_gains, spectra_of
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import Tracer, View
 
@@ -372,7 +372,7 @@ class BistaticField(RadioField):
 
     def _seen(self, view: View, uncertainty: bool) -> Spectrum:
         gains = self.path_gains(view)
-        image = images(gains, self._beam)[0]
+        image = spectra_of(gains, self._beam)[0]
         delay, aod = strongest(gains, image, self.beam_sigma_rad)
         spectrum = Spectrum(
             path_gain=image.astype(np.float32),
@@ -410,7 +410,7 @@ class BistaticField(RadioField):
 
     def _paths_of(self, view: View, max_paths: int | None) -> Paths:
         gains = self.path_gains(view)
-        return paths_of(gains, images(gains, self._beam)[0], self.floor, self.air, max_paths)
+        return paths_of(gains, spectra_of(gains, self._beam)[0], self.floor, self.air, max_paths)
 
     def _trace_spectra(self, receivers: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
         """Several receivers are traced at once."""
@@ -420,7 +420,7 @@ class BistaticField(RadioField):
         for first in range(0, len(receivers), batch):
             some = np.arange(first, min(first + batch, len(receivers)))
             view = tracer.view(receivers[some], self.effects, paths=paths.of(some))
-            found[some] = images(self.path_gains(view), self._beam)
+            found[some] = spectra_of(self.path_gains(view), self._beam)
         return found
 
     def array_spectrum(

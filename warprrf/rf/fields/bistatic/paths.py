@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.rf.channel.path_arrays import SCATTER
+from warprrf.kernels.radio.records import SCATTER
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.maps.links import Links, best_beam_gain
