@@ -105,7 +105,7 @@ def trace(
         if effects is None:
             wanted = replace(wanted, mirrors=tracer.images.affordable(receivers, wanted.mirrors))
         found = tracer.paths(receivers, wanted, progress)
-        parts = [(receivers[r], found.take(np.flatnonzero(found.receiver == r))) for r in range(len(own))]
+        parts = [(receiver, found.of(np.array([r]))) for r, receiver in enumerate(receivers)]
         for r, view in each(partial(view_of, make, wanted, keeps), parts, client):
             views[own[r]] = tracer.adopted(view)
             tell("transport", len(views), len(places))
