@@ -31,7 +31,7 @@ from warprrf.rf.paths.mirror_paths import MirrorPaths, ZoneRays, described, legs
 from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.paths.slabs import Slabs, Walls
 from warprrf.rf.spectra.spectrum import unit_beams
-from warprrf.rf.tracing.model import SETS, Effects
+from warprrf.rf.tracing.model import Effects
 from warprrf.rf.tracing.rays import NEAREST_M, Hits, Light, RayGrid
 from warprrf.rf.tracing.records import Interactions, Records, one_kind
 from warprrf.rf.tracing.surface import Surface
@@ -91,8 +91,6 @@ class View:
         records: tables by sequence, of those that were asked for; of line of sight and mirrors under :data:`SPECULAR`, one row
             for each of ``paths``.
         keeps: whether what is made when it is first asked for is kept.
-        lit: where it is not, rays that the transmitter lights, as bits, once that is known: the table of single bounces is
-            made of them without casting rays.
     """
 
     tracer: Tracer
@@ -101,7 +99,6 @@ class View:
     paths: MirrorPaths
     records: dict[str, Records] = field(repr=False)
     keeps: bool = True
-    lit: list[np.ndarray] = field(default_factory=list, repr=False)
     _beams: list[np.ndarray] = field(init=False, repr=False, default_factory=list)
 
     @property
@@ -143,10 +140,6 @@ class View:
         if made and self.keeps:
             with making:
                 self.records.update(made)
-        elif "S" in made and not self.lit:
-            bits = np.zeros(len(self.hits.face), bool)
-            bits[made["S"].ray] = True
-            self.lit[:] = [np.packbits(bits)]
         return {name: made[name] if name in made else self.records[name] for name in (SPECULAR, *wanted)}
 
     def of(self, k: int) -> View:
@@ -326,7 +319,7 @@ class Tracer:
             if sight not in seen:
                 seen[sight] = self._turned(view) if sight == "M" else self.behind(first, most)
             rays = seen[sight]
-            if light in ("S", "TS") and sight not in lights and not (view.lit and light + sight == "S"):
+            if light in ("S", "TS") and sight not in lights:
                 lights[sight] = self.light(rays)
             if light == "E":
                 table = self.seen(rays)
@@ -336,12 +329,8 @@ class Tracer:
                 table = self.lit_by_mirrors(rays, most)
             elif light == "TS":
                 table = self.lit_through(rays, lights[sight], most)
-            elif sight in lights:
-                table = self.lit(rays, lights[sight])
             else:
-                row = np.flatnonzero(np.unpackbits(view.lit[0], count=len(first.ray)))
-                known = self.grid.unshadowed(first.hits, self.transmitter, row)
-                table = self.scattered(first, row, known.strength, known.angle)
+                table = self.lit(rays, lights[sight])
             made[Sequence(light, sight, most).name] = table
         return made
 
@@ -505,7 +494,8 @@ def view_of(
     """What a receiver (3,) of known line of sight and mirror paths sees, without what all receivers share; ``make`` makes their
     tracer, in another process too."""
     view = make().view(part[0], effects, paths=part[1], keeps=keeps)
-    view.traced(effects if keeps else SETS["single"])
+    if keeps:
+        view.traced(effects)
     none: dict[str, Any] = {"directions": None, "solid_angle": None}
     return replace(view, tracer=None, hits=replace(view.hits, **none))  # type: ignore[arg-type]
 

@@ -57,16 +57,14 @@ def test_spectra_that_would_not_fit_into_memory_are_refused(scene, data, monkeyp
 
 
 def test_a_fit_to_many_keeps_no_records_and_is_the_same(scene, data, field, monkeypatch):
-    """Of each ray 4 bytes of its face, 8 of its range, and a bit that says whether it is lit; records alone would take 24."""
+    """Of each ray 4 bytes of its face and 8 of its range; records alone would take 24."""
     monkeypatch.setattr(training, "MOST_KEPT", 0)
     traced = []
     monkeypatch.setattr(fitting, "trace", lambda *a, **o: traced.append(trace(*a, **o)) or traced[-1])
     again = RadioField.fit(scene, data.subset(np.arange(6)))
     ((seen, _),) = traced
     for _, view in seen:
-        assert sum(a.nbytes for a in (view.hits.face, view.hits.range_m, *view.lit)) < 13 * len(
-            view.hits.face
-        )
+        assert view.hits.face.nbytes + view.hits.range_m.nbytes == 12 * len(view.hits.face)
         assert set(view.records) == {SPECULAR}
     assert np.array_equal(again.residual, field.residual)
     for name in ("log_weight", "log_excess", "log_mirror"):
