@@ -160,6 +160,29 @@ def test_uncertainty_covers_the_error(field, data):
     assert (ratio <= 2).mean() > 0.75
 
 
+def test_what_parameters_leave_open_is_carried_to_the_pixels(field):
+    """Of one material all lobes together: by differences of the spectrum."""
+    bare = replace(field, effects=replace(SETS["single"], residual=False))
+    place, step, p = RECEIVERS[3], 0.01, bare.parameters
+    closed, lobes = np.zeros_like(field.errors.covariance), len(p.lobes)
+    left_open = closed.copy()
+    left_open[:lobes, :lobes] = 1.0
+
+    def std_db(covariance):
+        unsure = replace(bare, errors=replace(field.errors, covariance=covariance))
+        return unsure.spectrum(place, uncertainty=True).std_db
+
+    def db(by):
+        weight = p.log_weight + by * (field.material == 0)[:, None]
+        image = replace(bare, parameters=replace(p, log_weight=weight)).spectrum(place).path_gain
+        return NEPER * np.log1p(image / field.floor)
+
+    found = np.sqrt(std_db(left_open) ** 2 - std_db(closed) ** 2)
+    slope = np.abs(db(step) - db(-step)) / (2.0 * step)
+    assert slope.max() > 1.0
+    np.testing.assert_allclose(found, slope, atol=0.02 * slope.max())
+
+
 def test_the_beam_keeps_power_and_its_adjoint_is_one():
     beam = BeamOperator(SHAPE, SIGMA)
     rng = np.random.default_rng(1)
