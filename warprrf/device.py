@@ -217,7 +217,7 @@ def launch(
     whole = wp.launch(
         kernel, dim=size, inputs=arguments, device=where, record_tape=False, record_cmd=True, **extra
     )
-    _issue(_cut(whole, bounds))
+    _issue(whole, [(low, high) for low, high in pairwise(bounds) if high > low])
 
 
 def filled(struct: Any, device: DeviceLike, **values: Any) -> Any:
@@ -235,33 +235,25 @@ def _as_taken(value: Any, kind: Any, device: wp.Device) -> Any:
     return value
 
 
-def _cut(whole: wp.Launch, bounds: Sequence[int]) -> list[wp.Launch]:
-    """A CPU launch as one for each stretch of its indices that is not empty."""
-    parts = []
-    for low, high in pairwise(bounds):
-        if high > low:
-            part = copy(whole)
-            part.params, part.fwd_args = list(whole.params), list(whole.fwd_args)
-            part.set_param_at_index(0, low)
-            part.set_dim(high - low)
-            parts.append(part)
-    return parts
-
-
-def _issue(parts: Sequence[wp.Launch]) -> None:
-    """Run the parts of a launch on all cores: the threads share an iterator, each takes the next when it is free."""
-    waiting = iter(parts)
+def _issue(whole: wp.Launch, stretches: Sequence[tuple[int, int]]) -> None:
+    """Run a CPU launch on all cores, a stretch of its indices at a time: the threads share an iterator, each takes the next
+    when it is free."""
+    waiting = iter(stretches)
 
     def work() -> None:
-        for part in waiting:
-            part.launch()
+        own = copy(whole)
+        own.params, own.fwd_args = list(whole.params), list(whole.fwd_args)
+        for low, high in waiting:
+            own.set_param_at_index(0, low)
+            own.set_dim(high - low)
+            own.launch()
 
     others: list[Future[None]] = []
     try:
         with suppress(
             RuntimeError
         ):  # the main thread has ended, and the pool with it: this thread works alone
-            for _ in range(min(threads(), len(parts)) - 1):
+            for _ in range(min(threads(), len(stretches)) - 1):
                 others.append(_pool().submit(work))
         work()
     finally:  # also after Ctrl-C: nothing that is still written to may be freed
