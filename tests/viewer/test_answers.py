@@ -164,7 +164,7 @@ def test_a_file_of_splats_is_shown_as_gaussians(tmp_path):
     splats = wr.Gaussians(
         np.eye(3), np.tile([1.0, 0, 0, 0], (count, 1)), np.ones((count, 3)), np.full(count, 0.5), np.zeros((count, 1, 3))
     )  # fmt: skip
-    splats.save_ply(tmp_path / "splats.ply")
-    found = Subject.of([tmp_path / "splats.ply"])
+    splats.save_ply(tmp_path / "splats.PLY")
+    found = Subject.of([tmp_path / "splats.PLY"])
     assert found.mesh is None
     np.testing.assert_allclose(found.gaussians.means, np.eye(3))

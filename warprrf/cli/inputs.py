@@ -19,7 +19,7 @@ import warprrf as wr
 from warprrf.checks import check_array
 from warprrf.files import read_json
 from warprrf.geometry.mesh_files import METRES, READERS, is_mesh_file
-from warprrf.geometry.ply_files import ply_columns
+from warprrf.geometry.ply_files import holds_gaussians
 from warprrf.rf.tracing.model import SETS
 from warprrf.tensor_files import named
 
@@ -363,7 +363,7 @@ def load_geometry(path: str, options: argparse.Namespace) -> Any:
     """A saved reconstruction (folder), splats (PLY, optionally with a mesh), a scene (XML) or a mesh file, which is a scene
     where materials are given."""
     source, mesh = existing(path), options.mesh
-    splats = source.suffix.lower() == ".ply" and "scale_0" in ply_columns(source).get("vertex", ())
+    splats = holds_gaussians(source)
     if options.materials is not None and (source.is_dir() or splats):
         raise ValueError(f"--materials: {source} names no materials, expected a scene (.xml) or a mesh file")
     if source.is_dir():

@@ -587,6 +587,13 @@ def face_neighbours(faces: np.ndarray) -> np.ndarray:
     return across.reshape(-1, 3)
 
 
+def joined(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> Mesh:
+    """One mesh of vertices ``(V, 3)`` and faces ``(F, 3)`` of each part, in their order; nothing is welded."""
+    first = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    faces = [faces + start for (_, faces), start in zip(parts, first, strict=False)]
+    return Mesh(np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces))
+
+
 def connected_pieces(mesh: Mesh, label: np.ndarray) -> np.ndarray:
     """Numbers of the connected pieces of faces that share a label, shape ``(F,)``; a face labelled -1 is a piece."""
     ring = face_neighbours(mesh.faces)

@@ -69,13 +69,15 @@ def read_ply(path: str | os.PathLike[str]) -> dict[str, Element]:
         raise ValueError(f"{os.fspath(path)}: {error}") from error
 
 
-def ply_columns(path: str | os.PathLike[str]) -> dict[str, list[str]]:
-    """Names of the columns of each element that the header of a PLY file states.
+def holds_gaussians(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is a PLY whose header states Gaussians, which have scales.
 
     Raises:
         OSError: naming the file, if it cannot be read.
-        ValueError: naming it, if it is no PLY file.
+        ValueError: naming it, if it ends in ``.ply`` and is no PLY file.
     """
+    if Path(path).suffix.lower() != ".ply" or Path(path).is_dir():
+        return False
     with Path(path).open("rb") as file:
         data = file.read(_LONGEST_HEADER)
     end = data.find(b"\n" + _END)
@@ -85,7 +87,7 @@ def ply_columns(path: str | os.PathLike[str]) -> dict[str, list[str]]:
         stated = _header(data[:end].decode("ascii", "replace"))[1]
     except ValueError as error:
         raise ValueError(f"{os.fspath(path)}: {error}") from error
-    return {element.name: [name for name, _, _ in element.columns] for element in stated}
+    return any(e.name == "vertex" and "scale_0" in [name for name, _, _ in e.columns] for e in stated)
 
 
 def write_ply(

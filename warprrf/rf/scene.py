@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from warprrf.checks import NotNegative, check_array, check_arrays, check_items, check_type, checked, index_to
 from warprrf.device import DeviceLike
-from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.mesh import Mesh, joined
 from warprrf.geometry.mesh_files import MeshOptions, is_mesh_file
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.materials import Material
@@ -175,14 +175,10 @@ class Scene:
     @classmethod
     def _of_parts(cls, parts: Sequence[ScenePart], **options: Any) -> Scene:
         counts = [len(part.faces) for part in parts]
-        starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
         materials = list({id(part.material): part.material for part in parts}.values())
         index = {id(material): k for k, material in enumerate(materials)}
         return cls(
-            Mesh(
-                np.concatenate([part.vertices for part in parts]),
-                np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)]),
-            ),
+            joined([(part.vertices, part.faces) for part in parts]),
             materials,
             np.repeat([index[id(part.material)] for part in parts], counts),
             face_object=np.repeat(np.arange(len(parts)), counts),

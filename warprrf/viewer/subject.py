@@ -12,7 +12,7 @@ import numpy as np
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import is_mesh_file
-from warprrf.geometry.ply_files import ply_columns
+from warprrf.geometry.ply_files import holds_gaussians
 from warprrf.geometry.reconstruction import FILE as RECONSTRUCTION_FILE
 from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.geometry.splats.camera import Camera
@@ -142,9 +142,9 @@ def _opened(path: Path) -> list[Any]:
         return _folder(path)
     if not path.is_file():
         raise ValueError(f"things: {path}: no such file or folder")
-    if path.suffix == ".ply" and "opacity" in ply_columns(path).get("vertex", ()):
+    if holds_gaussians(path):
         return [Gaussians.load_ply(path)]
-    kind: Any = _FILES.get(path.suffix, Mesh if is_mesh_file(path) else None)
+    kind: Any = _FILES.get(path.suffix.lower(), Mesh if is_mesh_file(path) else None)
     if kind is None:
         raise ValueError(f"things: {path}: got a file of another kind, expected {KINDS}")
     return [kind.load(path)]

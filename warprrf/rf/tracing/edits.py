@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
+from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh, joined
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.rf.tracing.surface import (
     LARGEST_FACE,
@@ -122,8 +122,7 @@ def edited(surface: Surface, room: Room, **slabs: np.ndarray) -> tuple[Surface, 
 
 def _first_at_place(s: Surface, mesh: Mesh) -> np.ndarray:
     """Of the faces of ``s`` and of ``mesh``, one after the other, the first with the same corners."""
-    vertices = np.concatenate([s.mesh.vertices, mesh.vertices])
-    return Mesh(vertices, np.concatenate([s.mesh.faces, mesh.faces + len(s.mesh.vertices)])).first_at_place
+    return joined([(part.vertices, part.faces) for part in (s.mesh, mesh)]).first_at_place
 
 
 def _renumbered(index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

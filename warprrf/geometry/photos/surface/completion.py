@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from warprrf.geometry.mesh import Mesh, connected_pieces
+from warprrf.geometry.mesh import Mesh, connected_pieces, joined
 from warprrf.geometry.photos.gaussians.cells import BEHIND_M, plane_mesh, with_cells
 from warprrf.geometry.photos.posed.photo_files import spread
 from warprrf.geometry.photos.surface.boxes import (
@@ -138,11 +138,7 @@ def _without_gaps(patches: PlanarPatches, cameras: Sequence[Camera]) -> PlanarPa
         if squares is not None:
             meshes.append(squares)
             labels.append(np.full(len(squares.faces), k, dtype=np.int32))
-    first = np.cumsum([0, *(len(part.vertices) for part in meshes)])
-    whole = Mesh(
-        np.concatenate([part.vertices for part in meshes]),
-        np.concatenate([part.faces + start for part, start in zip(meshes, first, strict=False)]),
-    )
+    whole = joined([(part.vertices, part.faces) for part in meshes])
     return PlanarPatches.from_planes(
         whole, np.concatenate(labels), patches.normal, patches.offset, tolerance_m=patches.tolerance_m
     )
