@@ -71,10 +71,10 @@ STALE: set[str] = set()
 def test_result_files_say_which_code_made_them_and_whether_it_is_todays():
     depends = tables.common.DEPENDS
     files = {p.stem: json.loads(p.read_text()) for p in tables.common.FOLDER.glob("*.json")}
-    kinds = {"gpu" if name.startswith("gpu") else name for name in files}
+    kinds = {tables.common.kind_of(name) for name in files}
     assert kinds == {*depends, "paper", "published", "measured_flat_noise", "measured_office_noise"}
     for name, found in files.items():
-        kind = "gpu" if name.startswith("gpu") else name
+        kind = tables.common.kind_of(name)
         if kind in depends:
             assert found["machine"]["commit"] and set(depends[kind]) <= set(found["machine"]["computes"])
     assert {name for name in files if tables.common.older(name)} == STALE

@@ -101,11 +101,15 @@ def show(value: Any, form: str = "{:.1f}") -> str:
     return "" if value is None else form.format(value)
 
 
+def kind_of(name: str) -> str:
+    """The kind of a result file: of ``gpu-CARD`` it is ``gpu``, of ``filmed-ROOM`` ``filmed``."""
+    return name.partition("-")[0]
+
+
 def older(name: str) -> list[str]:
     """What the code computes otherwise today than when a result file was made: of :data:`VERSIONS` those that it depends on."""
     then = read(name).get("machine", {}).get("computes", {})
-    kind = "gpu" if name.startswith("gpu") else name
-    return [what for what in DEPENDS.get(kind, ()) if then.get(what) != VERSIONS[what]]
+    return [what for what in DEPENDS.get(kind_of(name), ()) if then.get(what) != VERSIONS[what]]
 
 
 def _machine(name: str) -> str:

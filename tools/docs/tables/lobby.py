@@ -187,37 +187,31 @@ def _transmitter() -> str:
     return markdown(head, lines)
 
 
+FILMS = {"filmed": "kitchen", "filmed-cafe": "café"}
+
+
 @entry("filmed")
 def _filmed() -> str:
-    found = read("filmed")
-    rows = {
-        "distance": "mesh to reference", "back": "reference to mesh", "laid_on_distance": "mesh to reference, aligned by surface",
-        "laid_on_back": "reference to mesh, aligned by surface", "other_frames_distance": "depth frames in between to reference",
-    }  # fmt: skip
-
-    def normals(key: str) -> str:
-        turned = found.get(key.replace("distance", "normal_median_deg")) if key.endswith("distance") else None
-        return "" if turned is None else f"{turned:.1f}"
-
-    lines = [
-        [
-            name,
-            *(f"{100 * found[f'{key}_{part}_m']:.1f}" for part in ("median", "p90")),
-            f"{100 * found[f'{key}_within_5_cm']:.0f} %",
-            normals(key),
-        ]
-        for key, name in rows.items()
-    ]
-    head = "distance", "median [cm]", "90th percentile [cm]", "within 5 cm", "normals, median [degrees]"
-    off = f"Camera positions differ from the reference's by {100 * found['camera_rms_m']:.0f} cm rms."
-    if field := found.get("field"):
-        psnr = [f"{field[name]['psnr_db']:.1f}" for name in ("reference", "other_frames", "mesh")]
-        off += (
-            f" A field fitted to {field['train']} of Sionna RT's spectra on the reference at 60 GHz has, at {field['test']} other "
-            f"places, a PSNR of {psnr[0]} dB on the reference, {psnr[1]} dB on a mesh of the depth frames in between, and "
-            f"{psnr[2]} dB on our mesh."
-        )
-    return f"{markdown(head, lines)}\n\n{off}"
+    lines = []
+    for name, room in FILMS.items():
+        found = read(name)
+        field = found["field"]
+        ours, other = (
+            [
+                f"{100 * found[f'{mesh}_distance_median_m']:.1f}", f"{100 * found[f'{mesh}_distance_p90_m']:.1f}",
+                f"{found[f'{mesh}_f_5_cm']:.2f}", f"{found[f'{mesh}_normal_median_deg']:.1f}",
+                f"{1 - found[f'{mesh}_covered']:.0%}", f"{field[fitted]['psnr_db']:.1f}",
+            ]
+            for mesh, fitted in (("laid_on", "mesh"), ("other_frames", "other_frames"))
+        )  # fmt: skip
+        posed = f"{found['posed']} of {found['frames']}"
+        lines.append([room, posed, *ours, f"{field['reference']['psnr_db']:.1f}"])
+        lines.append([f"{room}, depth frames in between", "", *other, ""])
+    head = (
+        "film", "photos posed", "median [cm]", "90th percentile [cm]", "F at 5 cm", "normals, median [degrees]", "holes",
+        "field on this mesh: PSNR [dB]", "on the reference: PSNR [dB]",
+    )  # fmt: skip
+    return markdown(head, lines)
 
 
 ROOMS = {
