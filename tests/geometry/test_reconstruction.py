@@ -1,5 +1,6 @@
 """From photos to geometry: initial Gaussians, resumed runs, files."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -111,6 +112,21 @@ def test_a_killed_run_continues_to_the_same_result(whole, monkeypatch):
     assert steps(told) == {"surface"}  # depth maps were kept
     np.testing.assert_array_equal(resumed.gaussians.means, rec.gaussians.means)
     np.testing.assert_array_equal(resumed.mesh.vertices, rec.mesh.vertices)
+
+
+def test_a_workspace_that_was_moved_is_continued_though_its_folder_is_named(whole, tmp_path, monkeypatch):
+    moved, posed = tmp_path / "moved", from_photos.sfm.structure_from_motion
+    shutil.copytree(whole[0], moved)
+
+    def in_pieces(photos, *, workspace, **options):
+        said = f"poses={workspace}/sfm/model-2 gives that"
+        return replace(
+            posed(photos, workspace=workspace, **options), causes={"far.jpg": said}, guessed=(said,)
+        )
+
+    monkeypatch.setattr(from_photos.sfm, "structure_from_motion", in_pieces)
+    rec, told = made(moved)
+    assert steps(told) == set() and rec.causes == {"far.jpg": f"poses={moved}/sfm/model-2 gives that"}
 
 
 def test_a_changed_setting_is_not_served_from_the_old_run(whole):

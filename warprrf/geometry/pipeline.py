@@ -297,7 +297,8 @@ def _steps(
         config.gaussians,
         seed,
     ]
-    first = _kept(steps, "initial", initial, [sparse, list(fitted), masks, *settings])
+    computed = replace(sparse, causes={}, guessed=())  # without words, which name folders
+    first = _kept(steps, "initial", initial, [computed, list(fitted), masks, *settings])
     planes = to_planes(first)
     gaussians = to_gaussians(_kept(steps, "refined", refined, [steps.key("initial"), config.refine]))
     inputs: list[Any] = [steps.key("refined"), config.surface, config.completion]
