@@ -241,6 +241,8 @@ def test_surveyed_cameras_bring_a_reconstruction_into_their_frame(seen):
 
 
 def test_plane_axes_are_a_right_handed_frame():
-    for normal in np.vstack([np.eye(3), -np.eye(3), [[0.6, 0, 0.8]]]):
-        first, second = plane_axes(normal)
+    normals = np.vstack([np.eye(3), -np.eye(3), [[0.6, 0, 0.8]]])
+    for normal, (first, second) in zip(normals, plane_axes(normals), strict=True):
+        np.testing.assert_array_equal(plane_axes(normal), [first, second])
         np.testing.assert_allclose(np.cross(first, second), normal, atol=1e-12)
+        assert first[2] == 0 or abs(normal[2]) > 0.99

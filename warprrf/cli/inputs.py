@@ -55,7 +55,7 @@ def read_positions(path: str | os.PathLike[str]) -> dict[str, tuple[float, float
     """`{file: (x, y, z)}` from JSON of that form or CSV rows `file,x,y,z`; metres."""
     path = existing(path)
     try:
-        if path.suffix == ".json":
+        if path.suffix.lower() == ".json":
             rows = [(name, *position) for name, position in read_json(path).items()]
         else:
             with path.open(newline="", encoding="utf-8-sig") as lines:
@@ -293,7 +293,7 @@ def refuse(args: argparse.Namespace, flags: Sequence[str], reason: str) -> None:
 def read_rows(path: Path, what: str, columns: int) -> np.ndarray:
     """Rows of ``columns`` numbers of a CSV or NPY file; a line of names and comments are left out."""
     with named(path, f"expected {what}"):
-        if path.suffix == ".npy":
+        if path.suffix.lower() == ".npy":
             found = np.load(path, mmap_mode="r", allow_pickle=False)
         else:
             lines = [re.split("[#x]", line)[0] for line in path.read_text("utf-8-sig").splitlines()]
@@ -372,7 +372,7 @@ def load_geometry(path: str, options: argparse.Namespace) -> Any:
         return wr.Reconstruction.from_files(source, mesh=None if mesh is None else _load_mesh(mesh, options))
     if mesh is not None:
         raise ValueError(f"--mesh: {source} has surfaces itself, expected splats (.ply) with --mesh")
-    if source.suffix == ".xml" or options.materials is not None:
+    if source.suffix.lower() == ".xml" or options.materials is not None:
         return load_scene(source, options)
     if not is_mesh_file(source):
         raise ValueError(

@@ -402,7 +402,7 @@ def _suggest(args: argparse.Namespace, out: Output) -> None:
         arrival = np.radians(np.column_stack([90.0 - pointings[:, 4], pointings[:, 3]]))
     if args.receive_pattern is not None:
         turned = {"arrival": arrival, "receive_pattern": read_pattern(args.receive_pattern)}
-    if source.suffix == ".safetensors":
+    if source.suffix.lower() == ".safetensors":
         own = ("transmitter", "mesh", "unit", "up", "simplify", "materials")
         refuse(args, own, f"{source} is a field, which has its own")
         field = load_field(source, args)
@@ -565,7 +565,7 @@ def _relevance(args: argparse.Namespace, out: Output) -> None:
     check_count("--most", args.most)
     if len(receivers) > args.most:
         receivers = receivers[np.random.default_rng(args.seed).permutation(len(receivers))[: args.most]]
-    if source.suffix == ".safetensors":
+    if source.suffix.lower() == ".safetensors":
         own = ("mesh", "unit", "up", "simplify", "materials")
         refuse(args, own, f"{source} is a field, which has its own")
         geometry = load_field(source, args)

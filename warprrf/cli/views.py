@@ -65,7 +65,7 @@ def _render(args: argparse.Namespace, out: Output) -> None:
       warprrf render room/geometry.ply --position 2 2 1.6 --look-at 8 6 1.2 -o view.png
     """
     source = existing(args.source)
-    if source.suffix == ".safetensors":
+    if source.suffix.lower() == ".safetensors":
         if args.receiver is None:
             raise ValueError("--receiver: none given, expected three coordinates in metres for a radio field")
         field, place = load_field(source, args), np.array(args.receiver, dtype=np.float64)
@@ -104,10 +104,10 @@ def _array_spectrum(field: Any, place: np.ndarray, args: argparse.Namespace) -> 
 
 
 def _write_spectrum(spectrum: wr.Spectrum, path: Path) -> None:
-    if path.suffix == ".npz":
+    if path.suffix.lower() == ".npz":
         arrays = {"path_gain": spectrum.path_gain, "delay_s": spectrum.delay_s, "aod": spectrum.aod}
         write_arrays(path, {name: array for name, array in arrays.items() if array is not None})
-    elif path.suffix == ".png":
+    elif path.suffix.lower() == ".png":
         figure = require("matplotlib.figure", extra="plots").Figure(figsize=(8.0, 4.2), layout="constrained")
         spectrum.plot(ax=figure.add_subplot())
         write_atomically(path, lambda name: figure.savefig(name, dpi=130))
@@ -213,7 +213,7 @@ def _map(args: argparse.Namespace, out: Output) -> None:
       warprrf map field.safetensors -o corner.png --bounds 0 0 5 4 --cell 0.1 --transmitter 2 3 3.2
     """
     path = Path(args.out)
-    if path.suffix not in (".nc", ".png"):
+    if path.suffix.lower() not in (".nc", ".png"):
         raise ValueError(f"{path}: expected .nc (NetCDF, a picture beside it) or .png (the picture alone)")
     field = load_field(args.field, args)
     found = field.radio_map(
@@ -229,8 +229,8 @@ def _map(args: argparse.Namespace, out: Output) -> None:
         mirror_order=args.mirror_order,
         progress=out,
     )
-    files = [path] if path.suffix == ".png" else [path, path.with_suffix(".png")]
-    if path.suffix == ".nc":
+    files = [path] if path.suffix.lower() == ".png" else [path, path.with_suffix(".png")]
+    if path.suffix.lower() == ".nc":
         found.save(path)
     found.picture(files[-1])
     gain, snr = (found.plot_values(name)[found.free] for name in ("total_path_gain", "best_beam_snr_db"))

@@ -146,12 +146,13 @@ class Plane:
 
 
 def plane_axes(normal: np.ndarray) -> np.ndarray:
-    """Two unit vectors in the plane, shape ``(2, 3)``: the first horizontal (along x for a level plane)."""
+    """Two unit vectors in each plane of unit ``normal`` (..., 3), shape ``(..., 2, 3)``: the first horizontal, along x for level
+    planes."""
     first = np.cross([0.0, 0.0, 1.0], normal)
-    if np.linalg.norm(first) < 0.1:
-        first = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(normal, first)])
+    level = np.linalg.norm(first, axis=-1, keepdims=True) < 0.1
+    first = np.where(level, np.array([1.0, 0.0, 0.0]) - normal[..., :1] * normal, first)
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    return np.stack([first, np.cross(normal, first)], axis=-2)
 
 
 def dilate(mask: np.ndarray, steps: int) -> np.ndarray:

@@ -69,8 +69,7 @@ def initial_gaussians(
 
 def discs(centres: np.ndarray, normals: np.ndarray, radius: np.ndarray, colors: np.ndarray) -> Gaussians:
     """Flat discs of degree 0: centres and unit normals ``(N, 3)``, radii ``(N,)`` [m], colours ``(N, 3)`` in [0, 1]."""
-    kinds, which = np.unique(normals, axis=0, return_inverse=True)
-    axes = np.array([plane_axes(n) for n in kinds])[which.ravel()]
+    axes = plane_axes(normals)
     rotation = np.stack([axes[:, 0], axes[:, 1], normals], axis=2)
     # 0.05: thickness over radius
     scales = np.stack([radius, radius, np.maximum(0.05 * radius, 1e-4)], axis=1)
