@@ -65,7 +65,13 @@ def test_committed_notebook_is_its_text(source):
     assert source.with_suffix(".ipynb").stat().st_size < MAX_BYTES
 
 
-@pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "source",
+    [
+        pytest.param(p, marks=[pytest.mark.long] * p.stem.startswith(("02", "03")), id=p.stem)
+        for p in NOTEBOOKS
+    ],
+)
 def test_notebook_runs(source, tmp_path):
     nbclient = pytest.importorskip("nbclient")
     text, surveyed = source.read_text(), tmp_path / "surveyed.json"

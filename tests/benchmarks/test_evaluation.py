@@ -39,6 +39,7 @@ def carried_out(found):
     return [(row["truth"], row["method"], row["count"]) for row in unpacked(found)]
 
 
+@pytest.mark.long
 def test_every_method_has_a_run_and_what_others_are_given_is_what_ours_took(data, tmp_path):
     pytest.importorskip("sionna.rt", reason="Sionna RT is an extra", exc_type=ImportError)
     methods = tuple(m for m in METHODS if m != "sionna-again")

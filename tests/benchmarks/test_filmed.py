@@ -111,6 +111,7 @@ def test_free_places_are_seen_through_and_off_the_walls(reference, monkeypatch):
     assert not len(film.free(surface, 12))  # two frames prove nothing
 
 
+@pytest.mark.long
 def test_a_field_on_a_moved_mesh_is_worse_than_on_the_reference(reference, tmp_path, monkeypatch):
     film, surface = reference
     for name, value in {"ENGINE": "exact", "SHAPE": (18, 36), "TRAINING": 4, "GRID_M": 0.2}.items():

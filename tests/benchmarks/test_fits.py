@@ -1,5 +1,6 @@
 """Experiments are rows of fits: whole once on a small room."""
 
+import pytest
 from small_room import small_room
 
 import warprrf as wr
@@ -9,6 +10,7 @@ from benchmarks.runner import Job, execute
 LEFT_OUT = ("no mirrors", "no scattering")
 
 
+@pytest.mark.long
 def test_every_part_is_worth_something_and_delays_are_right(tmp_path, monkeypatch):
     (tmp_path / "room").mkdir()
     room = small_room(tmp_path / "room")

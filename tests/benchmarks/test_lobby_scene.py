@@ -25,6 +25,7 @@ def test_the_air_has_the_volume_of_the_room_less_its_furniture(lobby_scene):
     assert share == pytest.approx(1 - solid_volume / float(np.prod(ROOM[1] - ROOM[0])), abs=0.008)
 
 
+@pytest.mark.long
 def test_the_committed_files_are_what_the_script_builds(tmp_path):
     images = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
     assert build(tmp_path).read_text() == (LOBBY / "scene.xml").read_text()

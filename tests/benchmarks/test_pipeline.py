@@ -86,6 +86,7 @@ def test_report_holds_every_figure_and_its_page_needs_no_other_file(finished):
     assert "v9.jpg: shows 3 features" in text and "<td>bistatic (ours), 2 spectra</td>" in text
 
 
+@pytest.mark.long
 def test_second_run_computes_nothing_and_a_killed_one_ends_with_the_same_figures(
     finished, data, tmp_path, monkeypatch
 ):

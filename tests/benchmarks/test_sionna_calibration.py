@@ -15,6 +15,7 @@ from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
 from warprrf.rf.paths.sionna import by_delay
 
 
+@pytest.mark.long
 def test_calibration_lowers_the_error_and_finds_what_scatters(tmp_path, monkeypatch):
     folder = small_room(tmp_path)
     train = wr.SpectrumDataset.load(folder / "spectra.nc").split(4)[0]
