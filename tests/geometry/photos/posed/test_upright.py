@@ -12,7 +12,6 @@ from warprrf.geometry.photos.posed import sparse
 from warprrf.geometry.photos.posed.photo_files import read_photo
 from warprrf.geometry.photos.posed.upright import held_up, upright, vertical_of_edges
 
-pytest.importorskip("skimage")
 EMPTY = np.zeros(0, dtype=np.int64)
 
 

@@ -14,8 +14,8 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from warprrf.device import require
 from warprrf.geometry.mesh_files import UP
+from warprrf.geometry.photos.posed.images import block_means
 from warprrf.geometry.photos.posed.photo_files import spread
 from warprrf.geometry.photos.posed.sparse import SparseModel, clean_points, detect_room_planes, transformed
 from warprrf.geometry.planes import Plane, PlaneConfig
@@ -108,8 +108,7 @@ def _edge_planes(photo: np.ndarray, camera: Camera) -> np.ndarray:
     """Unit normals in the world of the planes that a photo's straight edges span with its centre, shape ``(E, 3)``."""
     edge_pixels = 480  # about the longer side of a photo while its edges are looked for
     step = max(1, round(max(photo.shape[:2]) / edge_pixels))
-    grey = require("skimage.measure", extra="photos").block_reduce(photo.mean(axis=2), step, np.mean)
-    grey = ndimage.gaussian_filter(grey[: photo.shape[0] // step, : photo.shape[1] // step], 0.8)
+    grey = ndimage.gaussian_filter(block_means(photo.mean(axis=2), step), 0.8)
     gy, gx = (ndimage.sobel(grey, axis) / 8 for axis in (0, 1))
     xx, xy, yy = (ndimage.gaussian_filter(product, 2.0) for product in (gx * gx, gx * gy, gy * gy))
     spread = np.hypot(xx - yy, 2 * xy)
