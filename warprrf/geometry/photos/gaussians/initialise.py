@@ -52,7 +52,7 @@ def initial_gaussians(
     free = np.ones(len(points), dtype=bool)
     for plane in planes:
         # 0.02: a sparse point this close to an occupied cell gives way to the plane's own discs
-        free &= ~((np.abs(plane.distance(points)) < 0.02) & plane.covers(points))
+        free &= ~plane.holds(points, 0.02)
     min_scale, max_scale = 0.004, 0.12  # of a disc on a sparse point [m]
     gap = cKDTree(points).query(points[free], k=4)[0][:, 1:]  # infinite where there are fewer
     radius = np.clip(gap.mean(axis=1), min_scale, max_scale)

@@ -356,9 +356,7 @@ def _agreed(
     hits = np.concatenate(found)
     if not len(hits):
         return []
-    empty = Plane(
-        side * np.eye(3)[axis], side * height, np.zeros(0, dtype=np.int64), cell_m=CELL_M, plain=True
-    )
+    empty = Plane(side * np.eye(3)[axis], side * height, cell_m=CELL_M, plain=True)
     uv = empty.to_plane(hits)
     edges = empty.to_plane(bounds)  # a surface ends where its edges do
     low = np.maximum(uv.min(axis=0), edges.min(axis=0) - CELL_M)

@@ -165,8 +165,8 @@ def level_planes(
     normal = np.array([0.0, 0.0, 1.0 if up else -1.0])
     shape = np.ceil(np.abs(plane_axes(normal)[:, :2] @ (high - low)[:2]) / cell_m).astype(int) + 1
     corner = np.minimum(plane_axes(normal)[:, :2] @ low[:2], plane_axes(normal)[:, :2] @ high[:2])
-    nothing = np.zeros(0, dtype=np.int64)
-    whole = Plane(normal, 0.0, nothing, FINE_M, corner, cell_m, np.ones(shape, dtype=bool))
+    everywhere = np.ones(shape, dtype=bool)
+    whole = Plane(normal, 0.0, rms_m=FINE_M, corner=corner, cell_m=cell_m, occupied=everywhere)
     surface = plane_mesh(planes)
     agreement = _swept(whole, levels, surface, photos)
     peak = _peaks(agreement, AGREES) & ~_known(whole, levels, planes)
@@ -228,8 +228,7 @@ def _known(whole: Plane, levels: np.ndarray, planes: Sequence[Plane]) -> np.ndar
         if plane.normal @ whole.normal > 0.99:
             for k, z in enumerate(levels):
                 cells[:, 2] = z
-                near = (np.abs(plane.distance(cells)) < 0.05) & plane.covers(cells)
-                known[k] |= near.reshape(whole.occupied.shape)
+                known[k] |= plane.holds(cells, 0.05).reshape(whole.occupied.shape)
     return known
 
 

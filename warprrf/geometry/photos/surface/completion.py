@@ -146,7 +146,7 @@ def _without_gaps(patches: PlanarPatches, cameras: Sequence[Camera]) -> PlanarPa
 
 def _gaps(patches: PlanarPatches, k: int, points: np.ndarray) -> Plane:
     """The plane of patch ``k``, on whose faces ``points`` lie, with the cells of its gaps."""
-    plane = Plane(patches.normal[k], float(patches.offset[k]), np.zeros(0, dtype=np.int64), cell_m=CELL_M)
+    plane = Plane(patches.normal[k], float(patches.offset[k]), cell_m=CELL_M)
     uv = plane.to_plane(points)
     gap_m = 2.0  # gaps narrower than this are closed
     reach = 0.5 * gap_m / CELL_M

@@ -99,8 +99,7 @@ def _sure(
     points = view.position + depth[rest][:, None] * view.directions()[rest]
     held = np.zeros(len(points), dtype=bool)
     for plane in planes:
-        near = np.abs(plane.distance(points)) < reach_m
-        held[near] |= plane.covers(points[near])
+        held |= plane.holds(points, reach_m)
     result = depth.copy()
     result[rest] = np.where(held, depth[rest], 0.0)
     return result
