@@ -128,16 +128,8 @@ class Camera:
     def resized(self, width: Count, height: Count) -> Camera:
         """The same view at another resolution; pinhole intrinsics scale along."""
         sx, sy = width / self.width, height / self.height
-        return Camera(
-            self.kind,
-            width,
-            height,
-            self.world_to_camera,
-            self.fx * sx,
-            self.fy * sy,
-            self.cx * sx,
-            self.cy * sy,
-        )
+        fx, fy, cx, cy = self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy
+        return replace(self, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
     def transformed(
         self, *, scale: float = 1.0, rotation: ArrayLike | None = None, shift: ArrayLike = (0.0, 0.0, 0.0)

@@ -37,7 +37,7 @@ def lobby():
 def lost(lobby):
     """The same in units and axes of their own."""
     turn = np.linalg.qr(np.random.default_rng(3).standard_normal((3, 3)))[0]
-    return sparse.transformed(lobby, 0.13, turn * np.linalg.det(turn), np.array([3.0, -2.0, 1.0]))
+    return lobby.transformed(scale=0.13, rotation=turn * np.linalg.det(turn), shift=[3.0, -2.0, 1.0])
 
 
 def read(name):

@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from warprrf.checks import check_array, check_positive
+from warprrf.checks import check_array, check_positive, check_similarity
 from warprrf.geometry.photos.posed.photo_files import match_names, some
 from warprrf.geometry.photos.posed.undistort import Lens
 from warprrf.geometry.planes import Plane, PlaneConfig, detect_planes
@@ -86,6 +87,18 @@ class SparseModel:
             track_camera=self.track_camera[seen],
         )
 
+    def transformed(
+        self, *, scale: float = 1.0, rotation: ArrayLike | None = None, shift: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> SparseModel:
+        """The model with every point ``x`` at ``scale rotation x + shift``; cameras move along.
+
+        Arguments and errors: see :func:`warprrf.checks.check_similarity`.
+        """
+        scale, turn, moved = check_similarity(scale, rotation, shift)
+        how: dict[str, Any] = {"scale": scale, "rotation": turn, "shift": moved}
+        cameras = {name: camera.transformed(**how) for name, camera in self.cameras.items()}
+        return replace(self, cameras=cameras, points=scale * self.points @ turn.T + moved)
+
 
 def posed_in_words(sparse: SparseModel) -> str:
     """How many photos were posed, between which more are missing, and which are in no piece; empty where all were posed."""
@@ -120,7 +133,7 @@ def align_to_known(sparse: SparseModel, known_positions: Mapping[str, ArrayLike]
             photo that could not be posed.
     """
     scale, rotation, shift, rms_m = known_similarity(sparse.cameras, sparse.unposed, known_positions)
-    moved = transformed(sparse, scale, rotation, shift)
+    moved = sparse.transformed(scale=scale, rotation=rotation, shift=shift)
     return replace(moved, metric=True, upright=True, scale_rms_m=rms_m)
 
 
@@ -192,7 +205,7 @@ def scaled(sparse: SparseModel, scale: Scale) -> SparseModel:
                 f"scale: {scale[0]} and {scale[1]} were taken at one place; name two photos that are far apart"
             )
         scale = scale[2] / gap
-    return replace(transformed(sparse, scale, np.eye(3), np.zeros(3)), metric=True)
+    return replace(sparse.transformed(scale=scale), metric=True)
 
 
 def assume_scale(sparse: SparseModel) -> SparseModel:
@@ -203,8 +216,7 @@ def assume_scale(sparse: SparseModel) -> SparseModel:
     assumed_distance_m = 3.0
     scale = assumed_distance_m / float(np.median(gap)) if len(gap) else 1.0
     said = f"scale: nobody measured one; the median distance that photos look is taken for {assumed_distance_m:g} m"
-    moved = transformed(sparse, scale, np.eye(3), np.zeros(3))
-    return replace(moved, guessed=(*sparse.guessed, said))
+    return replace(sparse.transformed(scale=scale), guessed=(*sparse.guessed, said))
 
 
 def fit_similarity(source: ArrayLike, target: ArrayLike) -> tuple[float, np.ndarray, np.ndarray]:
@@ -232,15 +244,6 @@ def fit_similarity(source: ArrayLike, target: ArrayLike) -> tuple[float, np.ndar
     rotation = (u * sign) @ vt
     scale = float((d * sign).sum() / (a**2).sum())
     return scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
-
-
-def transformed(sparse: SparseModel, scale: float, rotation: np.ndarray, shift: np.ndarray) -> SparseModel:
-    """``sparse`` with every point ``x`` at ``scale rotation x + shift``; cameras move along."""
-    cameras = {
-        name: camera.transformed(scale=scale, rotation=rotation, shift=shift)
-        for name, camera in sparse.cameras.items()
-    }
-    return replace(sparse, cameras=cameras, points=scale * sparse.points @ rotation.T + shift)
 
 
 NEIGHBOURS = 16  # that a point is compared with

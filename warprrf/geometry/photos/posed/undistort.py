@@ -67,6 +67,12 @@ class Lens:
         """Whether photos need no undistorting."""
         return not any(self.coefficients)
 
+    def resized(self, width: Count, height: Count) -> Lens:
+        """The lens of photos of another size that show the same."""
+        sx, sy = width / self.width, height / self.height
+        fx, fy, cx, cy = self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy
+        return replace(self, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+
 
 def pinhole_of(lens: Lens, world_to_camera: ArrayLike, turns: int, max_pixels: int) -> Camera:
     """The pinhole camera of the undistorted, upright, reduced photo.
@@ -152,10 +158,7 @@ def _reduced(lens: Lens, max_pixels: int) -> Lens:
     share = (max_pixels / (whole.width * whole.height)) ** 0.5
     if share >= 1:
         return lens
-    width, height = max(int(lens.width * share), 1), max(int(lens.height * share), 1)
-    sx, sy = width / lens.width, height / lens.height
-    fx, fy, cx, cy = lens.fx * sx, lens.fy * sy, lens.cx * sx, lens.cy * sy
-    return replace(lens, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+    return lens.resized(max(int(lens.width * share), 1), max(int(lens.height * share), 1))
 
 
 def _undistorted(lens: Lens) -> Lens:

@@ -17,7 +17,7 @@ from scipy import ndimage
 from warprrf.geometry.mesh_files import UP
 from warprrf.geometry.photos.posed.images import block_means
 from warprrf.geometry.photos.posed.photo_files import spread
-from warprrf.geometry.photos.posed.sparse import SparseModel, clean_points, detect_room_planes, transformed
+from warprrf.geometry.photos.posed.sparse import SparseModel, clean_points, detect_room_planes
 from warprrf.geometry.planes import Plane, PlaneConfig
 from warprrf.geometry.splats.camera import Camera
 
@@ -56,14 +56,15 @@ def upright(sparse: SparseModel, photo: Callable[[str], np.ndarray], *, seed: in
     rotation = np.stack([ahead, np.cross(up, ahead), up])
     shift = -rotation @ np.mean([c.position for c in cameras], axis=0)
     shift[2] = -height
-    return replace(transformed(sparse, 1.0, rotation, shift), upright=True, guessed=tuple(guessed))
+    moved = sparse.transformed(rotation=rotation, shift=shift)
+    return replace(moved, upright=True, guessed=tuple(guessed))
 
 
 def turned(sparse: SparseModel, up: str) -> SparseModel:
     """``sparse`` with the axis ``up`` of its own, ``"x"``, ``"y"`` or ``"z"``, as z; its origin stays."""
     axes, signs = UP[up]
     rotation = np.eye(3)[axes] * np.array(signs)[:, None]
-    return replace(transformed(sparse, 1.0, rotation, np.zeros(3)), upright=True)
+    return replace(sparse.transformed(rotation=rotation), upright=True)
 
 
 def held_up(cameras: Sequence[Camera]) -> np.ndarray:
