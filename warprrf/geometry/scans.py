@@ -16,6 +16,7 @@ from warprrf.checks import check_count, check_positive
 from warprrf.geometry.mesh import Mesh, connected_pieces, edge_pairs, face_neighbours, smoothed_normals
 from warprrf.geometry.planar_patches import PlanarPatches, vertex_noise
 from warprrf.geometry.planes import Plane, PlaneConfig, detect_planes, drawn_by_place
+from warprrf.rows import distinct_rows, group_means
 
 
 @dataclass(frozen=True)
@@ -244,10 +245,8 @@ def _gathered(patches: PlanarPatches, cell_m: float) -> np.ndarray:
     stretch = (mesh.vertices[edge] * along).sum(axis=1) / np.maximum(size, 1e-30) / cell_m
     key[edge, 2] = np.floor(stretch)
     target, chosen = np.arange(count), np.flatnonzero(movable)
-    _, group, members = np.unique(key[chosen], axis=0, return_inverse=True, return_counts=True)
-    group = group.ravel()
-    sums = [np.bincount(group, mesh.vertices[chosen, a], len(members)) for a in range(3)]
-    centre = np.stack(sums, axis=1) / members[:, None]
+    _, group, members = distinct_rows(key[chosen])
+    centre = group_means(mesh.vertices[chosen], group, members)
     gap = np.linalg.norm(mesh.vertices[chosen] - centre[group], axis=1)
     first = np.lexsort((gap, group))[np.cumsum(members) - members]
     target[chosen] = chosen[first][group]

@@ -23,6 +23,7 @@ from warprrf.geometry.photos.posed.images import GreyPhotos, PosedPhotos
 from warprrf.geometry.photos.posed.sparse import SparseModel, clean_points, detect_room_planes
 from warprrf.geometry.planes import Plane, aligned, directions, plane_axes
 from warprrf.geometry.splats.gaussians import Y00, Gaussians, quaternions_of
+from warprrf.rows import distinct_rows, group_means
 
 SPREAD = 0.65  # standard deviation of a disc in units of the spacing: little light leaks between neighbours
 
@@ -90,14 +91,9 @@ def _blocks(
         key = np.insert(np.argwhere(plane.occupied)[some] // 2, 0, k, axis=1)
         cells.append((key, fine, color.reshape(-1, 4, 3)))
     key, fine, color = (np.concatenate(c) for c in zip(*cells, strict=True))
-    _, parent, members = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-    parent, whole = parent.ravel(), len(members)
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        return np.stack([np.bincount(parent, v, whole) for v in values.T], axis=1) / members[:, None]
-
-    middle = color.mean(axis=1)
-    coarse = mean(middle)
+    _, parent, members = distinct_rows(key)
+    whole, centre, middle = len(members), fine.mean(axis=1), color.mean(axis=1)
+    coarse_centre, coarse = (group_means(of, parent, members) for of in (centre, middle))
     # To cut a block costs 3 Gaussians and removes about the variance between its parts, with a share of what lies
     # within them; the largest gains first, half of the room for either size.
     within = ((color - middle[:, None]) ** 2).sum(axis=2).mean(axis=1)
@@ -112,8 +108,8 @@ def _blocks(
     parent_plane[parent] = plane_of
     quartered = np.repeat(plane_of[cut_again], 4)
     return [
-        (mean(fine.mean(axis=1))[~cut], normal[parent_plane[~cut]], 2 * SPREAD * side[parent_plane[~cut]], coarse[~cut]),
-        (fine.mean(axis=1)[kept], normal[plane_of[kept]], SPREAD * side[plane_of[kept]], middle[kept]),
+        (coarse_centre[~cut], normal[parent_plane[~cut]], 2 * SPREAD * side[parent_plane[~cut]], coarse[~cut]),
+        (centre[kept], normal[plane_of[kept]], SPREAD * side[plane_of[kept]], middle[kept]),
         (fine[cut_again].reshape(-1, 3), normal[quartered], 0.5 * SPREAD * side[quartered],
          color[cut_again].reshape(-1, 3)),
     ]  # fmt: skip

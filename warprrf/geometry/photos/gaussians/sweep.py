@@ -21,6 +21,7 @@ from warprrf.geometry.photos.posed.images import GreyPhotos, projections
 from warprrf.geometry.planes import AROUND, Plane, dilate, plane_axes
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.photo_consistency import SIDE, patch_agreement
+from warprrf.rows import distinct_rows
 
 VIEWS = 5  # photos compared
 MIN_ANGLE_DEG = 6.0  # between any two of them, seen from the patch: without parallax every height fits
@@ -119,8 +120,9 @@ def _scored(plane: Plane, surface: Mesh | None, points: np.ndarray, photos: Grey
 
 def _blocks(plane: Plane, side: int) -> tuple[np.ndarray, np.ndarray]:
     """Middles of the blocks of ``side`` x ``side`` cells of a plane, and the block of each occupied cell."""
-    key, group = np.unique(np.argwhere(plane.occupied) // side, axis=0, return_inverse=True)
-    return plane.to_world(plane.corner + (key + 0.5) * side * plane.cell_m), group.ravel()
+    blocks = np.argwhere(plane.occupied) // side
+    first, group, _ = distinct_rows(blocks)
+    return plane.to_world(plane.corner + (blocks[first] + 0.5) * side * plane.cell_m), group
 
 
 def _rivals(this: _Scored, others: Sequence[_Scored]) -> tuple[np.ndarray, np.ndarray]:

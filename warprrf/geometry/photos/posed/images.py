@@ -35,7 +35,8 @@ class PosedPhotos:
 
     def subset(self, chosen: Sequence[int]) -> PosedPhotos:
         """The photos of these numbers."""
-        return PosedPhotos(*([part[k] for k in chosen] for part in (self.images, self.cameras, self.masks)))
+        masks = [self.masks[k] for k in chosen]
+        return PosedPhotos([self.images[k] for k in chosen], [self.cameras[k] for k in chosen], masks)
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class GreyPhotos:
         return self.flat.device
 
 
-def block_means(pixels: np.ndarray, side: int, dtype: DTypeLike = None) -> np.ndarray:
+def block_means(pixels: np.ndarray, side: int, dtype: DTypeLike | None = None) -> np.ndarray:
     """Means over squares of ``side`` pixels of an image ``(H, W)`` or ``(H, W, C)``, summed in ``dtype``; what fills no square
     at its right and lower border is left out."""
     rows, columns = pixels.shape[0] // side, pixels.shape[1] // side

@@ -25,6 +25,7 @@ import numpy as np
 
 from warprrf.checks import check_choice, check_count
 from warprrf.device import Progress, require
+from warprrf.files import folder_in_place
 from warprrf.geometry.photos.config import LENSES, ReconstructionConfig
 from warprrf.geometry.photos.posed.photo_files import (
     MIN_PHOTOS,
@@ -487,18 +488,17 @@ def _map(
         if both is not None:
             kept = [both, *(other for other in kept[1:] if other is not model)]
     pieces: list[list[str]] = []
-    for old in folder.glob("model*"):
+    for old in folder.glob("model-*"):
         shutil.rmtree(old)
     for model in kept:
         names = sorted(_names(model).difference(*pieces))
         if len(names) < MIN_PHOTOS:
             continue
-        whole = _fresh(attempt.folder / "model")
-        model.write_binary(str(whole))
-        if not pieces:
-            choose_lens(colmap, whole, lens).write_binary(str(whole))
         pieces.append(names)
-        os.replace(whole, folder / ("model" if len(pieces) == 1 else f"model-{len(pieces)}"))
+        with folder_in_place(folder / ("model" if len(pieces) == 1 else f"model-{len(pieces)}")) as whole:
+            model.write_binary(str(whole))
+            if len(pieces) == 1:
+                choose_lens(colmap, whole, lens).write_binary(str(whole))
     report("mapping", len(named), len(named))
     return {"pieces": pieces}
 
@@ -645,18 +645,16 @@ def _keep_known(
     attempt: Attempt,
 ) -> dict[str, Any]:
     """The ``model`` of known poses into the folder ``model``, its points triangulated from the matches where asked."""
-    whole = _fresh(attempt.folder / "model")
-    if match:
-        attempt.progress("triangulating", 0, 1)
-        options = colmap.IncrementalPipelineOptions(random_seed=seed, num_threads=1)
-        working = _copied(folder / "matches.db", attempt.folder / "matches.db")
-        root = _root(photos)
-        model = colmap.triangulate_points(model, working, root, whole, options=options)
-        model.extract_colors_for_all_images(str(root))
-        attempt.progress("triangulating", 1, 1)
-    model.write_binary(str(whole))
-    shutil.rmtree(folder / "model", ignore_errors=True)
-    os.replace(whole, folder / "model")
+    with folder_in_place(folder / "model") as whole:
+        if match:
+            attempt.progress("triangulating", 0, 1)
+            options = colmap.IncrementalPipelineOptions(random_seed=seed, num_threads=1)
+            working = _copied(folder / "matches.db", attempt.folder / "matches.db")
+            root = _root(photos)
+            model = colmap.triangulate_points(model, working, root, whole, options=options)
+            model.extract_colors_for_all_images(str(root))
+            attempt.progress("triangulating", 1, 1)
+        model.write_binary(str(whole))
     return {"pieces": []}
 
 

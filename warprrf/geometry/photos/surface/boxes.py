@@ -18,6 +18,7 @@ from warprrf.geometry.photos.gaussians.cells import quarters
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.planes import ALIGNED_DEG, Plane
 from warprrf.geometry.splats.camera import Camera
+from warprrf.rows import distinct_rows
 
 EXACT_DEG, STRONG_M2 = 0.1, 2.0
 """A plane this parallel, with a proven area above the second, keeps its own tilt (0.1 degrees are 2 cm over 12 m): it is
@@ -336,14 +337,13 @@ def surface_of(grid: Grid, filled: np.ndarray, tolerance_m: float) -> tuple[Plan
     node = np.unravel_index(used, nodes)
     meeting = np.stack([grid.planes[a][node[a]] for a in range(3)], axis=1)
     vertices = np.linalg.solve(meeting[..., :3], meeting[..., 3:])[..., 0]
-    kinds, which = np.unique(np.concatenate(tags), axis=0, return_inverse=True)
-    mesh = Mesh(vertices, face.reshape(-1, 3))
+    tag = np.concatenate(tags)
+    first, which, _ = distinct_rows(tag)
+    kinds, mesh = tag[first], Mesh(vertices, face.reshape(-1, 3))
     plane = np.array([sign * grid.planes[a][k] for a, k, sign in kinds])
-    patches = PlanarPatches.from_planes(
-        mesh, which.ravel(), plane[:, :3], plane[:, 3], tolerance_m=tolerance_m
-    )
+    patches = PlanarPatches.from_planes(mesh, which, plane[:, :3], plane[:, 3], tolerance_m=tolerance_m)
     known = np.array([grid.known[a][k] for a, k, _ in kinds])
-    return patches, known[which.ravel()]
+    return patches, known[which]
 
 
 def votes(
