@@ -10,15 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from warprrf.cache import cached_property
-from warprrf.checks import check_array, check_positive
+from warprrf.checks import check_array, checked, positive
 
 
+@checked
 @dataclass(frozen=True)
 class PlaneConfig:
     """How planes are found among points, and how large their cells are.
@@ -32,15 +34,12 @@ class PlaneConfig:
         margin_m: cells reach so far beyond the hull of a plane's points.
     """
 
-    distance_m: float = 0.015
+    distance_m: Annotated[float, positive("length in metres")] = 0.015
     angle_deg: float = 30.0
     min_points: float = 40
     max_planes: int = 80
     cell_m: float = 0.1
     margin_m: float = 0.12
-
-    def __post_init__(self) -> None:
-        check_positive("distance_m", self.distance_m, "length in metres")
 
     @property
     def cosine(self) -> float:

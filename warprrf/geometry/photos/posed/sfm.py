@@ -23,10 +23,9 @@ from typing import Any, cast
 
 import numpy as np
 
-from warprrf.checks import check_choice, check_count
 from warprrf.device import Progress, require
 from warprrf.files import folder_in_place
-from warprrf.geometry.photos.config import LENSES, ReconstructionConfig
+from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.posed.photo_files import (
     MIN_PHOTOS,
     Photos,
@@ -103,16 +102,12 @@ def structure_from_motion(
         progress: called as ``progress("features" | "comparing" | "matching" | "mapping" | "undistorting", done, total)``.
 
     Raises:
-        ValueError: for photos that are missing, unreadable or too few, an unknown lens, or when the photos overlap too
-            little to be posed; the message names the files.
+        ValueError: for photos that are missing, unreadable or too few, or when the photos overlap too little to be posed;
+            the message names the files.
         ImportError: if pycolmap is not installed.
     """
     config = config or ReconstructionConfig()
-    lens = config.lens
-    check_choice("lens", lens, LENSES)
-    max_features = check_count("max_features", config.max_features, 100)
-    least_pixels = 10_000  # of max_pixels
-    max_pixels = check_count("max_pixels", config.max_pixels, least_pixels)
+    lens, max_features = config.lens, config.max_features
     everything = named = find_photos(photos)
     colmap = load_colmap()
     known: Any = None
@@ -145,7 +140,7 @@ def structure_from_motion(
             make = partial(_keep_known, colmap, folder, named, known, match, seed)
             inputs += [list(named.values()), *_content(known)]
         made = steps.run("model", make, version=VERSIONS["model"], inputs=inputs, outputs=["model"])
-        result = _straightened(colmap, steps, named, max_pixels)
+        result = _straightened(colmap, steps, named, config.max_pixels)
         unposed = [*result.unposed]
         if poses is not None:
             unposed += poses.unposed(everything)
