@@ -67,8 +67,8 @@ def sparse():
     order = np.argsort(hidden + rng.random(hidden.shape), axis=1)
     seen = np.concatenate([row[:n] for row, n in zip(order, length, strict=True)])
     cameras = {f"{k}.png": look(eye, [0, 0, 0.3]) for k, eye in enumerate(eyes)}
-    return SparseModel(cameras, points, np.full(points.shape, 0.5), error, length,
-                       np.concatenate([[0], np.cumsum(length)]), seen, metric=True, upright=True)  # fmt: skip
+    colors = np.full(points.shape, 0.5)
+    return SparseModel(cameras, points, colors, error, length, seen, metric=True, upright=True)
 
 
 def test_planes_go_as_far_as_photos_show_them_and_take_fine_discs_where_these_are_busy(sparse):

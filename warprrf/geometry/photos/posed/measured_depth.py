@@ -80,14 +80,12 @@ def with_points(sparse: SparseModel, files: Mapping[str, DepthFile]) -> SparseMo
     keep = seen.sum(axis=1) >= 3
     seen = seen[keep]
     index = np.flatnonzero([name in maps for name in sparse.cameras])
-    length = seen.sum(axis=1).astype(np.int64)
     return replace(
         sparse,
         points=points[keep],
         colors=colors[keep],
         reprojection_error=np.zeros(len(seen)),
-        track_length=length,
-        track_start=np.concatenate([[0], np.cumsum(length)]).astype(np.int64),
+        track_length=seen.sum(axis=1),
         track_camera=index[np.nonzero(seen)[1]],
     )
 

@@ -711,7 +711,6 @@ def _sparse_model(
         p for _, p in sorted(model.points3D.items()) if p.track.elements
     ]  # what no photo shows is no use
     tracks = [sorted({position[e.image_id] for e in p.track.elements}) for p in points]
-    length = np.array([len(t) for t in tracks], dtype=np.int64)
     return SparseModel(
         cameras=cameras,
         points=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),
@@ -720,8 +719,7 @@ def _sparse_model(
             [p.error * np.mean([share[e.image_id] for e in p.track.elements]) for p in points],
             dtype=np.float64,
         ),
-        track_length=length,
-        track_start=np.concatenate([[0], np.cumsum(length)]).astype(np.int64),
+        track_length=np.array([len(t) for t in tracks], dtype=np.int64),
         track_camera=np.array([c for t in tracks for c in t], dtype=np.int64),
         unposed=tuple(n for n in names if n not in cameras),
     )

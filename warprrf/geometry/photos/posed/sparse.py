@@ -33,8 +33,8 @@ class SparseModel:
         colors: colour of each point in [0, 1], shape ``(P, 3)``.
         reprojection_error: mean reprojection error of each point [pixels of ``cameras``], shape ``(P,)``.
         track_length: number of photos that see each point, shape ``(P,)`` int64.
-        track_start: where each point's photos begin in ``track_camera``, shape ``(P + 1,)`` int64.
-        track_camera: photos (position in ``list(cameras)``) that see the points, shape ``(sum of track lengths,)``.
+        track_camera: photos (position in ``list(cameras)``) that see the points, point by point, shape
+            ``(sum of track lengths,)``.
         unposed: names of the photos that no pose was found for, or that lie in a smaller, separate model.
         causes: why each of these has no pose, by name, where that is known.
         pieces: names of the photos of each model that too few features join to the others; ``cameras`` are those of the first.
@@ -51,7 +51,6 @@ class SparseModel:
     colors: np.ndarray
     reprojection_error: np.ndarray
     track_length: np.ndarray
-    track_start: np.ndarray
     track_camera: np.ndarray
     unposed: tuple[str, ...] = ()
     causes: Mapping[str, str] = field(default_factory=dict)
@@ -62,6 +61,11 @@ class SparseModel:
     guessed: tuple[str, ...] = ()
     photos: dict[str, Path] = field(default_factory=dict)
     lenses: dict[str, Lens] = field(default_factory=dict)
+
+    @property
+    def track_start(self) -> np.ndarray:
+        """Where each point's photos begin in ``track_camera``, and where the last one's end, shape ``(P + 1,)`` int64."""
+        return np.append(0, np.cumsum(self.track_length))
 
     def lines_of_sight(self) -> tuple[np.ndarray, np.ndarray]:
         """Eyes and points of all tracks [m], shape ``(sum of track lengths, 3)`` each."""
@@ -75,16 +79,13 @@ class SparseModel:
 
     def subset(self, keep: np.ndarray) -> SparseModel:
         """The model with only the points where ``keep`` (boolean, shape ``(P,)``) is True."""
-        seen = np.repeat(keep, self.track_length)
-        length = self.track_length[keep]
         return replace(
             self,
             points=self.points[keep],
             colors=self.colors[keep],
             reprojection_error=self.reprojection_error[keep],
-            track_length=length,
-            track_start=np.concatenate([[0], np.cumsum(length)]),
-            track_camera=self.track_camera[seen],
+            track_length=self.track_length[keep],
+            track_camera=self.track_camera[np.repeat(keep, self.track_length)],
         )
 
     def transformed(
