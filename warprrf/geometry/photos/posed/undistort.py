@@ -147,9 +147,14 @@ def colmap_camera(lens: Lens, number: int = 1) -> Any:
     """``lens`` as COLMAP's camera, in a model with two focal lengths, so that it scales without rounding."""
     colmap = load_colmap()
     model = lens.model if lens.model in ("OPENCV_FISHEYE", "FULL_OPENCV") else "OPENCV"
-    bends = [*lens.coefficients, 0.0, 0.0, 0.0, 0.0][: COEFFICIENTS[model]]
-    params = [lens.fx, lens.fy, lens.cx, lens.cy, *bends]
+    params = _parameters(lens, model)
     return colmap.Camera(model=model, width=lens.width, height=lens.height, params=params, camera_id=number)
+
+
+def _parameters(lens: Lens, kind: str) -> list[float]:
+    """Numbers of ``lens`` as a lens model of COLMAP's that may have more freedom or less, ``kind``, orders them."""
+    focal = [lens.fx] if kind in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") else [lens.fx, lens.fy]
+    return [*focal, lens.cx, lens.cy, *[*lens.coefficients, 0.0, 0.0, 0.0, 0.0][: COEFFICIENTS[kind]]]
 
 
 def _reduced(lens: Lens, max_pixels: int) -> Lens:
@@ -249,10 +254,8 @@ def _adjusted(colmap: ModuleType, model: Path, kind: str, principal_point: bool)
     found = colmap.Reconstruction(str(model))
     for camera in found.cameras.values():
         lens = lens_of(camera)
-        focal = [lens.fx] if kind in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") else [lens.fx, lens.fy]
-        bends = [*lens.coefficients, 0.0, 0.0, 0.0, 0.0][: COEFFICIENTS[kind]]
         camera.model = getattr(colmap.CameraModelId, kind)
-        camera.params = np.array([*focal, lens.cx, lens.cy, *bends])
+        camera.params = np.array(_parameters(lens, kind))
     options = colmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_principal_point = principal_point

@@ -71,9 +71,13 @@ def held_up(cameras: Sequence[Camera]) -> np.ndarray:
     """Unit vector that points up as cameras are held: across their x axes, which are level, and near their own up."""
     axes = np.array([c.rotation for c in cameras])
     right, up = axes[:, 0], -axes[:, 1]
-    total = right.T @ right + 0.1 * (len(up) * np.eye(3) - up.T @ up)
-    found: np.ndarray = np.linalg.eigh(total)[1][:, 0]
-    return found if found @ up.sum(axis=0) > 0 else -found
+    return _least(right.T @ right + 0.1 * (len(up) * np.eye(3) - up.T @ up), up.sum(axis=0))
+
+
+def _least(cost: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """The unit vector ``x`` of least ``x . cost x``, of symmetric ``cost`` (3, 3), that points the way of ``near``."""
+    found: np.ndarray = np.linalg.eigh(cost)[1][:, 0]
+    return found if found @ near > 0 else -found
 
 
 def vertical_of_edges(
@@ -95,8 +99,7 @@ def vertical_of_edges(
     windows_deg = (12, 8, 5, 3, 2, 1.5, 1, 0.7, 0.5, 0.5, 0.5)  # standard deviations of the window, in turn
     for window in windows_deg:
         weight = np.exp(-0.5 * (normals @ up / np.sin(np.radians(window))) ** 2)
-        found = np.linalg.eigh((normals * weight[:, None]).T @ normals)[1][:, 0]
-        up = found if found @ up > 0 else -found
+        up = _least((normals * weight[:, None]).T @ normals, up)
     off = np.degrees(np.arcsin(np.minimum(np.abs(normals @ up), 1.0)))
     # density of edges within 1 degree of the vertical over that from 4 to 10 degrees; of clutter: 1
     proven = 1.3
@@ -152,8 +155,7 @@ def _vertical_of_planes(up: np.ndarray, planes: Iterable[Plane]) -> np.ndarray:
         total = (normals * (weight * sign)[:, None]).T @ normals
         # What no plane says stays as it was.
         total -= 1e-3 * max(weight.sum(), 1.0) * np.outer(up, up)
-        found = np.linalg.eigh(total)[1][:, 0]
-        up = found if found @ up > 0 else -found
+        up = _least(total, up)
     return up
 
 

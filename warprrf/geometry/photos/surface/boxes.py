@@ -350,13 +350,14 @@ def votes(
     grid: Grid,
     mesh: Mesh,
     faces: FaceLevels,
+    proven: Sequence[tuple[Plane, Level]],
     cameras: Sequence[Camera],
     depths: Sequence[np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Votes for free and for solid, shape ``grid.shape`` each.
 
     A line of sight counts where its depth agrees with the mesh. It votes free at samples along it, and where it ends on
-    a plane also right before the plane, and solid right behind.
+    a plane also right before the plane, and solid right behind. So does each occupied cell of ``proven`` planes, four times.
     """
     o, d, ranges = _lines_of_sight(cameras, depths)
     hit = mesh.cast(o, d)
@@ -384,6 +385,11 @@ def votes(
         ray = np.repeat(np.arange(first, first + len(count)), count)
         step = np.arange(len(ray)) - np.repeat(np.cumsum(count) - count, count)
         free += grid.count(o[ray] + ((step + 0.5) * step_m)[:, None] * d[ray])
+    for plane, level in proven:
+        points, across = quarters(plane).reshape(-1, 3), grid.axes[level.axis]
+        points += (level.height - points @ across)[:, None] * across
+        free += grid.count(points + level.sign * BESIDE_M * across)
+        solid += grid.count(points - level.sign * BESIDE_M * across)
     return free, solid
 
 
@@ -399,15 +405,6 @@ def _lines_of_sight(
         parts.append((np.broadcast_to(camera.position, towards.shape), towards, ranges[seen]))
     o, d, ranges = (np.concatenate(p) for p in zip(*parts, strict=True))
     return o, d, ranges
-
-
-def vote_proven(grid: Grid, plane: Plane, level: Level) -> tuple[np.ndarray, np.ndarray]:
-    """Four votes of each occupied cell for free space before it, and for a solid behind, shape ``grid.shape`` each."""
-    points = quarters(plane).reshape(-1, 3)
-    axis = grid.axes[level.axis]
-    points += (level.height - points @ axis)[:, None] * axis
-    before = level.sign * BESIDE_M * axis
-    return grid.count(points + before), grid.count(points - before)
 
 
 def closed_sides(grid: Grid, mesh: Mesh, faces: FaceLevels) -> np.ndarray:

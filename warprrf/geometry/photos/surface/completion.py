@@ -31,7 +31,6 @@ from warprrf.geometry.photos.surface.boxes import (
     proven_levels,
     seen_share,
     surface_of,
-    vote_proven,
     votes,
 )
 from warprrf.geometry.planar_patches import PlanarPatches
@@ -70,11 +69,7 @@ def complete(
     claim_proven(mesh, faces, axes, proven)
 
     grid = divide(mesh, axes, levels)
-    free, solid = votes(grid, mesh, faces, cameras, depths)
-    for plane, level in proven:
-        before, behind = vote_proven(grid, plane, level)
-        free, solid = free + before, solid + behind
-
+    free, solid = votes(grid, mesh, faces, proven, cameras, depths)
     filled = least_surface(grid, free, solid, closed_sides(grid, mesh, faces))
     if filled.all():
         return _without_gaps(patches, cameras), False
