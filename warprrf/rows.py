@@ -1,4 +1,5 @@
-"""Tables: dataclasses whose arrays have a row for each thing, taken from and put together alike; and rows that are equal."""
+"""Tables: dataclasses whose arrays have a row for each thing, taken from and put together alike; rows that are equal, and their
+means."""
 
 from __future__ import annotations
 
@@ -41,3 +42,9 @@ def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     index = np.empty(len(rows), int)
     index[order] = np.cumsum(new) - 1
     return order[new], index, np.bincount(index)
+
+
+def group_means(values: np.ndarray, group: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Means over groups of the rows of ``values`` (N, K), shape ``(G, K)``: ``group`` (N,) says which group each row is of,
+    ``count`` (G,) how many each has, as :func:`distinct_rows` returns both."""
+    return np.stack([np.bincount(group, column, len(count)) for column in values.T], axis=1) / count[:, None]

@@ -239,23 +239,17 @@ def _steps(
         fitted: the photos that Gaussians are fitted to, by name.
         measured: depth images by photo; with some, they make the surface.
     """
-    cameras = {name: sparse.cameras[name] for name in fitted}
+    cameras = [sparse.cameras[name] for name in fitted]
     masks = [mask_beside(photo) for photo in fitted.values()]
 
     @cache
     def photos() -> PosedPhotos:
         images = [read_photo(photo) for photo in fitted.values()]
-        return PosedPhotos(images, list(cameras.values()), [read_mask(photo) for photo in fitted.values()])
+        return PosedPhotos(images, cameras, [read_mask(photo) for photo in fitted.values()])
 
     def initial(attempt: Attempt) -> Arrays:
         planes, gaussians = initialise(
-            sparse,
-            cameras,
-            photos().images,
-            config=config,
-            seed=seed,
-            progress=attempt.progress,
-            device=device,
+            sparse, photos(), config=config, seed=seed, progress=attempt.progress, device=device
         )
         return of_planes(planes) | of_gaussians(gaussians)
 
@@ -273,7 +267,7 @@ def _steps(
 
     def depth(attempt: Attempt) -> Arrays:
         ranges = depth_maps(
-            gaussians, list(cameras.values()), photos=photos(), planes=planes, config=config, progress=attempt.progress,
+            gaussians, cameras, photos=photos(), planes=planes, config=config, progress=attempt.progress,
             device=device,
         )  # fmt: skip
         return {str(k): map_ for k, map_ in enumerate(ranges)}
@@ -283,7 +277,7 @@ def _steps(
             maps = range_maps(sparse, measured).values()
             views, ranges = (list(part) for part in zip(*maps, strict=True))
         else:
-            views = depth_views(list(cameras.values()), config.surface)
+            views = depth_views(cameras, config.surface)
             ranges = [rendered[str(k)] for k in range(len(views))]
         patches, whole = fuse_maps(views, ranges, planes=planes, config=config, progress=attempt.progress)
         skipped = float(config.completion and not whole)

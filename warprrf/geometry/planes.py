@@ -10,15 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from warprrf.cache import cached_property
-from warprrf.checks import check_array, check_positive
+from warprrf.checks import check_array, checked, positive
 
 
+@checked
 @dataclass(frozen=True)
 class PlaneConfig:
     """How planes are found among points, and how large their cells are.
@@ -32,15 +34,12 @@ class PlaneConfig:
         margin_m: cells reach so far beyond the hull of a plane's points.
     """
 
-    distance_m: float = 0.015
+    distance_m: Annotated[float, positive("length in metres")] = 0.015
     angle_deg: float = 30.0
     min_points: float = 40
     max_planes: int = 80
     cell_m: float = 0.1
     margin_m: float = 0.12
-
-    def __post_init__(self) -> None:
-        check_positive("distance_m", self.distance_m, "length in metres")
 
     @property
     def cosine(self) -> float:
@@ -65,7 +64,7 @@ class Plane:
     Attributes:
         normal: unit normal, on the side the surface was seen from, shape ``(3,)``.
         offset: [m].
-        inliers: indices of the points it was fitted to, shape ``(K,)`` int64.
+        inliers: indices of the points it was fitted to, shape ``(K,)`` int64; default: none.
         rms_m: rms distance of those points from the plane [m].
         corner: in-plane coordinates of the outer corner of cell (0, 0) [m], shape ``(2,)``.
         cell_m: side of a cell [m].
@@ -75,7 +74,7 @@ class Plane:
 
     normal: np.ndarray
     offset: float
-    inliers: np.ndarray = field(repr=False)
+    inliers: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64), repr=False)
     rms_m: float = 0.0
     corner: np.ndarray = field(default_factory=lambda: np.zeros(2), repr=False)
     cell_m: float = 0.1
@@ -123,6 +122,12 @@ class Plane:
             return np.zeros(len(points), dtype=bool)
         place, inside = self.cell_of(points)
         return inside & cells[place]
+
+    def holds(self, points: np.ndarray, reach_m: float, chosen: np.ndarray | None = None) -> np.ndarray:
+        """Which points ``(N, 3)`` lie closer than ``reach_m`` to an occupied (or ``chosen``) cell, shape ``(N,)`` bool."""
+        near = np.abs(self.distance(points)) < reach_m
+        near[near] = self.covers(points[near], chosen)
+        return near
 
     def count(self, points: np.ndarray) -> np.ndarray:
         """Number of points ``(N, 3)`` whose foot lies in each cell, shape of ``occupied``."""

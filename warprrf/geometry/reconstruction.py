@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -402,23 +402,14 @@ def of_planes(planes: Sequence[Plane]) -> Arrays:
 def to_planes(arrays: Arrays) -> list[Plane]:
     """What :func:`of_planes` took apart."""
     check_arrays(arrays, PLANE_ARRAYS, C=int(np.prod(arrays["plane_shapes"], axis=-1).sum()))
-    shapes, nothing = arrays["plane_shapes"], np.zeros(0, dtype=np.int64)
+    shapes = arrays["plane_shapes"]
     cells = np.split(arrays["plane_cells"], np.cumsum(shapes.prod(axis=1))[:-1])
-    return [
-        Plane(
-            row[:3],
-            float(row[3]),
-            nothing,
-            float(row[4]),
-            row[5:7],
-            float(row[7]),
-            own.reshape(shape),
-            bool(plain),
-        )
-        for row, shape, own, plain in zip(
-            arrays["planes"], shapes, cells, arrays["plane_plain"], strict=False
-        )
-    ]
+    planes = []
+    for row, shape, own, plain in zip(arrays["planes"], shapes, cells, arrays["plane_plain"], strict=False):
+        offset, rms_m, cell_m = row[[3, 4, 7]].tolist()
+        grid = Plane(row[:3], offset, rms_m=rms_m, corner=row[5:7], cell_m=cell_m, plain=bool(plain))
+        planes.append(replace(grid, occupied=own.reshape(shape)))
+    return planes
 
 
 def of_mesh(mesh: Mesh) -> Arrays:

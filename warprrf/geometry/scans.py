@@ -8,16 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from scipy import sparse
 
-from warprrf.checks import check_count, check_positive
+from warprrf.checks import Count, checked, positive
 from warprrf.geometry.mesh import Mesh, connected_pieces, edge_pairs, face_neighbours, smoothed_normals
 from warprrf.geometry.planar_patches import PlanarPatches, vertex_noise
 from warprrf.geometry.planes import Plane, PlaneConfig, detect_planes, drawn_by_place
+from warprrf.rows import distinct_rows, group_means
 
 
+@checked
 @dataclass(frozen=True)
 class SurfaceConfig:
     """How Gaussians become a mesh with planar patches.
@@ -31,16 +34,12 @@ class SurfaceConfig:
         patch_distance_m: a face this close to a plane can belong to its patch: a depth map's error.
     """
 
-    depth_pixels: int = 320_000
-    voxel_m: float = 0.05
+    depth_pixels: Count = 320_000
+    voxel_m: Annotated[float, positive("length in metres")] = 0.05
     truncation_voxels: float = 3.0
     max_range_m: float = 12.0
     min_component_faces: int = 200
     patch_distance_m: float = 0.06
-
-    def __post_init__(self) -> None:
-        check_count("depth_pixels", self.depth_pixels)
-        check_positive("voxel_m", self.voxel_m, "length in metres")
 
 
 PATCH_ANGLE_DEG = 35.0  # most between the smoothed normal of a face and that of its patch
@@ -244,10 +243,8 @@ def _gathered(patches: PlanarPatches, cell_m: float) -> np.ndarray:
     stretch = (mesh.vertices[edge] * along).sum(axis=1) / np.maximum(size, 1e-30) / cell_m
     key[edge, 2] = np.floor(stretch)
     target, chosen = np.arange(count), np.flatnonzero(movable)
-    _, group, members = np.unique(key[chosen], axis=0, return_inverse=True, return_counts=True)
-    group = group.ravel()
-    sums = [np.bincount(group, mesh.vertices[chosen, a], len(members)) for a in range(3)]
-    centre = np.stack(sums, axis=1) / members[:, None]
+    _, group, members = distinct_rows(key[chosen])
+    centre = group_means(mesh.vertices[chosen], group, members)
     gap = np.linalg.norm(mesh.vertices[chosen] - centre[group], axis=1)
     first = np.lexsort((gap, group))[np.cumsum(members) - members]
     target[chosen] = chosen[first][group]

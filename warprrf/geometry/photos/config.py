@@ -6,8 +6,9 @@ What nobody has had reason to change is a constant beside its use.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
-from warprrf.checks import check_count, check_seed
+from warprrf.checks import Count, Seed, checked, one_of, whole
 from warprrf.geometry.planes import PlaneConfig
 from warprrf.geometry.scans import SurfaceConfig
 
@@ -15,6 +16,7 @@ LENSES = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENC
 """COLMAP's lens models that photos can be taken through; "auto": the simplest that explains them."""
 
 
+@checked
 @dataclass(frozen=True)
 class RefineConfig:
     """Settings of :func:`warprrf.geometry.photos.gaussians.refine.refine`; for about 100 photos on two CPU cores.
@@ -32,40 +34,29 @@ class RefineConfig:
         seed: of the order of photos and of where clones go.
     """
 
-    iterations: int = 2400
-    downscale: int = 2
+    iterations: Count = 2400
+    downscale: Count = 2
     fit_exposure: bool = True
     mean_rate: float = 4e-4
     densify_from: int = 300
-    densify_every: int = 200
-    max_gaussians: int = 60_000
+    densify_every: Count = 200
+    max_gaussians: Count = 60_000
     max_scale_m: float = 0.3
     thickness_m: float = 0.004
-    checkpoint_every: int = 300
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        counts = (
-            "iterations",
-            "downscale",
-            "densify_every",
-            "max_gaussians",
-            "checkpoint_every",
-        )
-        for name in counts:
-            check_count(name, getattr(self, name))
-        check_seed(self.seed)
+    checkpoint_every: Count = 300
+    seed: Seed = 0
 
 
+@checked
 @dataclass(frozen=True)
 class ReconstructionConfig:
     """Settings of :func:`warprrf.reconstruct`.
 
     Attributes:
-        max_features: SIFT features kept per photo (the largest ones).
+        max_features: SIFT features kept per photo (the largest ones), 100 at least.
         lens: COLMAP's model of the lenses, one of :data:`LENSES`; ``"auto"`` takes the simplest of pinhole,
             ``"SIMPLE_RADIAL"``, ``"RADIAL"`` and ``"OPENCV"`` that explains the photos. A fisheye has to be named.
-        max_pixels: undistorted photos are reduced to about so many pixels.
+        max_pixels: undistorted photos are reduced to about so many pixels, 10,000 at least.
         planes: how planes are found among sparse points.
         sweep: whether planes are corrected and completed by comparing the photos.
         plain: whether surfaces without features are found from their edges.
@@ -77,9 +68,9 @@ class ReconstructionConfig:
         completion: whether holes are closed and borders straightened where the planes allow it.
     """
 
-    max_features: int = 2400
-    lens: str = "auto"
-    max_pixels: int = 1_000_000
+    max_features: Annotated[int, whole(100)] = 2400
+    lens: Annotated[str, one_of(*LENSES)] = "auto"
+    max_pixels: Annotated[int, whole(10_000)] = 1_000_000
     planes: PlaneConfig = field(default_factory=PlaneConfig)
     sweep: bool = True
     plain: bool = True

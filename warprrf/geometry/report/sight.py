@@ -52,8 +52,7 @@ class Seen:
         """Parts of the surface that no photo shows, and that some show but only edges found: those on plain ``planes``."""
         plain = np.zeros(len(self.points), dtype=bool)
         for plane in (plane for plane in planes if plane.plain):
-            near = np.abs(plane.distance(self.points)) < ON_PLANE_M
-            plain |= near & (self.normals @ plane.normal > PARALLEL) & plane.covers(self.points)
+            plain |= plane.holds(self.points, ON_PLANE_M) & (self.normals @ plane.normal > PARALLEL)
         return float((self.photos == 0).mean()), float((plain & (self.photos > 0)).mean())
 
     @property

@@ -104,12 +104,12 @@ class Camera:
 
     def directions(self) -> np.ndarray:
         """Unit world direction of every pixel centre, shape ``(height, width, 3)`` float64."""
-        u, v = np.arange(self.width) + 0.5, np.arange(self.height) + 0.5
         if self.kind == "pinhole":
-            x, y = np.meshgrid((u - self.cx) / self.fx, (v - self.cy) / self.fy)
+            x, y = slopes_of(self)
             local = np.stack([x, y, np.ones_like(x)], axis=-1)
             local /= np.linalg.norm(local, axis=-1, keepdims=True)
             return local @ self.rotation
+        u, v = np.arange(self.width) + 0.5, np.arange(self.height) + 0.5
         azimuth, zenith = np.meshgrid(-np.pi + u * 2 * np.pi / self.width, v * np.pi / self.height)
         return np.stack(
             [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1
@@ -128,16 +128,8 @@ class Camera:
     def resized(self, width: Count, height: Count) -> Camera:
         """The same view at another resolution; pinhole intrinsics scale along."""
         sx, sy = width / self.width, height / self.height
-        return Camera(
-            self.kind,
-            width,
-            height,
-            self.world_to_camera,
-            self.fx * sx,
-            self.fy * sy,
-            self.cx * sx,
-            self.cy * sy,
-        )
+        fx, fy, cx, cy = self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy
+        return replace(self, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
     def transformed(
         self, *, scale: float = 1.0, rotation: ArrayLike | None = None, shift: ArrayLike = (0.0, 0.0, 0.0)
@@ -167,6 +159,14 @@ class Camera:
         azimuth = np.arctan2(local[:, 1], local[:, 0])
         uv = np.stack([(azimuth + np.pi) * self.width / (2 * np.pi), zenith * self.height / np.pi], axis=-1)
         return uv, distance
+
+
+def slopes_of(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """x / z and y / z of the ray through each pixel of a pinhole camera, in its own axes, shape ``(H, W)`` each."""
+    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    columns, rows = np.meshgrid(x, y)
+    return columns, rows
 
 
 def check_camera(cam: object) -> None:

@@ -6,7 +6,7 @@ Scales in metres, opacities in [0, 1], quaternions wxyz (normalised on entry), c
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -104,13 +104,7 @@ class Gaussians:
 
     def __getitem__(self, chosen: slice | np.ndarray) -> Gaussians:
         """The Gaussians that an index array, mask or slice selects."""
-        return Gaussians(
-            self.means[chosen],
-            self.quaternions[chosen],
-            self.scales[chosen],
-            self.opacities[chosen],
-            self.sh[chosen],
-        )
+        return Gaussians(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
     @property
     def rotations(self) -> np.ndarray:

@@ -11,6 +11,7 @@ from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.gaussians import sweep
 from warprrf.geometry.photos.gaussians.cells import meeting
 from warprrf.geometry.photos.gaussians.initialise import initialise
+from warprrf.geometry.photos.posed.images import PosedPhotos
 from warprrf.geometry.photos.posed.sparse import SparseModel, detect_room_planes
 from warprrf.geometry.planes import Plane, aligned
 
@@ -66,14 +67,14 @@ def sparse():
     order = np.argsort(hidden + rng.random(hidden.shape), axis=1)
     seen = np.concatenate([row[:n] for row, n in zip(order, length, strict=True)])
     cameras = {f"{k}.png": look(eye, [0, 0, 0.3]) for k, eye in enumerate(eyes)}
-    return SparseModel(cameras, points, np.full(points.shape, 0.5), error, length,
-                       np.concatenate([[0], np.cumsum(length)]), seen, metric=True, upright=True)  # fmt: skip
+    colors = np.full(points.shape, 0.5)
+    return SparseModel(cameras, points, colors, error, length, seen, metric=True, upright=True)
 
 
 def test_planes_go_as_far_as_photos_show_them_and_take_fine_discs_where_these_are_busy(sparse):
     images = [photo(camera) for camera in sparse.cameras.values()]
     config = ReconstructionConfig(plain=False, gaussians=3000)
-    planes, g = initialise(sparse, sparse.cameras, images, config=config)
+    planes, g = initialise(sparse, PosedPhotos(images, [*sparse.cameras.values()]), config=config)
     floor, _, table = planes
     np.testing.assert_array_equal([floor.normal, table.normal], [[0, 0, 1], [0, 0, 1]])
     # The floor beyond its points, but not beneath the table, of which there is no point at all.
@@ -94,11 +95,9 @@ def test_planes_go_as_far_as_photos_show_them_and_take_fine_discs_where_these_ar
 
 
 def test_photos_of_two_sizes_are_compared(sparse):
-    cameras = {
-        name: camera.resized(200, 150) if k % 2 else camera for k, (name, camera) in enumerate(sparse.cameras.items())
-    }  # fmt: skip
+    cameras = [c.resized(200, 150) if k % 2 else c for k, c in enumerate(sparse.cameras.values())]
     config = ReconstructionConfig(plain=False, gaussians=3000)
-    planes, _ = initialise(sparse, cameras, [photo(c) for c in cameras.values()], config=config)
+    planes, _ = initialise(sparse, PosedPhotos([photo(c) for c in cameras], cameras), config=config)
     assert [p.offset for p in planes if p.normal[2] > 0.99] == pytest.approx([0, TABLE[2]], abs=5e-3)
     assert planes[-1].area() == pytest.approx(np.prod(TABLE[1] - TABLE[0]), rel=0.1)
 
@@ -114,7 +113,7 @@ def test_a_plane_whose_features_were_taken_for_two_is_one(sparse, monkeypatch):
     images = [photo(camera) for camera in sparse.cameras.values()]
     config = ReconstructionConfig(plain=False, sweep=False, gaussians=3000)
     monkeypatch.setattr("warprrf.geometry.photos.gaussians.initialise.detect_room_planes", halves)
-    wall, floor = initialise(sparse, sparse.cameras, images, config=config)[0]
+    wall, floor = initialise(sparse, PosedPhotos(images, [*sparse.cameras.values()]), config=config)[0]
     assert abs(wall.normal[2]) < 0.01 and floor.covers(np.array([[x, 0.7, 0] for x in (-0.7, 0.7)])).all()
 
 

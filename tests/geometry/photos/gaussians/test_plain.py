@@ -8,6 +8,7 @@ from helpers.views import look
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.gaussians import plain
 from warprrf.geometry.photos.gaussians.plain import plain_surfaces, with_plain
+from warprrf.geometry.photos.posed.images import PosedPhotos
 from warprrf.geometry.planes import Plane
 
 SIZE = np.array([6.0, 5.0, 3.0])  # of the room [m]
@@ -57,45 +58,43 @@ def cameras():
     return result
 
 
-@pytest.fixture(scope="module")
-def bare(cameras):
-    """Plain surfaces of the room that no mirror is in."""
-    return plain_surfaces(cameras, photos(cameras), np.eye(3))
+def found(cameras, images):
+    """Plain surfaces in photos, and which lines through the six sides of the room end on what a mirror shows, 10 cm behind it
+    or more: those that end 8 and 12 cm behind the sides."""
+    outwards, away = np.concatenate([-np.eye(3), np.eye(3)]), np.tile(SIZE / 2, 2)[:, None]
+    targets = np.concatenate([SIZE / 2 + (away + behind) * outwards for behind in (0.08, 0.12)])
+    sight = np.broadcast_to(SIZE / 2, targets.shape), targets
+    planes, reflected = plain_surfaces(PosedPhotos(images, cameras), np.eye(3), sight)
+    return planes, reflected.reshape(2, 6).tolist()
 
 
-def test_walls_ceiling_and_pillar_without_features_are_found_from_their_edges(bare):
+def test_walls_ceiling_and_pillar_without_features_are_found_from_their_edges(cameras):
     mesh, _ = room()
+    planes, reflected = found(cameras, photos(cameras))
     for axis in range(3):
         for side, height in ((1, 0.0), (-1, SIZE[axis])):
             normal = side * np.eye(3)[axis]
-            found = [
-                p for p in bare.planes if p.normal @ normal > 0.99 and abs(p.offset - side * height) < 0.02
-            ]
-            assert sum(p.area() for p in found) > 0.6 * np.prod(SIZE) / SIZE[axis], (axis, side)
-    cells = np.concatenate([plane.cells() for plane in bare.planes])
+            own = [p for p in planes if p.normal @ normal > 0.99 and abs(p.offset - side * height) < 0.02]
+            assert sum(p.area() for p in own) > 0.6 * np.prod(SIZE) / SIZE[axis], (axis, side)
+    cells = np.concatenate([plane.cells() for plane in planes])
     assert np.mean(mesh.distance(cells) < 0.1) > 0.95
-    faces = [p for p in bare.planes if abs(p.normal[2]) < 0.1 and mesh.distance(p.cells()).mean() < 0.05]
+    faces = [p for p in planes if abs(p.normal[2]) < 0.1 and mesh.distance(p.cells()).mean() < 0.05]
     assert any(
         ((p.cells() > PILLAR[0] - 0.05) & (p.cells() < PILLAR[1] + 0.05)).all(axis=1).any() for p in faces
     )
-    assert all(plane.plain for plane in bare.planes) and not bare.panes
+    assert all(plane.plain for plane in planes) and reflected == [[False] * 6] * 2
 
 
-def test_what_a_pane_mirrors_becomes_no_surface(cameras, bare):
-    found = plain_surfaces(cameras, photos(cameras, mirrors=True), np.eye(3))
-    assert [(p.axis, p.side) for p in found.panes] == [(0, 1)] and abs(found.panes[0].height) < 0.02
-    cells = np.concatenate([plane.cells() for plane in found.planes])
-    assert (cells[:, 0] > -0.1).all()
-    eyes = np.array([[3.0, 1.0, 1.5], [3.0, 1.0, 1.5]])
-    targets = np.array([[-2.0, 1.5, 1.2], [1.0, 1.5, 1.2]])  # behind the pane, and before it
-    assert found.reflected(eyes, targets).tolist() == [True, False]
-    assert bare.reflected(eyes, targets).tolist() == [False, False]
+def test_what_a_pane_mirrors_becomes_no_surface(cameras):
+    planes, reflected = found(cameras, photos(cameras, mirrors=True))
+    assert reflected == [[False] * 6, [True] + [False] * 5]
+    assert (np.concatenate([plane.cells() for plane in planes])[:, 0] > -0.1).all()
 
 
 def test_photos_full_of_features_show_no_plain_surface(cameras):
     rng = np.random.default_rng(0)
     images = [rng.uniform(size=(240, 320, 3)).astype(np.float32) for _ in cameras[:4]]
-    assert plain_surfaces(cameras[:4], images, np.eye(3)).planes == []
+    assert found(cameras[:4], images) == ([], [[False] * 6] * 2)
 
 
 def test_a_plain_cell_gives_way_to_points_on_a_plane_and_to_lines_of_sight():
@@ -122,5 +121,5 @@ def test_plain_surfaces_are_looked_for_where_a_third_of_the_photos_is_plain(
     monkeypatch.setattr(plain, "find_lines", lambda *given: asked.append(given) or [])
     image = np.random.default_rng(0).random((240, 320, 3)).astype(np.float32)
     image[: round(240 * share) + 6] = 0.5  # six rows more, which a texture beside them keeps from being plain
-    found = plain_surfaces(cameras[:12], [image] * 12, np.eye(3))
-    assert len(asked) == lines and not found.planes and not found.panes
+    assert found(cameras[:12], [image] * 12) == ([], [[False] * 6] * 2)
+    assert len(asked) == lines

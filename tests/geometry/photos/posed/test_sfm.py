@@ -32,9 +32,8 @@ def model(rng, names="abcdefgh"):
         )
     points = rng.standard_normal((50, 3))
     return SparseModel(
-        cameras, points, np.full((50, 3), 0.5), np.full(50, 0.3), np.full(50, 2), np.arange(0, 101, 2),
-        np.tile([0, 1], 50),
-    )  # fmt: skip
+        cameras, points, np.full((50, 3), 0.5), np.full(50, 0.3), np.full(50, 2), np.tile([0, 1], 50)
+    )
 
 
 def made(workspace, photos):

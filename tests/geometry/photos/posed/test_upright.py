@@ -12,7 +12,6 @@ from warprrf.geometry.photos.posed import sparse
 from warprrf.geometry.photos.posed.photo_files import read_photo
 from warprrf.geometry.photos.posed.upright import held_up, upright, vertical_of_edges
 
-pytest.importorskip("skimage")
 EMPTY = np.zeros(0, dtype=np.int64)
 
 
@@ -30,15 +29,14 @@ def lobby():
     xyz = np.concatenate(points) + 0.003 * np.random.default_rng(0).standard_normal((sum(count), 3))
     length = np.full(len(xyz), 3)  # each counts as seen by its own camera and two that are told too
     own = np.repeat(np.repeat(np.arange(len(cameras)), count), 3)
-    return sparse.SparseModel(cameras, xyz, np.ones((len(xyz), 3)), np.zeros(len(xyz)), length,
-                              np.arange(0, len(own) + 1, 3), own)  # fmt: skip
+    return sparse.SparseModel(cameras, xyz, np.ones((len(xyz), 3)), np.zeros(len(xyz)), length, own)
 
 
 @pytest.fixture(scope="module")
 def lost(lobby):
     """The same in units and axes of their own."""
     turn = np.linalg.qr(np.random.default_rng(3).standard_normal((3, 3)))[0]
-    return sparse.transformed(lobby, 0.13, turn * np.linalg.det(turn), np.array([3.0, -2.0, 1.0]))
+    return lobby.transformed(scale=0.13, rotation=turn * np.linalg.det(turn), shift=[3.0, -2.0, 1.0])
 
 
 def read(name):
@@ -67,7 +65,7 @@ def test_vertical_edges_say_where_up_is(lost, lobby):
 
 def test_what_photos_do_not_show_is_said_to_be_guessed(lost):
     bare = replace(lost, points=np.zeros((0, 3)), colors=np.zeros((0, 3)), reprojection_error=np.zeros(0),
-                   track_length=EMPTY, track_start=np.zeros(1, dtype=np.int64), track_camera=EMPTY)  # fmt: skip
+                   track_length=EMPTY, track_camera=EMPTY)  # fmt: skip
     plausible = sparse.assume_scale(lost)
     seen_from = np.array([c.position for c in plausible.cameras.values()])[plausible.track_camera[::3]]
     assert np.median(np.linalg.norm(plausible.points - seen_from, axis=1)) == pytest.approx(3.0)

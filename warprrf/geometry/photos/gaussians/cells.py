@@ -77,7 +77,7 @@ def contested(plane: Plane, other: Plane, cells: np.ndarray, held: np.ndarray | 
     alike; shape ``(K,)`` bool."""
     if other.normal @ plane.normal < PARALLEL:
         return np.zeros(len(cells), dtype=bool)
-    return (np.abs(other.distance(cells)) < CONTESTED_M) & other.covers(cells, held)
+    return other.holds(cells, CONTESTED_M, held)
 
 
 def with_cells(plane: Plane, kept: np.ndarray) -> Plane:

@@ -19,7 +19,7 @@ from scipy import ndimage
 from warprrf.device import DeviceLike
 from warprrf.geometry.photos.config import RefineConfig
 from warprrf.geometry.photos.gaussians.initialise import SPREAD, discs
-from warprrf.geometry.photos.posed.images import PosedPhotos
+from warprrf.geometry.photos.posed.images import PosedPhotos, block_means
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians, rotations_of
 from warprrf.geometry.splats.rasterizer import Blending
@@ -107,8 +107,7 @@ def filled(gaussians: Gaussians, photos: PosedPhotos, *, device: DeviceLike = No
         photos: each is looked at once, in order; masked pixels ask for nothing.
     """
     for k, (image, camera) in enumerate(zip(photos.images, photos.cameras, strict=True)):
-        mask = photos.masks[k] if photos.masks else None
-        found = _missing(gaussians, image, mask, camera, device)
+        found = _missing(gaussians, image, photos.masks[k], camera, device)
         if found is not None:
             gaussians = _joined(gaussians, found)
     return gaussians
@@ -123,8 +122,9 @@ def _missing(
     rows, columns = (max(1, round(share * n / BLOCK)) for n in (camera.height, camera.width))
     small = camera.resized(columns * BLOCK, rows * BLOCK)
     seen = render(gaussians, small, device=device, blending=Blending())
-    alpha = _blocks(seen.alpha)
-    nearness = _blocks(seen.alpha / np.maximum(seen.depth, 1e-6)) / np.maximum(alpha, 1e-6)  # 1 / m
+    alpha = block_means(seen.alpha, BLOCK, np.float64)
+    nearness = block_means(seen.alpha / np.maximum(seen.depth, 1e-6), BLOCK, np.float64)  # 1 / m
+    nearness /= np.maximum(alpha, 1e-6)
     # 0.5: a block that blocks less light than this is a hole
     known = alpha >= 0.5
     if not known.any():
@@ -142,12 +142,6 @@ def _missing(
     centres = camera.position + depth[:, None] * toward
     # 0.5: of a new disc: its depth is a guess, so others may be seen through it
     return replace(discs(centres, -toward, radius, shown[hole]), opacities=np.full(len(depth), 0.5))
-
-
-def _blocks(pixels: np.ndarray) -> np.ndarray:
-    """Means over blocks."""
-    rows, columns = pixels.shape[0] // BLOCK, pixels.shape[1] // BLOCK
-    return pixels.reshape(rows, BLOCK, columns, BLOCK).mean(axis=(1, 3), dtype=np.float64)
 
 
 def _shrunk(pixels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -8,7 +8,7 @@ worst first, until the wanted number is reached. So bare walls take few Gaussian
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import ndimage
@@ -19,11 +19,11 @@ from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.gaussians.cells import meeting, occupancy, plane_mesh, quarters, seen_cells
 from warprrf.geometry.photos.gaussians.plain import plain_surfaces, with_plain
 from warprrf.geometry.photos.gaussians.sweep import choose_views, joined, level_planes, proven_cells, united
-from warprrf.geometry.photos.posed.images import GreyPhotos
+from warprrf.geometry.photos.posed.images import GreyPhotos, PosedPhotos
 from warprrf.geometry.photos.posed.sparse import SparseModel, clean_points, detect_room_planes
 from warprrf.geometry.planes import Plane, aligned, directions, plane_axes
-from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Y00, Gaussians, quaternions_of
+from warprrf.rows import distinct_rows, group_means
 
 SPREAD = 0.65  # standard deviation of a disc in units of the spacing: little light leaks between neighbours
 
@@ -33,8 +33,7 @@ def initial_gaussians(
     colors: np.ndarray,
     normals: np.ndarray,
     planes: Sequence[Plane],
-    cameras: Sequence[Camera],
-    images: Sequence[np.ndarray],
+    photos: PosedPhotos,
     count: int,
 ) -> Gaussians:
     """Flat Gaussians to start the photometric optimisation from, degree 0 colours.
@@ -45,7 +44,7 @@ def initial_gaussians(
         normals: unit normals, shape ``(P, 3)``.
         planes: planes with occupied cells (see :func:`~warprrf.geometry.photos.gaussians.cells.occupancy`); cells that no camera
             sees are left out.
-        cameras, images: the photos, ``(H, W, 3)`` in [0, 1].
+        photos: that give colours.
         count: Gaussians wanted in all (about).
 
     Raises:
@@ -54,13 +53,13 @@ def initial_gaussians(
     free = np.ones(len(points), dtype=bool)
     for plane in planes:
         # 0.02: a sparse point this close to an occupied cell gives way to the plane's own discs
-        free &= ~((np.abs(plane.distance(points)) < 0.02) & plane.covers(points))
+        free &= ~plane.holds(points, 0.02)
     min_scale, max_scale = 0.004, 0.12  # of a disc on a sparse point [m]
     gap = cKDTree(points).query(points[free], k=4)[0][:, 1:]  # infinite where there are fewer
     radius = np.clip(gap.mean(axis=1), min_scale, max_scale)
     parts = [(points[free], normals[free], radius, colors[free])]
     if planes:
-        parts += _blocks(planes, cameras, images, max(count - int(free.sum()), 1))
+        parts += _blocks(planes, photos, max(count - int(free.sum()), 1))
     centres, facing, sizes, shades = (np.concatenate(p) for p in zip(*parts, strict=True))
     if not len(centres):
         raise ValueError("points: got none, and no plane that a photo sees; nothing to start from")
@@ -79,27 +78,22 @@ def discs(centres: np.ndarray, normals: np.ndarray, radius: np.ndarray, colors: 
 
 
 def _blocks(
-    planes: Sequence[Plane], cameras: Sequence[Camera], images: Sequence[np.ndarray], count: int
+    planes: Sequence[Plane], photos: PosedPhotos, count: int
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
     """Centres, normals, radii and colours of discs for blocks of two, one or half a cell, about ``count`` in all."""
     surface = plane_mesh(planes)
     cells = []
     for k, plane in enumerate(planes):
-        views = choose_views(surface, plane.cells(), plane.normal, cameras)
+        views = choose_views(surface, plane.cells(), plane.normal, photos.cameras)
         some = views[:, 0] >= 0
         fine = quarters(plane)[some]
-        color = _median_colors(fine.reshape(-1, 3), np.repeat(views[some], 4, axis=0), cameras, images)
+        color = _median_colors(fine.reshape(-1, 3), np.repeat(views[some], 4, axis=0), photos)
         key = np.insert(np.argwhere(plane.occupied)[some] // 2, 0, k, axis=1)
         cells.append((key, fine, color.reshape(-1, 4, 3)))
     key, fine, color = (np.concatenate(c) for c in zip(*cells, strict=True))
-    _, parent, members = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-    parent, whole = parent.ravel(), len(members)
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        return np.stack([np.bincount(parent, v, whole) for v in values.T], axis=1) / members[:, None]
-
-    middle = color.mean(axis=1)
-    coarse = mean(middle)
+    _, parent, members = distinct_rows(key)
+    whole, centre, middle = len(members), fine.mean(axis=1), color.mean(axis=1)
+    coarse_centre, coarse = (group_means(of, parent, members) for of in (centre, middle))
     # To cut a block costs 3 Gaussians and removes about the variance between its parts, with a share of what lies
     # within them; the largest gains first, half of the room for either size.
     within = ((color - middle[:, None]) ** 2).sum(axis=2).mean(axis=1)
@@ -114,8 +108,8 @@ def _blocks(
     parent_plane[parent] = plane_of
     quartered = np.repeat(plane_of[cut_again], 4)
     return [
-        (mean(fine.mean(axis=1))[~cut], normal[parent_plane[~cut]], 2 * SPREAD * side[parent_plane[~cut]], coarse[~cut]),
-        (fine.mean(axis=1)[kept], normal[plane_of[kept]], SPREAD * side[plane_of[kept]], middle[kept]),
+        (coarse_centre[~cut], normal[parent_plane[~cut]], 2 * SPREAD * side[parent_plane[~cut]], coarse[~cut]),
+        (centre[kept], normal[plane_of[kept]], SPREAD * side[plane_of[kept]], middle[kept]),
         (fine[cut_again].reshape(-1, 3), normal[quartered], 0.5 * SPREAD * side[quartered],
          color[cut_again].reshape(-1, 3)),
     ]  # fmt: skip
@@ -128,12 +122,10 @@ def _largest(values: np.ndarray, count: int) -> np.ndarray:
     return chosen & (values > 0)
 
 
-def _median_colors(
-    points: np.ndarray, views: np.ndarray, cameras: Sequence[Camera], images: Sequence[np.ndarray]
-) -> np.ndarray:
-    """Median colour of each point over its ``views`` (camera indices, shape ``(N, V)``, -1 padded), shape ``(N, 3)``."""
+def _median_colors(points: np.ndarray, views: np.ndarray, photos: PosedPhotos) -> np.ndarray:
+    """Median colour of each point over its ``views`` (indices of photos, shape ``(N, V)``, -1 padded), shape ``(N, 3)``."""
     taken = np.full((*views.shape, 3), np.nan)
-    for c, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+    for c, (camera, image) in enumerate(zip(photos.cameras, photos.images, strict=True)):
         rows, slots = np.nonzero(views == c)
         if len(rows):
             at = camera.project(points[rows])[0].T[::-1] - 0.5
@@ -146,8 +138,7 @@ def _median_colors(
 
 def initialise(
     sparse: SparseModel,
-    cameras: Mapping[str, Camera],
-    images: Sequence[np.ndarray],
+    photos: PosedPhotos,
     *,
     config: ReconstructionConfig,
     seed: int = 0,
@@ -158,8 +149,7 @@ def initialise(
 
     Args:
         sparse: posed cameras and points [m], those of held-out photos among them.
-        cameras: of the photos that the Gaussians are fitted to.
-        images: these photos, shape ``(H, W, 3)`` each, in [0, 1].
+        photos: that the Gaussians are fitted to.
         config: settings.
         seed: of the plane detection.
         progress: called with ``"planes"``.
@@ -184,28 +174,27 @@ def initialise(
     planes = aligned(planes, points) if level else planes
     planes = occupancy(planes, points, *lines, config=config.planes)
     report("planes", 1, 6)
-    if config.sweep and len(cameras) > 2 and planes:
-        photos = GreyPhotos.upload(list(cameras.values()), images, device)
-        planes = proven_cells(planes, points, photos)
+    if config.sweep and len(photos.cameras) > 2 and planes:
+        grey = GreyPhotos.upload(photos.cameras, photos.images, device)
+        planes = proven_cells(planes, points, grey)
         report("planes", 2, 6)
         if level:
             levels = []
             for k, up in enumerate((True, False)):
-                levels += level_planes(planes, points, photos, lines, cell_m=config.planes.cell_m, up=up)
+                levels += level_planes(planes, points, grey, lines, cell_m=config.planes.cell_m, up=up)
                 report("planes", 3 + k, 6)
             planes = joined(planes, levels)
     real = np.ones(len(points), dtype=bool)
     axes = _axes(planes) if config.plain else None
     if axes is not None:
-        plain = plain_surfaces(list(cameras.values()), images, axes)
-        reflected = plain.reflected(*lines)
+        plain, reflected = plain_surfaces(photos, axes, lines)
         sight = lines[0][~reflected], lines[1][~reflected]
-        planes = with_plain(planes, plain.planes, points, sight)
+        planes = with_plain(planes, plain, points, sight)
         real = np.add.reduceat(reflected, sparse.track_start[:-1]) < 0.5 * sparse.track_length
     report("planes", 5, 6)
     planes = seen_cells(meeting(united((), planes)), list(sparse.cameras.values()))
     own = points[real], sparse.colors[real], normals[real]
-    gaussians = initial_gaussians(*own, planes, list(cameras.values()), images, config.gaussians)
+    gaussians = initial_gaussians(*own, planes, photos, config.gaussians)
     report("planes", 6, 6)
     return planes, gaussians
 

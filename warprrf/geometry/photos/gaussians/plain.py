@@ -33,6 +33,7 @@ from warprrf.geometry.photos.gaussians.edges import (
     find_lines,
     lines_through,
 )
+from warprrf.geometry.photos.posed.images import PosedPhotos
 from warprrf.geometry.planes import Plane, dilate
 from warprrf.geometry.splats.camera import Camera
 
@@ -75,56 +76,37 @@ class Pane:
         return np.asarray(crossing & ((at >= self.low) & (at <= self.high))[:, across].all(axis=1))
 
 
-@dataclass(frozen=True)
-class PlainSurfaces:
-    """What was found, in world coordinates.
-
-    Attributes:
-        planes: with the cells where photos agree on a plain surface.
-        panes: mirrors, in the room's frame.
-        axes: the room's directions, unit rows, shape ``(3, 3)``.
-    """
-
-    planes: list[Plane]
-    panes: list[Pane]
-    axes: np.ndarray
-
-    def reflected(self, eyes: np.ndarray, targets: np.ndarray) -> np.ndarray:
-        """Which lines of sight, in world coordinates, end on what a mirror shows, shape ``(L,)`` bool."""
-        eyes, targets = eyes @ self.axes.T, targets @ self.axes.T
-        return np.any(
-            [pane.between(eyes, targets) for pane in self.panes] + [np.zeros(len(eyes), bool)], axis=0
-        )
-
-
 def plain_surfaces(
-    cameras: Sequence[Camera],
-    images: Sequence[np.ndarray],
-    axes: np.ndarray,
-) -> PlainSurfaces:
-    """Planes without features that photos prove by their edges, and mirrors.
+    photos: PosedPhotos, axes: np.ndarray, sight: tuple[np.ndarray, np.ndarray]
+) -> tuple[list[Plane], np.ndarray]:
+    """Planes without features that photos prove by their edges, with the cells where photos agree on them; and which lines
+    of sight end on what a mirror shows, shape ``(L,)`` bool.
 
     Args:
-        cameras: pinhole cameras.
-        images: their photos, shape ``(H, W, 3)`` each, in [0, 1].
+        photos: of pinhole cameras, one at least.
         axes: three perpendicular directions of the room, unit rows, right-handed, shape ``(3, 3)``.
+        sight: lines of sight, from eyes to points, shape ``(L, 3)`` each.
     """
-    turn = np.eye(4)
+    turn, images = np.eye(4), photos.images
     turn[:3, :3] = axes.T
-    cameras = [replace(c, world_to_camera=c.world_to_camera @ turn) for c in cameras]
-    some = images[:: -(-len(images) // 12)] if images else []
+    cameras = [replace(c, world_to_camera=c.world_to_camera @ turn) for c in photos.cameras]
+    eyes, targets = (ends @ axes.T for ends in sight)
+    reflected = np.zeros(len(eyes), dtype=bool)
+    some = images[:: -(-len(images) // 12)]
     # 0.33: of less plain photos features show the surfaces (share of plain pixels: plain lobby 0.5, a filmed lounge 0.26)
-    if np.mean([_plain(find_edgels(image)).mean() for image in some] or 0) < 0.33:
-        return PlainSurfaces([], [], axes)
+    if np.mean([_plain(find_edgels(image)).mean() for image in some]) < 0.33:
+        return [], reflected
     with ThreadPoolExecutor(threads()) as pool:
         edgels = list(pool.map(find_edgels, images))
         plain = list(pool.map(_plain, edgels))
     lines = find_lines(cameras, images, edgels)
     lines = [x for x in lines if len(x.views) >= SURE_VIEWS and x.high - x.low >= LINE_M]
     panes, lines = _mirrors(lines, cameras)
+    for pane in panes:
+        reflected |= pane.between(eyes, targets)
     heights = _heights(lines)
     if not heights:
-        return PlainSurfaces([], panes, axes)
+        return [], reflected
     on_planes = partial(_regions_on, heights, lines, _traced(lines), panes)
     with ThreadPoolExecutor(threads()) as pool:
         seen = list(pool.map(on_planes, cameras, edgels, plain))
@@ -134,7 +116,7 @@ def plain_surfaces(
         for side in (1, -1)
         for plane in _agreed(number, side, heights, cameras, seen)
     ]
-    return PlainSurfaces([_in_world(plane, axes) for plane in planes], panes, axes)
+    return [_in_world(plane, axes) for plane in planes], reflected
 
 
 def _plain(edgels: Edgels) -> np.ndarray:
@@ -374,9 +356,7 @@ def _agreed(
     hits = np.concatenate(found)
     if not len(hits):
         return []
-    empty = Plane(
-        side * np.eye(3)[axis], side * height, np.zeros(0, dtype=np.int64), cell_m=CELL_M, plain=True
-    )
+    empty = Plane(side * np.eye(3)[axis], side * height, cell_m=CELL_M, plain=True)
     uv = empty.to_plane(hits)
     edges = empty.to_plane(bounds)  # a surface ends where its edges do
     low = np.maximum(uv.min(axis=0), edges.min(axis=0) - CELL_M)

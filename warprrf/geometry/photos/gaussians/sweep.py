@@ -21,6 +21,7 @@ from warprrf.geometry.photos.posed.images import GreyPhotos, projections
 from warprrf.geometry.planes import AROUND, Plane, dilate, plane_axes
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.photo_consistency import SIDE, patch_agreement
+from warprrf.rows import distinct_rows
 
 VIEWS = 5  # photos compared
 MIN_ANGLE_DEG = 6.0  # between any two of them, seen from the patch: without parallax every height fits
@@ -119,8 +120,9 @@ def _scored(plane: Plane, surface: Mesh | None, points: np.ndarray, photos: Grey
 
 def _blocks(plane: Plane, side: int) -> tuple[np.ndarray, np.ndarray]:
     """Middles of the blocks of ``side`` x ``side`` cells of a plane, and the block of each occupied cell."""
-    key, group = np.unique(np.argwhere(plane.occupied) // side, axis=0, return_inverse=True)
-    return plane.to_world(plane.corner + (key + 0.5) * side * plane.cell_m), group.ravel()
+    blocks = np.argwhere(plane.occupied) // side
+    first, group, _ = distinct_rows(blocks)
+    return plane.to_world(plane.corner + (blocks[first] + 0.5) * side * plane.cell_m), group
 
 
 def _rivals(this: _Scored, others: Sequence[_Scored]) -> tuple[np.ndarray, np.ndarray]:
@@ -165,8 +167,8 @@ def level_planes(
     normal = np.array([0.0, 0.0, 1.0 if up else -1.0])
     shape = np.ceil(np.abs(plane_axes(normal)[:, :2] @ (high - low)[:2]) / cell_m).astype(int) + 1
     corner = np.minimum(plane_axes(normal)[:, :2] @ low[:2], plane_axes(normal)[:, :2] @ high[:2])
-    nothing = np.zeros(0, dtype=np.int64)
-    whole = Plane(normal, 0.0, nothing, FINE_M, corner, cell_m, np.ones(shape, dtype=bool))
+    everywhere = np.ones(shape, dtype=bool)
+    whole = Plane(normal, 0.0, rms_m=FINE_M, corner=corner, cell_m=cell_m, occupied=everywhere)
     surface = plane_mesh(planes)
     agreement = _swept(whole, levels, surface, photos)
     peak = _peaks(agreement, AGREES) & ~_known(whole, levels, planes)
@@ -228,8 +230,7 @@ def _known(whole: Plane, levels: np.ndarray, planes: Sequence[Plane]) -> np.ndar
         if plane.normal @ whole.normal > 0.99:
             for k, z in enumerate(levels):
                 cells[:, 2] = z
-                near = (np.abs(plane.distance(cells)) < 0.05) & plane.covers(cells)
-                known[k] |= near.reshape(whole.occupied.shape)
+                known[k] |= plane.holds(cells, 0.05).reshape(whole.occupied.shape)
     return known
 
 

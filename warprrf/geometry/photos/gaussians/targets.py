@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from warprrf.device import launch
-from warprrf.geometry.photos.posed.images import PosedPhotos
+from warprrf.geometry.photos.posed.images import PosedPhotos, block_means
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.photo_loss import PhotoLoss
 from warprrf.kernels import exposure as kernels
@@ -58,16 +58,12 @@ class Targets:
             self.scale = scale
         if view in self.made:
             return self.made[view]
-        image, camera = np.asarray(self.photos.images[view], dtype=np.float32), self.photos.cameras[view]
-        mask = self.photos.masks[view] if self.photos.masks else None
-        height, width = image.shape[0] // scale, image.shape[1] // scale
-        rows, columns = height * scale, width * scale
-        blocks = image[:rows, :columns].reshape(height, scale, width, scale, 3)
-        small = image if scale == 1 else blocks.mean(axis=(1, 3), dtype=np.float32)
+        camera, mask = self.photos.cameras[view], self.photos.masks[view]
+        small = block_means(np.asarray(self.photos.images[view], dtype=np.float32), scale)
+        height, width, _ = small.shape
         kept = np.ones((height, width), dtype=np.float32)
         if mask is not None:
-            masked = np.asarray(mask)[:rows, :columns].reshape(height, scale, width, scale) != 0
-            kept = (~masked.any(axis=(1, 3))).astype(np.float32)
+            kept = (block_means(np.asarray(mask) != 0, scale) == 0).astype(np.float32)
             small = small * kept[..., None]
         lens = {name: getattr(camera, name) / scale for name in ("fx", "fy", "cx", "cy")}
         smaller = Camera.pinhole(width, height, world_to_camera=camera.world_to_camera, **lens)

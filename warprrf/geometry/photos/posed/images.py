@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
+from numpy.typing import DTypeLike
 
 from warprrf.device import DeviceLike, require, resolve
 from warprrf.geometry.splats.camera import Camera
@@ -22,16 +23,19 @@ class PosedPhotos:
     Attributes:
         images: in [0, 1], each ``(H, W, 3)``.
         cameras: pinhole cameras of the same sizes.
-        masks: True where a pixel takes no part, each ``(H, W)``, None for a photo without one; empty: none has one.
+        masks: True where a pixel takes no part, each ``(H, W)``, None for a photo without one; default: none has one.
     """
 
     images: Sequence[np.ndarray]
     cameras: Sequence[Camera]
     masks: Sequence[np.ndarray | None] = ()
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "masks", self.masks or [None] * len(self.images))
+
     def subset(self, chosen: Sequence[int]) -> PosedPhotos:
         """The photos of these numbers."""
-        masks = [self.masks[k] for k in chosen] if self.masks else []
+        masks = [self.masks[k] for k in chosen]
         return PosedPhotos([self.images[k] for k in chosen], [self.cameras[k] for k in chosen], masks)
 
 
@@ -70,6 +74,15 @@ class GreyPhotos:
     def device(self) -> wp.Device:
         """Where they lie."""
         return self.flat.device
+
+
+def block_means(pixels: np.ndarray, side: int, dtype: DTypeLike | None = None) -> np.ndarray:
+    """Means over squares of ``side`` pixels of an image ``(H, W)`` or ``(H, W, C)``, summed in ``dtype``; what fills no square
+    at its right and lower border is left out."""
+    rows, columns = pixels.shape[0] // side, pixels.shape[1] // side
+    whole = pixels[: rows * side, : columns * side]
+    blocks = whole.reshape(rows, side, columns, side, *pixels.shape[2:])
+    return np.asarray(blocks.mean(axis=(1, 3), dtype=dtype))
 
 
 def layout(cameras: Sequence[Camera]) -> np.ndarray:

@@ -12,7 +12,8 @@ from warprrf.geometry.photos.posed.photo_files import read_photo, spread
 from warprrf.geometry.photos.posed.poses import DepthFile, read_depth
 from warprrf.geometry.photos.posed.sparse import SparseModel
 from warprrf.geometry.photos.posed.undistort import stored_pixels
-from warprrf.geometry.splats.camera import Camera
+from warprrf.geometry.splats.camera import Camera, slopes_of
+from warprrf.rows import distinct_rows, group_means
 
 
 def range_maps(sparse: SparseModel, files: Mapping[str, DepthFile]) -> dict[str, tuple[Camera, np.ndarray]]:
@@ -37,10 +38,7 @@ def range_maps(sparse: SparseModel, files: Mapping[str, DepthFile]) -> dict[str,
             )
         share = width / lens.width * (lens.fx + lens.fy) / (camera.fx + camera.fy)
         view = camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
-        x, y = np.meshgrid(
-            (np.arange(view.width) + 0.5 - view.cx) / view.fx,
-            (np.arange(view.height) + 0.5 - view.cy) / view.fy,
-        )
+        x, y = slopes_of(view)
         columns, rows = stored_pixels(lens, np.column_stack([x.ravel(), y.ravel()]), files[name].turns).T
         place = (rows * height / lens.height).astype(int), (columns * width / lens.width).astype(int)
         known = (rows >= 0) & (columns >= 0) & (place[0] < height) & (place[1] < width)
@@ -82,14 +80,12 @@ def with_points(sparse: SparseModel, files: Mapping[str, DepthFile]) -> SparseMo
     keep = seen.sum(axis=1) >= 3
     seen = seen[keep]
     index = np.flatnonzero([name in maps for name in sparse.cameras])
-    length = seen.sum(axis=1).astype(np.int64)
     return replace(
         sparse,
         points=points[keep],
         colors=colors[keep],
         reprojection_error=np.zeros(len(seen)),
-        track_length=length,
-        track_start=np.concatenate([[0], np.cumsum(length)]).astype(np.int64),
+        track_length=seen.sum(axis=1),
         track_camera=index[np.nonzero(seen)[1]],
     )
 
@@ -116,6 +112,5 @@ def _cloud(
     xyz, rgb = np.concatenate(points).astype(np.float64), np.concatenate(colors).astype(np.float64)
     # 0.03: one point for each cube of this side
     cell = np.floor(xyz / 0.03).astype(np.int64)
-    _, group, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
-    total = [[np.bincount(group.ravel(), weights=of[:, k]) for k in range(3)] for of in (xyz, rgb)]
-    return np.array(total[0]).T / count[:, None], np.array(total[1]).T / count[:, None]
+    _, group, count = distinct_rows(cell)
+    return group_means(xyz, group, count), group_means(rgb, group, count)

@@ -72,15 +72,14 @@ class KnownCamera:
             ValueError: if it has another shape.
         """
         own = self.size if all(self.size) else (width, height)
-        sx, sy = width / own[0], height / own[1]
-        if abs(sx / sy - 1) > 0.01:
+        if abs(width / own[0] / (height / own[1]) - 1) > 0.01:
             raise ValueError(
                 f"poses: {name} is stored with {width} x {height} pixels, its lens is given for {own[0]} x {own[1]}; expected "
                 "the photos that the poses were made with, or all of them made smaller alike"
             )
         focal = own[0] / 2 / np.tan(self.angle / 2) if self.angle else 0.0
         fx, fy, cx, cy, *bends = self.lens or (focal, focal, own[0] / 2, own[1] / 2)
-        return Lens(self.model, width, height, fx * sx, fy * sy, cx * sx, cy * sy, tuple(bends))
+        return Lens(self.model, *own, fx, fy, cx, cy, tuple(bends)).resized(width, height)
 
 
 def read_poses(path: Path) -> dict[str, KnownCamera]:

@@ -23,9 +23,9 @@ from typing import Any, cast
 
 import numpy as np
 
-from warprrf.checks import check_choice, check_count
 from warprrf.device import Progress, require
-from warprrf.geometry.photos.config import LENSES, ReconstructionConfig
+from warprrf.files import folder_in_place
+from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.posed.photo_files import (
     MIN_PHOTOS,
     Photos,
@@ -102,16 +102,12 @@ def structure_from_motion(
         progress: called as ``progress("features" | "comparing" | "matching" | "mapping" | "undistorting", done, total)``.
 
     Raises:
-        ValueError: for photos that are missing, unreadable or too few, an unknown lens, or when the photos overlap too
-            little to be posed; the message names the files.
+        ValueError: for photos that are missing, unreadable or too few, or when the photos overlap too little to be posed;
+            the message names the files.
         ImportError: if pycolmap is not installed.
     """
     config = config or ReconstructionConfig()
-    lens = config.lens
-    check_choice("lens", lens, LENSES)
-    max_features = check_count("max_features", config.max_features, 100)
-    least_pixels = 10_000  # of max_pixels
-    max_pixels = check_count("max_pixels", config.max_pixels, least_pixels)
+    lens, max_features = config.lens, config.max_features
     everything = named = find_photos(photos)
     colmap = load_colmap()
     known: Any = None
@@ -144,7 +140,7 @@ def structure_from_motion(
             make = partial(_keep_known, colmap, folder, named, known, match, seed)
             inputs += [list(named.values()), *_content(known)]
         made = steps.run("model", make, version=VERSIONS["model"], inputs=inputs, outputs=["model"])
-        result = _straightened(colmap, steps, named, max_pixels)
+        result = _straightened(colmap, steps, named, config.max_pixels)
         unposed = [*result.unposed]
         if poses is not None:
             unposed += poses.unposed(everything)
@@ -487,18 +483,17 @@ def _map(
         if both is not None:
             kept = [both, *(other for other in kept[1:] if other is not model)]
     pieces: list[list[str]] = []
-    for old in folder.glob("model*"):
+    for old in folder.glob("model-*"):
         shutil.rmtree(old)
     for model in kept:
         names = sorted(_names(model).difference(*pieces))
         if len(names) < MIN_PHOTOS:
             continue
-        whole = _fresh(attempt.folder / "model")
-        model.write_binary(str(whole))
-        if not pieces:
-            choose_lens(colmap, whole, lens).write_binary(str(whole))
         pieces.append(names)
-        os.replace(whole, folder / ("model" if len(pieces) == 1 else f"model-{len(pieces)}"))
+        with folder_in_place(folder / ("model" if len(pieces) == 1 else f"model-{len(pieces)}")) as whole:
+            model.write_binary(str(whole))
+            if len(pieces) == 1:
+                choose_lens(colmap, whole, lens).write_binary(str(whole))
     report("mapping", len(named), len(named))
     return {"pieces": pieces}
 
@@ -645,18 +640,16 @@ def _keep_known(
     attempt: Attempt,
 ) -> dict[str, Any]:
     """The ``model`` of known poses into the folder ``model``, its points triangulated from the matches where asked."""
-    whole = _fresh(attempt.folder / "model")
-    if match:
-        attempt.progress("triangulating", 0, 1)
-        options = colmap.IncrementalPipelineOptions(random_seed=seed, num_threads=1)
-        working = _copied(folder / "matches.db", attempt.folder / "matches.db")
-        root = _root(photos)
-        model = colmap.triangulate_points(model, working, root, whole, options=options)
-        model.extract_colors_for_all_images(str(root))
-        attempt.progress("triangulating", 1, 1)
-    model.write_binary(str(whole))
-    shutil.rmtree(folder / "model", ignore_errors=True)
-    os.replace(whole, folder / "model")
+    with folder_in_place(folder / "model") as whole:
+        if match:
+            attempt.progress("triangulating", 0, 1)
+            options = colmap.IncrementalPipelineOptions(random_seed=seed, num_threads=1)
+            working = _copied(folder / "matches.db", attempt.folder / "matches.db")
+            root = _root(photos)
+            model = colmap.triangulate_points(model, working, root, whole, options=options)
+            model.extract_colors_for_all_images(str(root))
+            attempt.progress("triangulating", 1, 1)
+        model.write_binary(str(whole))
     return {"pieces": []}
 
 
@@ -718,7 +711,6 @@ def _sparse_model(
         p for _, p in sorted(model.points3D.items()) if p.track.elements
     ]  # what no photo shows is no use
     tracks = [sorted({position[e.image_id] for e in p.track.elements}) for p in points]
-    length = np.array([len(t) for t in tracks], dtype=np.int64)
     return SparseModel(
         cameras=cameras,
         points=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),
@@ -727,8 +719,7 @@ def _sparse_model(
             [p.error * np.mean([share[e.image_id] for e in p.track.elements]) for p in points],
             dtype=np.float64,
         ),
-        track_length=length,
-        track_start=np.concatenate([[0], np.cumsum(length)]).astype(np.int64),
+        track_length=np.array([len(t) for t in tracks], dtype=np.int64),
         track_camera=np.array([c for t in tracks for c in t], dtype=np.int64),
         unposed=tuple(n for n in names if n not in cameras),
     )

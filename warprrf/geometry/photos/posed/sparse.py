@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from warprrf.checks import check_array, check_positive
+from warprrf.checks import check_array, check_positive, check_similarity
 from warprrf.geometry.photos.posed.photo_files import match_names, some
 from warprrf.geometry.photos.posed.undistort import Lens
 from warprrf.geometry.planes import Plane, PlaneConfig, detect_planes
@@ -32,8 +33,8 @@ class SparseModel:
         colors: colour of each point in [0, 1], shape ``(P, 3)``.
         reprojection_error: mean reprojection error of each point [pixels of ``cameras``], shape ``(P,)``.
         track_length: number of photos that see each point, shape ``(P,)`` int64.
-        track_start: where each point's photos begin in ``track_camera``, shape ``(P + 1,)`` int64.
-        track_camera: photos (position in ``list(cameras)``) that see the points, shape ``(sum of track lengths,)``.
+        track_camera: photos (position in ``list(cameras)``) that see the points, point by point, shape
+            ``(sum of track lengths,)``.
         unposed: names of the photos that no pose was found for, or that lie in a smaller, separate model.
         causes: why each of these has no pose, by name, where that is known.
         pieces: names of the photos of each model that too few features join to the others; ``cameras`` are those of the first.
@@ -50,7 +51,6 @@ class SparseModel:
     colors: np.ndarray
     reprojection_error: np.ndarray
     track_length: np.ndarray
-    track_start: np.ndarray
     track_camera: np.ndarray
     unposed: tuple[str, ...] = ()
     causes: Mapping[str, str] = field(default_factory=dict)
@@ -61,6 +61,11 @@ class SparseModel:
     guessed: tuple[str, ...] = ()
     photos: dict[str, Path] = field(default_factory=dict)
     lenses: dict[str, Lens] = field(default_factory=dict)
+
+    @property
+    def track_start(self) -> np.ndarray:
+        """Where each point's photos begin in ``track_camera``, and where the last one's end, shape ``(P + 1,)`` int64."""
+        return np.append(0, np.cumsum(self.track_length))
 
     def lines_of_sight(self) -> tuple[np.ndarray, np.ndarray]:
         """Eyes and points of all tracks [m], shape ``(sum of track lengths, 3)`` each."""
@@ -74,17 +79,26 @@ class SparseModel:
 
     def subset(self, keep: np.ndarray) -> SparseModel:
         """The model with only the points where ``keep`` (boolean, shape ``(P,)``) is True."""
-        seen = np.repeat(keep, self.track_length)
-        length = self.track_length[keep]
         return replace(
             self,
             points=self.points[keep],
             colors=self.colors[keep],
             reprojection_error=self.reprojection_error[keep],
-            track_length=length,
-            track_start=np.concatenate([[0], np.cumsum(length)]),
-            track_camera=self.track_camera[seen],
+            track_length=self.track_length[keep],
+            track_camera=self.track_camera[np.repeat(keep, self.track_length)],
         )
+
+    def transformed(
+        self, *, scale: float = 1.0, rotation: ArrayLike | None = None, shift: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> SparseModel:
+        """The model with every point ``x`` at ``scale rotation x + shift``; cameras move along.
+
+        Arguments and errors: see :func:`warprrf.checks.check_similarity`.
+        """
+        scale, turn, moved = check_similarity(scale, rotation, shift)
+        how: dict[str, Any] = {"scale": scale, "rotation": turn, "shift": moved}
+        cameras = {name: camera.transformed(**how) for name, camera in self.cameras.items()}
+        return replace(self, cameras=cameras, points=scale * self.points @ turn.T + moved)
 
 
 def posed_in_words(sparse: SparseModel) -> str:
@@ -120,7 +134,7 @@ def align_to_known(sparse: SparseModel, known_positions: Mapping[str, ArrayLike]
             photo that could not be posed.
     """
     scale, rotation, shift, rms_m = known_similarity(sparse.cameras, sparse.unposed, known_positions)
-    moved = transformed(sparse, scale, rotation, shift)
+    moved = sparse.transformed(scale=scale, rotation=rotation, shift=shift)
     return replace(moved, metric=True, upright=True, scale_rms_m=rms_m)
 
 
@@ -192,7 +206,7 @@ def scaled(sparse: SparseModel, scale: Scale) -> SparseModel:
                 f"scale: {scale[0]} and {scale[1]} were taken at one place; name two photos that are far apart"
             )
         scale = scale[2] / gap
-    return replace(transformed(sparse, scale, np.eye(3), np.zeros(3)), metric=True)
+    return replace(sparse.transformed(scale=scale), metric=True)
 
 
 def assume_scale(sparse: SparseModel) -> SparseModel:
@@ -203,8 +217,7 @@ def assume_scale(sparse: SparseModel) -> SparseModel:
     assumed_distance_m = 3.0
     scale = assumed_distance_m / float(np.median(gap)) if len(gap) else 1.0
     said = f"scale: nobody measured one; the median distance that photos look is taken for {assumed_distance_m:g} m"
-    moved = transformed(sparse, scale, np.eye(3), np.zeros(3))
-    return replace(moved, guessed=(*sparse.guessed, said))
+    return replace(sparse.transformed(scale=scale), guessed=(*sparse.guessed, said))
 
 
 def fit_similarity(source: ArrayLike, target: ArrayLike) -> tuple[float, np.ndarray, np.ndarray]:
@@ -232,15 +245,6 @@ def fit_similarity(source: ArrayLike, target: ArrayLike) -> tuple[float, np.ndar
     rotation = (u * sign) @ vt
     scale = float((d * sign).sum() / (a**2).sum())
     return scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
-
-
-def transformed(sparse: SparseModel, scale: float, rotation: np.ndarray, shift: np.ndarray) -> SparseModel:
-    """``sparse`` with every point ``x`` at ``scale rotation x + shift``; cameras move along."""
-    cameras = {
-        name: camera.transformed(scale=scale, rotation=rotation, shift=shift)
-        for name, camera in sparse.cameras.items()
-    }
-    return replace(sparse, cameras=cameras, points=scale * sparse.points @ rotation.T + shift)
 
 
 NEIGHBOURS = 16  # that a point is compared with

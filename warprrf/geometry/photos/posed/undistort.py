@@ -67,6 +67,12 @@ class Lens:
         """Whether photos need no undistorting."""
         return not any(self.coefficients)
 
+    def resized(self, width: Count, height: Count) -> Lens:
+        """The lens of photos of another size that show the same."""
+        sx, sy = width / self.width, height / self.height
+        fx, fy, cx, cy = self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy
+        return replace(self, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+
 
 def pinhole_of(lens: Lens, world_to_camera: ArrayLike, turns: int, max_pixels: int) -> Camera:
     """The pinhole camera of the undistorted, upright, reduced photo.
@@ -141,9 +147,14 @@ def colmap_camera(lens: Lens, number: int = 1) -> Any:
     """``lens`` as COLMAP's camera, in a model with two focal lengths, so that it scales without rounding."""
     colmap = load_colmap()
     model = lens.model if lens.model in ("OPENCV_FISHEYE", "FULL_OPENCV") else "OPENCV"
-    bends = [*lens.coefficients, 0.0, 0.0, 0.0, 0.0][: COEFFICIENTS[model]]
-    params = [lens.fx, lens.fy, lens.cx, lens.cy, *bends]
+    params = _parameters(lens, model)
     return colmap.Camera(model=model, width=lens.width, height=lens.height, params=params, camera_id=number)
+
+
+def _parameters(lens: Lens, kind: str) -> list[float]:
+    """Numbers of ``lens`` as a lens model of COLMAP's that may have more freedom or less, ``kind``, orders them."""
+    focal = [lens.fx] if kind in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") else [lens.fx, lens.fy]
+    return [*focal, lens.cx, lens.cy, *[*lens.coefficients, 0.0, 0.0, 0.0, 0.0][: COEFFICIENTS[kind]]]
 
 
 def _reduced(lens: Lens, max_pixels: int) -> Lens:
@@ -152,10 +163,7 @@ def _reduced(lens: Lens, max_pixels: int) -> Lens:
     share = (max_pixels / (whole.width * whole.height)) ** 0.5
     if share >= 1:
         return lens
-    width, height = max(int(lens.width * share), 1), max(int(lens.height * share), 1)
-    sx, sy = width / lens.width, height / lens.height
-    fx, fy, cx, cy = lens.fx * sx, lens.fy * sy, lens.cx * sx, lens.cy * sy
-    return replace(lens, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+    return lens.resized(max(int(lens.width * share), 1), max(int(lens.height * share), 1))
 
 
 def _undistorted(lens: Lens) -> Lens:
@@ -246,10 +254,8 @@ def _adjusted(colmap: ModuleType, model: Path, kind: str, principal_point: bool)
     found = colmap.Reconstruction(str(model))
     for camera in found.cameras.values():
         lens = lens_of(camera)
-        focal = [lens.fx] if kind in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") else [lens.fx, lens.fy]
-        bends = [*lens.coefficients, 0.0, 0.0, 0.0, 0.0][: COEFFICIENTS[kind]]
         camera.model = getattr(colmap.CameraModelId, kind)
-        camera.params = np.array([*focal, lens.cx, lens.cy, *bends])
+        camera.params = np.array(_parameters(lens, kind))
     options = colmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_principal_point = principal_point

@@ -14,10 +14,10 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from warprrf.device import require
 from warprrf.geometry.mesh_files import UP
+from warprrf.geometry.photos.posed.images import block_means
 from warprrf.geometry.photos.posed.photo_files import spread
-from warprrf.geometry.photos.posed.sparse import SparseModel, clean_points, detect_room_planes, transformed
+from warprrf.geometry.photos.posed.sparse import SparseModel, clean_points, detect_room_planes
 from warprrf.geometry.planes import Plane, PlaneConfig
 from warprrf.geometry.splats.camera import Camera
 
@@ -56,23 +56,28 @@ def upright(sparse: SparseModel, photo: Callable[[str], np.ndarray], *, seed: in
     rotation = np.stack([ahead, np.cross(up, ahead), up])
     shift = -rotation @ np.mean([c.position for c in cameras], axis=0)
     shift[2] = -height
-    return replace(transformed(sparse, 1.0, rotation, shift), upright=True, guessed=tuple(guessed))
+    moved = sparse.transformed(rotation=rotation, shift=shift)
+    return replace(moved, upright=True, guessed=tuple(guessed))
 
 
 def turned(sparse: SparseModel, up: str) -> SparseModel:
     """``sparse`` with the axis ``up`` of its own, ``"x"``, ``"y"`` or ``"z"``, as z; its origin stays."""
     axes, signs = UP[up]
     rotation = np.eye(3)[axes] * np.array(signs)[:, None]
-    return replace(transformed(sparse, 1.0, rotation, np.zeros(3)), upright=True)
+    return replace(sparse.transformed(rotation=rotation), upright=True)
 
 
 def held_up(cameras: Sequence[Camera]) -> np.ndarray:
     """Unit vector that points up as cameras are held: across their x axes, which are level, and near their own up."""
     axes = np.array([c.rotation for c in cameras])
     right, up = axes[:, 0], -axes[:, 1]
-    total = right.T @ right + 0.1 * (len(up) * np.eye(3) - up.T @ up)
-    found: np.ndarray = np.linalg.eigh(total)[1][:, 0]
-    return found if found @ up.sum(axis=0) > 0 else -found
+    return _least(right.T @ right + 0.1 * (len(up) * np.eye(3) - up.T @ up), up.sum(axis=0))
+
+
+def _least(cost: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """The unit vector ``x`` of least ``x . cost x``, of symmetric ``cost`` (3, 3), that points the way of ``near``."""
+    found: np.ndarray = np.linalg.eigh(cost)[1][:, 0]
+    return found if found @ near > 0 else -found
 
 
 def vertical_of_edges(
@@ -94,8 +99,7 @@ def vertical_of_edges(
     windows_deg = (12, 8, 5, 3, 2, 1.5, 1, 0.7, 0.5, 0.5, 0.5)  # standard deviations of the window, in turn
     for window in windows_deg:
         weight = np.exp(-0.5 * (normals @ up / np.sin(np.radians(window))) ** 2)
-        found = np.linalg.eigh((normals * weight[:, None]).T @ normals)[1][:, 0]
-        up = found if found @ up > 0 else -found
+        up = _least((normals * weight[:, None]).T @ normals, up)
     off = np.degrees(np.arcsin(np.minimum(np.abs(normals @ up), 1.0)))
     # density of edges within 1 degree of the vertical over that from 4 to 10 degrees; of clutter: 1
     proven = 1.3
@@ -108,8 +112,7 @@ def _edge_planes(photo: np.ndarray, camera: Camera) -> np.ndarray:
     """Unit normals in the world of the planes that a photo's straight edges span with its centre, shape ``(E, 3)``."""
     edge_pixels = 480  # about the longer side of a photo while its edges are looked for
     step = max(1, round(max(photo.shape[:2]) / edge_pixels))
-    grey = require("skimage.measure", extra="photos").block_reduce(photo.mean(axis=2), step, np.mean)
-    grey = ndimage.gaussian_filter(grey[: photo.shape[0] // step, : photo.shape[1] // step], 0.8)
+    grey = ndimage.gaussian_filter(block_means(photo.mean(axis=2), step), 0.8)
     gy, gx = (ndimage.sobel(grey, axis) / 8 for axis in (0, 1))
     xx, xy, yy = (ndimage.gaussian_filter(product, 2.0) for product in (gx * gx, gx * gy, gy * gy))
     spread = np.hypot(xx - yy, 2 * xy)
@@ -152,8 +155,7 @@ def _vertical_of_planes(up: np.ndarray, planes: Iterable[Plane]) -> np.ndarray:
         total = (normals * (weight * sign)[:, None]).T @ normals
         # What no plane says stays as it was.
         total -= 1e-3 * max(weight.sum(), 1.0) * np.outer(up, up)
-        found = np.linalg.eigh(total)[1][:, 0]
-        up = found if found @ up > 0 else -found
+        up = _least(total, up)
     return up
 
 

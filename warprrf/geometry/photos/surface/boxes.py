@@ -18,6 +18,7 @@ from warprrf.geometry.photos.gaussians.cells import quarters
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.planes import ALIGNED_DEG, Plane
 from warprrf.geometry.splats.camera import Camera
+from warprrf.rows import distinct_rows
 
 EXACT_DEG, STRONG_M2 = 0.1, 2.0
 """A plane this parallel, with a proven area above the second, keeps its own tilt (0.1 degrees are 2 cm over 12 m): it is
@@ -336,27 +337,27 @@ def surface_of(grid: Grid, filled: np.ndarray, tolerance_m: float) -> tuple[Plan
     node = np.unravel_index(used, nodes)
     meeting = np.stack([grid.planes[a][node[a]] for a in range(3)], axis=1)
     vertices = np.linalg.solve(meeting[..., :3], meeting[..., 3:])[..., 0]
-    kinds, which = np.unique(np.concatenate(tags), axis=0, return_inverse=True)
-    mesh = Mesh(vertices, face.reshape(-1, 3))
+    tag = np.concatenate(tags)
+    first, which, _ = distinct_rows(tag)
+    kinds, mesh = tag[first], Mesh(vertices, face.reshape(-1, 3))
     plane = np.array([sign * grid.planes[a][k] for a, k, sign in kinds])
-    patches = PlanarPatches.from_planes(
-        mesh, which.ravel(), plane[:, :3], plane[:, 3], tolerance_m=tolerance_m
-    )
+    patches = PlanarPatches.from_planes(mesh, which, plane[:, :3], plane[:, 3], tolerance_m=tolerance_m)
     known = np.array([grid.known[a][k] for a, k, _ in kinds])
-    return patches, known[which.ravel()]
+    return patches, known[which]
 
 
 def votes(
     grid: Grid,
     mesh: Mesh,
     faces: FaceLevels,
+    proven: Sequence[tuple[Plane, Level]],
     cameras: Sequence[Camera],
     depths: Sequence[np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Votes for free and for solid, shape ``grid.shape`` each.
 
     A line of sight counts where its depth agrees with the mesh. It votes free at samples along it, and where it ends on
-    a plane also right before the plane, and solid right behind.
+    a plane also right before the plane, and solid right behind. So does each occupied cell of ``proven`` planes, four times.
     """
     o, d, ranges = _lines_of_sight(cameras, depths)
     hit = mesh.cast(o, d)
@@ -384,6 +385,11 @@ def votes(
         ray = np.repeat(np.arange(first, first + len(count)), count)
         step = np.arange(len(ray)) - np.repeat(np.cumsum(count) - count, count)
         free += grid.count(o[ray] + ((step + 0.5) * step_m)[:, None] * d[ray])
+    for plane, level in proven:
+        points, across = quarters(plane).reshape(-1, 3), grid.axes[level.axis]
+        points += (level.height - points @ across)[:, None] * across
+        free += grid.count(points + level.sign * BESIDE_M * across)
+        solid += grid.count(points - level.sign * BESIDE_M * across)
     return free, solid
 
 
@@ -399,15 +405,6 @@ def _lines_of_sight(
         parts.append((np.broadcast_to(camera.position, towards.shape), towards, ranges[seen]))
     o, d, ranges = (np.concatenate(p) for p in zip(*parts, strict=True))
     return o, d, ranges
-
-
-def vote_proven(grid: Grid, plane: Plane, level: Level) -> tuple[np.ndarray, np.ndarray]:
-    """Four votes of each occupied cell for free space before it, and for a solid behind, shape ``grid.shape`` each."""
-    points = quarters(plane).reshape(-1, 3)
-    axis = grid.axes[level.axis]
-    points += (level.height - points @ axis)[:, None] * axis
-    before = level.sign * BESIDE_M * axis
-    return grid.count(points + before), grid.count(points - before)
 
 
 def closed_sides(grid: Grid, mesh: Mesh, faces: FaceLevels) -> np.ndarray:

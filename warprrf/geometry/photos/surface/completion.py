@@ -31,7 +31,6 @@ from warprrf.geometry.photos.surface.boxes import (
     proven_levels,
     seen_share,
     surface_of,
-    vote_proven,
     votes,
 )
 from warprrf.geometry.planar_patches import PlanarPatches
@@ -70,11 +69,7 @@ def complete(
     claim_proven(mesh, faces, axes, proven)
 
     grid = divide(mesh, axes, levels)
-    free, solid = votes(grid, mesh, faces, cameras, depths)
-    for plane, level in proven:
-        before, behind = vote_proven(grid, plane, level)
-        free, solid = free + before, solid + behind
-
+    free, solid = votes(grid, mesh, faces, proven, cameras, depths)
     filled = least_surface(grid, free, solid, closed_sides(grid, mesh, faces))
     if filled.all():
         return _without_gaps(patches, cameras), False
@@ -146,7 +141,7 @@ def _without_gaps(patches: PlanarPatches, cameras: Sequence[Camera]) -> PlanarPa
 
 def _gaps(patches: PlanarPatches, k: int, points: np.ndarray) -> Plane:
     """The plane of patch ``k``, on whose faces ``points`` lie, with the cells of its gaps."""
-    plane = Plane(patches.normal[k], float(patches.offset[k]), np.zeros(0, dtype=np.int64), cell_m=CELL_M)
+    plane = Plane(patches.normal[k], float(patches.offset[k]), cell_m=CELL_M)
     uv = plane.to_plane(points)
     gap_m = 2.0  # gaps narrower than this are closed
     reach = 0.5 * gap_m / CELL_M

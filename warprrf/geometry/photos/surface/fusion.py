@@ -33,7 +33,7 @@ from warprrf.geometry.scans import (
     simplified,
     snapped,
 )
-from warprrf.geometry.splats.camera import Camera
+from warprrf.geometry.splats.camera import Camera, slopes_of
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.render import render
 
@@ -99,8 +99,7 @@ def _sure(
     points = view.position + depth[rest][:, None] * view.directions()[rest]
     held = np.zeros(len(points), dtype=bool)
     for plane in planes:
-        near = np.abs(plane.distance(points)) < reach_m
-        held[near] |= plane.covers(points[near])
+        held |= plane.holds(points, reach_m)
     result = depth.copy()
     result[rest] = np.where(held, depth[rest], 0.0)
     return result
@@ -235,9 +234,8 @@ def _ordered(o3d: ModuleType, raw: Any) -> Any:
 
 def range_to_depth(distance: np.ndarray, camera: Camera) -> np.ndarray:
     """Depth along the optical axis [m] of Euclidean ranges ``(H, W)`` in a pinhole image."""
-    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    return distance / np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2)
+    x, y = slopes_of(camera)
+    return distance / np.sqrt(1 + x**2 + y**2)
 
 
 def _smooth(z: np.ndarray, tolerance: float) -> np.ndarray:

@@ -88,7 +88,7 @@ def ahead(camera: Camera) -> np.ndarray:
 
 def kept_pixels(photos: PosedPhotos, number: int, camera: Camera) -> np.ndarray:
     """The pixels of a photo that are not masked, at the size of ``camera``, bool."""
-    mask = photos.masks[number] if photos.masks else None
+    mask = photos.masks[number]
     if mask is None:
         return np.full((camera.height, camera.width), True)
     rows, columns = ((np.arange(n) + 0.5) / n for n in (camera.height, camera.width))
