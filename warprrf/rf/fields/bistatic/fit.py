@@ -44,6 +44,7 @@ from warprrf.rf.positions import warn_of_unmodelled
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.tracing.model import SETS, Effects, Model
 from warprrf.rf.tracing.surface import Surface
+from warprrf.rows import distinct_rows
 
 SHORT_STEPS = 10  # of a fit that only decides about something
 BETTER = 0.995
@@ -66,6 +67,8 @@ def fit(
         if isinstance(one, SpectrumDataset) and len(one) and not (one.path_gain > one.floor).any():
             raise ValueError("ds: got no pixel above the floor, expected spectra with power to fit to")
     places = places_of(data, mesh, device)
+    ends = np.array([np.concatenate([place.transmitter, place.receiver]) for place in places])
+    ends = ends[np.sort(distinct_rows(ends)[0])]
     check_rays(places, options.rays_a_side)
     if options.effects != "auto":  # else these are decided on by what they are worth
         frequency_hz, first = frame_of(data).frequency_hz, places[0]
@@ -96,7 +99,10 @@ def fit(
         for k, own in offsets.items()
     }
     parameters = replace(model.parameters, log_gains=np.zeros(0))  # chains are of the data, not of the field
-    return found | {"parameters": parameters, "report": report | zeros | {"position_offset_m": places_moved}}
+    return found | {
+        "parameters": parameters, "report": report | zeros | {"position_offset_m": places_moved},
+        "fitted_on": ends[:, 3:], "fitted_under": ends[:, :3],
+    }  # fmt: skip
 
 
 def _learned(

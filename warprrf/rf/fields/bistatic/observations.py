@@ -34,9 +34,9 @@ from warprrf.rf.fields.bistatic.measured import (
     pixel_means,
     read,
 )
-from warprrf.rf.positions import check_dataset, check_positions, question_unit
+from warprrf.rf.positions import check_dataset
 from warprrf.rf.spectra.beam import beam_operator
-from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.dataset import SpectrumDataset, question_spectra
 from warprrf.rf.spectra.readings import Readings, fading_db, path_weights, question_readings
 from warprrf.rf.spectra.spectrum import to_db
 from warprrf.rf.tracing.model import SETS, Effects, Layout, Model, Parameters
@@ -441,16 +441,12 @@ class Kind(ABC):
     one: Any
 
     @abstractmethod
-    def places(self, mesh: Mesh | None, device: DeviceLike) -> list[Place]:
-        """Where it was taken, checked."""
+    def places(self) -> list[Place]:
+        """Where it was taken; warns of powers that nobody can have read."""
 
     @abstractmethod
     def observe(self, place: Place, view: View) -> Observation:
         """What was read at ``place``, where ``view`` is seen."""
-
-    def ends(self) -> tuple[np.ndarray, np.ndarray]:
-        """Transmitter of each receiver and the receivers [m], shape ``(R, 3)`` each."""
-        return self.one.transmitters, self.one.receivers
 
     def frame(self) -> SpectrumDataset:
         """What a field's spectra are made with, if it is the first: floor and range are those of the powers."""
@@ -469,15 +465,12 @@ class _Spectra(Kind):
 
     one: SpectrumDataset
 
-    def ends(self) -> tuple[np.ndarray, np.ndarray]:
-        return np.broadcast_to(self.one.transmitter, self.one.receivers.shape), self.one.receivers
-
-    def places(self, mesh: Mesh | None, device: DeviceLike) -> list[Place]:
+    def places(self) -> list[Place]:
         one = self.one
-        receivers, transmitter = check_dataset(mesh, one, device=device)
+        question_spectra(one)
         return [
-            Place(self.number, np.array([r]), transmitter, receiver, one.frequency_hz, one.shape, one.air, one.beam_sigma_rad)
-            for r, receiver in enumerate(receivers)
+            Place(self.number, np.array([r]), one.transmitter, receiver, one.frequency_hz, one.shape, one.air, one.beam_sigma_rad)
+            for r, receiver in enumerate(one.receivers)
         ]  # fmt: skip
 
     def observe(self, place: Place, view: View) -> Observation:
@@ -500,10 +493,9 @@ class _Tables(Kind):
     one: Readings
     _pointings: list[tuple[np.ndarray, np.ndarray] | None] = field(default_factory=list)
 
-    def places(self, mesh: Mesh | None, device: DeviceLike) -> list[Place]:
+    def places(self) -> list[Place]:
         one = self.one
         question_readings(one)
-        _check_places(mesh, one, device)
         names, chain = np.unique(np.asarray(one.chain), return_inverse=True)
         key = np.column_stack([one.transmitters, one.receivers, chain])
         first, own, count = np.unique(
@@ -553,9 +545,8 @@ class _Arrays(Kind):
 
     one: ArraySpectra
 
-    def places(self, mesh: Mesh | None, device: DeviceLike) -> list[Place]:
+    def places(self) -> list[Place]:
         one = self.one
-        _check_places(mesh, one, device)
         return [
             Place(self.number, np.array([r]), *ends, one.frequency_hz, READINGS_SHAPE, one.air)
             for r, ends in enumerate(zip(one.transmitters, one.receivers, strict=True))
@@ -645,17 +636,6 @@ def _pointings(one: Readings, view: View) -> tuple[np.ndarray, np.ndarray] | Non
     return path_weights(one, first, toward, toward, np.zeros(len(toward)), dtype=np.float32), row.reshape(-1)
 
 
-def _check_places(mesh: Mesh | None, one: Readings | ArraySpectra, device: DeviceLike) -> None:
-    wavelength_m = SPEED_OF_LIGHT / one.frequency_hz
-    if mesh is not None:
-        question_unit(mesh, wavelength_m)
-    transmitters, under = np.unique(one.transmitters, axis=0, return_inverse=True)
-    for k, transmitter in enumerate(transmitters):
-        receivers = np.unique(one.receivers[under.reshape(-1) == k], axis=0)
-        names = "ds.transmitters", "ds.receivers"
-        check_positions(mesh, transmitter, receivers, wavelength_m, names=names, device=device)
-
-
 def frame_of(data: Sequence[Measured]) -> SpectrumDataset:
     """What a field's spectra are made with, and its transmitter: the first data set of spectra, else an empty one that is like
     the first of readings."""
@@ -668,4 +648,8 @@ def places_of(data: Sequence[Measured], mesh: Mesh | None, device: DeviceLike) -
     Raises:
         ValueError: for a place where no field can hold; see :func:`warprrf.rf.positions.check_positions`.
     """
-    return [place for kind in kinds_of(data) for place in kind.places(mesh, device)]
+    found = []
+    for kind in kinds_of(data):
+        found += kind.places()
+        check_dataset(mesh, kind.one, device=device)
+    return found
