@@ -589,11 +589,6 @@ def kinds_of(data: Sequence[Measured]) -> list[Kind]:
     ]
 
 
-def chains_of(places: Sequence[Place]) -> list[str]:
-    """Names of the measuring chains of unknown gain."""
-    return sorted({place.chain for place in places} - {""})
-
-
 def observe(
     data: Sequence[Measured], seen: Sequence[Seen], frequency_hz: float, chains: Sequence[str]
 ) -> list[Observation]:
