@@ -273,7 +273,8 @@ def cross_validate(t: Training, choice: Solution) -> tuple[bool, ErrorModel | No
     for residual, error in loss.items():
         t.note("residual" if residual else "no residual", residual == keep, error)
     if not all(
-        isinstance(o.measured, SpectrumPixels) and o.target.trust is None for o in t.observations.values()
+        isinstance(o.measured, SpectrumPixels) and (o.target.trust == 1.0).all()
+        for o in t.observations.values()
     ):
         return keep, None
     shapes = [t.observations[k].place.shape for k in order]

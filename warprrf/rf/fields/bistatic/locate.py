@@ -235,7 +235,9 @@ class Question:
         few = self._tracers.setdefault((place.seen_from, quick), tracer.on_grid(place.shape, sub_pixels))
         few.beam_sigma_rad = place.beam_sigma_rad
         paths = few.paths(points, model.effects)
-        views = (few.view(point, model.effects, paths=paths.of(np.array([k]))) for k, point in enumerate(points))
+        views = (
+            few.view(point, model.effects, paths=paths.of(np.array([k]))) for k, point in enumerate(points)
+        )
         return [path_gains(view, model) for view in views]
 
     def descend(

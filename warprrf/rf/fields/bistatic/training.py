@@ -226,22 +226,20 @@ class Training:
 
     def _part(self, o: Observation) -> Observation:
         """Readings of a place that parameters are fitted to, and what they count."""
-        trust, db = o.target.trust, o.target.db
         readings, least = 12_000, 200  # of all places, and of each at least
         # Line of sight alone holds no material: it tells a chain's gain.
         known_better = 2.0
         # Of what comes through slabs more is left out (light between surfaces that passes them on its way), and what a
         # material must make up for there it lacks in the open.
         behind_walls = 0.5
-        known = np.arange(len(db)) if trust is None else np.flatnonzero(trust)
+        known = np.flatnonzero(o.target.trust)
         size = min(len(known), max(least, readings // len(self.places)))
         part = o.part(known[np.sort(self.rng.choice(len(known), size, replace=False))])
-        if part.sight is not None:
-            part = replace(part, target=part.target.trusted(1.0 + known_better * part.sight))
+        target = part.target.trusted(1.0 + known_better * part.target.sight)
         straight = o.view.paths.order == 0
         if not self.totals and (straight & (o.view.paths.slabs > 0)).any():
-            part = replace(part, target=part.target.trusted(np.full(len(part.target.db), behind_walls)))
-        return part
+            target = target.trusted(behind_walls)
+        return replace(part, target=target)
 
     def as_sought(self, effects: Effects) -> Training:
         """The same that chooses from slabs and edges as they were sought for ``effects``, and no more mirrors; of power alone
@@ -263,7 +261,7 @@ class Training:
     @property
     def telling(self) -> np.ndarray:
         """Places whose readings parameters of materials are fitted to, those of every chain among them."""
-        readings, places = sum(len(o.target.db) for o in self.parts.values()), np.array(list(self.parts))
+        readings, places = sum(len(o.target) for o in self.parts.values()), np.array(list(self.parts))
         if readings <= MOST_READINGS:
             return places
         return np.union1d(self.always, evenly(places, len(places) * MOST_READINGS // readings)).astype(int)
@@ -362,12 +360,11 @@ class Training:
         normal = 1.4826  # standard deviation over the median size of normal errors
         for k, power in zip(tables, self.predicted(model, tables), strict=True):
             o, target = self.observations[k], self.observations[k].target
-            if target.trust is not None and target.censored is not None:
-                error = target.error(power)
-                wrong = np.flatnonzero(np.abs(error) > most_db)
-                rows |= {k: wrong} if len(wrong) else {}
-                clear = ~target.censored & (target.db > clear_db)
-                left.setdefault(self.names[o.place.data], []).extend((error / target.trust)[clear])
+            error = target.error(power)
+            wrong = np.flatnonzero(np.abs(error) > most_db)
+            rows |= {k: wrong} if len(wrong) else {}
+            clear = ~target.censored & (target.db > clear_db)
+            left.setdefault(self.names[o.place.data], []).extend((error / target.trust)[clear])
         return rows, {
             name: normal * float(np.median(np.abs(errors))) for name, errors in left.items() if errors
         }
@@ -377,7 +374,7 @@ class Training:
         observations, parts = dict(self.observations), dict(self.parts)
         for k, rows in wrong.items():
             o = observations[k]
-            counts = ~np.isin(np.arange(len(o.target.db)), rows)
+            counts = ~np.isin(np.arange(len(o.target)), rows)
             observations[k] = replace(o, target=o.target.trusted(counts))
             parts[k] = replace(parts[k], target=parts[k].target.trusted(counts[parts[k].rows]))
         return replace(self, observations=observations, parts=parts)
