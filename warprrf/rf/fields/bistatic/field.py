@@ -358,13 +358,11 @@ class BistaticField(RadioField):
         if view is not None:
             return field._seen(view, uncertainty)
         return field._looked(
-            receivers, transmitter, lambda *link: field._trace_spectrum(*link, uncertainty=uncertainty)
+            receivers, transmitter, lambda *link: field._seen(field._view(*link), uncertainty)
         )
 
-    def _trace_spectrum(
-        self, receiver: np.ndarray, transmitter: np.ndarray, *, uncertainty: bool = False
-    ) -> Spectrum:
-        return self._seen(self._view(receiver, transmitter), uncertainty)
+    def _trace_spectrum(self, receiver: np.ndarray, transmitter: np.ndarray) -> Spectrum:
+        return self._seen(self._view(receiver, transmitter), False)
 
     def _seen(self, view: View, uncertainty: bool) -> Spectrum:
         gains = self.path_gains(view)
