@@ -277,3 +277,13 @@ def test_a_room_in_millimetres_is_refused_before_it_is_cut_to_elements():
             pytest.raises(ValueError, match="geometry.*elements.*millimetres"),
         ):
             ask()
+
+
+def test_errors_name_the_row_of_a_link_whatever_else_is_under_its_transmitter(field):
+    """A solid's receiver, the third of three under two transmitters; and in a table that has others twice."""
+    other = TX + [0.3, 0.0, 0.0]
+    with pytest.raises(ValueError, match=r"receivers\[2\].*inside a solid"):
+        field.spectrum([AIR, AIR, IN_CUPBOARD], [other, TX, other])
+    table = wr.Readings(TX, [AIR, AIR, IN_CUPBOARD, AIR + 0.1], np.full(4, 1e-9), F, 1e-14)
+    with pytest.raises(ValueError, match=r"ds.receivers\[2\].*inside a solid"):
+        wr.RadioField.fit(scene(), table)

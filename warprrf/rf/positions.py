@@ -25,7 +25,9 @@ from warprrf.checks import Positive, check_array, checked, warn
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.spectra.dataset import SpectrumDataset, question_spectra
+from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.readings import PowerTable
+from warprrf.rows import distinct_rows
 
 WALL_CLEARANCE_M = 1e-4
 """Positions nearer to a surface than this count as on it [m]."""
@@ -151,7 +153,7 @@ def check_positions(
 
     Args:
         mesh: What blocks; None checks distances between antennas alone.
-        transmitter: Position [m], shape ``(3,)``.
+        transmitter: Position [m], shape ``(3,)``, or that of each receiver, ``(R, 3)``; each link is looked at once.
         receivers: Positions [m], shape ``(3,)`` or ``(R, 3)``.
         wavelength_m: Wavelength [m].
         names: Of the two arguments.
@@ -166,12 +168,29 @@ def check_positions(
     Warns:
         UserWarning: if a receiver is within a wavelength of the transmitter.
     """
-    many = np.ndim(receivers) == 2
-    points = np.concatenate([transmitter[None], np.reshape(receivers, (-1, 3))])
-    labels = [names[0], *((f"{names[1]}[{k}]" for k in range(len(points) - 1)) if many else names[1:])]
-    _check_apart(points, wavelength_m, labels)
-    if mesh is None:
-        return
+    to = np.reshape(receivers, (-1, 3))
+    rows = [f"{names[1]}[{k}]" for k in range(len(to))] if np.ndim(receivers) == 2 else [names[1]]
+    asked = [(transmitter, np.arange(len(to)))]
+    if np.ndim(transmitter) == 2:
+        first = np.sort(distinct_rows(np.column_stack([transmitter, to]))[0])
+        asked = [(source, first[own]) for source, own in Ends(to[first], transmitter[first], False).groups()]
+    for source, own in asked:
+        points, labels = np.concatenate([source[None], to[own]]), [names[0], *(rows[k] for k in own)]
+        _check_apart(points, wavelength_m, labels)
+        if mesh is not None:
+            _check_in_air(mesh, points, labels, known, on_surfaces, device)
+
+
+def _check_in_air(
+    mesh: Mesh,
+    points: np.ndarray,
+    labels: list[str],
+    known: np.ndarray | None,
+    on_surfaces: bool,
+    device: DeviceLike,
+) -> None:
+    """:func:`check_positions` of a transmitter and its receivers, ``points`` (1 + R, 3), whose names are ``labels``."""
+    transmitter = points[0]
     reference = transmitter if known is None else known
     apart = parted(mesh, points, reference, device=device)
     if (
@@ -191,22 +210,19 @@ def check_positions(
     _refuse(apart, "inside a solid", points, labels, mesh)
 
 
-def check_dataset(
-    mesh: Mesh | None, ds: SpectrumDataset, *, device: DeviceLike = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Receivers (R, 3) and transmitter (3,) of ``ds`` [m], if a field of this mesh can be fitted to what they measured.
+def check_dataset(mesh: Mesh | None, ds: SpectrumDataset | PowerTable, *, device: DeviceLike = None) -> None:
+    """Refuse a data set that no field of this mesh can be fitted to.
 
-    Raises, warns: as :func:`check_positions`, :func:`question_unit` and
-    :func:`~warprrf.rf.spectra.dataset.question_spectra`.
+    Raises, warns: as :func:`check_positions` and :func:`question_unit`.
     """
-    receivers, transmitter, wavelength_m = ds.receivers, ds.transmitter, SPEED_OF_LIGHT / ds.frequency_hz
-    question_spectra(ds)
+    wavelength_m, name = (
+        SPEED_OF_LIGHT / ds.frequency_hz,
+        "transmitters" if isinstance(ds, PowerTable) else "transmitter",
+    )
     if mesh is not None:
         question_unit(mesh, wavelength_m)
-    check_positions(
-        mesh, transmitter, receivers, wavelength_m, names=("ds.transmitter", "ds.receivers"), device=device
-    )
-    return receivers, transmitter
+    names = f"ds.{name}", "ds.receivers"
+    check_positions(mesh, getattr(ds, name), ds.receivers, wavelength_m, names=names, device=device)
 
 
 def parted(

@@ -520,11 +520,10 @@ class RadioField(ABC):
                 of the fitted transmitter, or a receiver within the transmitter's reactive near field.
         """
         ends = Ends.of(receivers, self.transmitter if transmitter is None else transmitter, name)
-        for source, own in ends.groups():
-            check_positions(
-                self.mesh, source, ends.shaped(ends.receivers[own]), SPEED_OF_LIGHT / self.frequency_hz,
-                names=("transmitter", name), known=self.transmitter, device=self.device,
-            )  # fmt: skip
+        check_positions(
+            self.mesh, ends.transmitters, ends.shaped(ends.receivers), SPEED_OF_LIGHT / self.frequency_hz,
+            names=("transmitter", name), known=self.transmitter, device=self.device,
+        )  # fmt: skip
         return ends
 
     def trace_links(self, ends: Ends, options: LinkOptions) -> Links:

@@ -53,7 +53,6 @@ from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, read
 from warprrf.rf.fields.bistatic.observations import (
     as_list,
     frame_of,
-    kinds_of,
     places_of,
 )
 from warprrf.rf.fields.bistatic.options import SUB_PIXELS, FitOptions, assumed, evenly
@@ -188,15 +187,12 @@ class BistaticField(RadioField):
             return cls._unmeasured(geometry, data, chosen, device)
         found = fit(geometry, data, chosen, client=client, device=device, progress=progress)
         frame = frame_of(data)
-        ends = np.concatenate([np.column_stack(kind.ends()) for kind in kinds_of(data)])
-        ends = ends[np.sort(np.unique(ends, axis=0, return_index=True)[1])]
-        receivers = ends[(ends[:, :3] == frame.transmitter).all(axis=1), 3:]
         fitted = replace(
-            cls.prior(found["surface"], frame, sub_pixels=chosen.rays_a_side, device=device),
-            **found, fitted_on=ends[:, 3:], fitted_under=ends[:, :3],
-        )  # fmt: skip
+            cls.prior(found["surface"], frame, sub_pixels=chosen.rays_a_side, device=device), **found
+        )
         if any(isinstance(one, SpectrumDataset) for one in data):
             return fitted
+        receivers = found["fitted_on"][(found["fitted_under"] == frame.transmitter).all(axis=1)]
         gains = np.stack([fitted.spectrum(place).path_gain for place in evenly(receivers, 8)])
         floor = default_floor(gains)
         return replace(
@@ -362,13 +358,11 @@ class BistaticField(RadioField):
         if view is not None:
             return field._seen(view, uncertainty)
         return field._looked(
-            receivers, transmitter, lambda *link: field._trace_spectrum(*link, uncertainty=uncertainty)
+            receivers, transmitter, lambda *link: field._seen(field._view(*link), uncertainty)
         )
 
-    def _trace_spectrum(
-        self, receiver: np.ndarray, transmitter: np.ndarray, *, uncertainty: bool = False
-    ) -> Spectrum:
-        return self._seen(self._view(receiver, transmitter), uncertainty)
+    def _trace_spectrum(self, receiver: np.ndarray, transmitter: np.ndarray) -> Spectrum:
+        return self._seen(self._view(receiver, transmitter), False)
 
     def _seen(self, view: View, uncertainty: bool) -> Spectrum:
         gains = self.path_gains(view)

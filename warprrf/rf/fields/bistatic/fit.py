@@ -33,7 +33,6 @@ from warprrf.rf.fields.bistatic.training import (
     MERGES,
     MOST_KEPT,
     MOST_TO_CHOOSE,
-    Split,
     Training,
     check_rays,
     rays_of,
@@ -44,6 +43,7 @@ from warprrf.rf.positions import warn_of_unmodelled
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.tracing.model import SETS, Effects, Model
 from warprrf.rf.tracing.surface import Surface
+from warprrf.rows import distinct_rows
 
 SHORT_STEPS = 10  # of a fit that only decides about something
 BETTER = 0.995
@@ -66,6 +66,8 @@ def fit(
         if isinstance(one, SpectrumDataset) and len(one) and not (one.path_gain > one.floor).any():
             raise ValueError("ds: got no pixel above the floor, expected spectra with power to fit to")
     places = places_of(data, mesh, device)
+    ends = np.array([np.concatenate([place.transmitter, place.receiver]) for place in places])
+    ends = ends[np.sort(distinct_rows(ends)[0])]
     check_rays(places, options.rays_a_side)
     if options.effects != "auto":  # else these are decided on by what they are worth
         frequency_hz, first = frame_of(data).frequency_hz, places[0]
@@ -78,17 +80,15 @@ def fit(
     tell("patches", 0, 1)
     surface = Surface.of(geometry)
     tell("patches", 1, 1)
-    look = partial(
-        trace, surface, sub_pixels=options.rays_a_side, client=client, device=device, progress=progress
-    )
+    look = partial(trace, sub_pixels=options.rays_a_side, client=client, device=device, progress=progress)
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
     with threadpool_limits(1, user_api="blas"):
-        t, model, found, zeros = _learned(data, places, look, options, progress)
+        t, model, found, zeros = _learned(surface, data, places, look, options, progress)
         offsets = _offsets(t, model)
         if offsets:
             data = [moved(one, offsets[k]) if k in offsets else one for k, one in enumerate(t.data)]  # type: ignore[arg-type]
             places = places_of(data, mesh, device)
-            t, model, found, _ = _learned(data, places, look, options, progress)
+            t, model, found, _ = _learned(surface, data, places, look, options, progress)
     report = found["report"]
     warn_of(t.data, report)
     places_moved = {
@@ -96,10 +96,14 @@ def fit(
         for k, own in offsets.items()
     }
     parameters = replace(model.parameters, log_gains=np.zeros(0))  # chains are of the data, not of the field
-    return found | {"parameters": parameters, "report": report | zeros | {"position_offset_m": places_moved}}
+    return found | {
+        "parameters": parameters, "report": report | zeros | {"position_offset_m": places_moved},
+        "fitted_on": ends[:, 3:], "fitted_under": ends[:, :3],
+    }  # fmt: skip
 
 
 def _learned(
+    surface: Surface,
     data: Sequence[Measured],
     places: Sequence[Place],
     look: Callable[..., tuple[list[Seen], Effects]],
@@ -110,16 +114,14 @@ def _learned(
 
     With many receivers some decide about effects and materials; what the others see is traced with those effects alone.
     """
-    rng = np.random.default_rng(options.seed)
-    split = Split.of(places, options.quick, rng)
-    candidates = options.candidates(frame_of(data).frequency_hz)
-    sought = candidates[0] if len(candidates) == 1 else None
+    t = Training.of(surface, data, places, options, progress)
+    given = t.candidates[0] if len(t.candidates) == 1 else None
     decides = options.effects == "auto" and options.relevance is None
     started = time.perf_counter()
-    seen, sought = look([places[k] for k in split.deciding], effects=sought, decides=decides)
+    seen, sought = look(surface, [places[k] for k in t.deciding], effects=given, decides=decides)
     tracing_s = time.perf_counter() - started
     data, zeros = with_zeros(data, seen)
-    t = Training.of(seen, sought, split, data, options, rng, progress)
+    t = replace(t, data=data).as_sought(sought).and_at(t.deciding, seen)
     del seen  # and with them records, once the training has none
     started = time.perf_counter()
     choice = choose(t)
@@ -128,9 +130,11 @@ def _learned(
         keeps = rays_of(places, options.rays_a_side) <= MOST_KEPT
         t = t if keeps else t.without_records()
         again = time.perf_counter()
-        more, _ = look([places[k] for k in others], effects=choice.effects, decides=False, keeps=keeps)
+        more, _ = look(
+            surface, [places[k] for k in others], effects=choice.effects, decides=False, keeps=keeps
+        )
         tracing_s += time.perf_counter() - again
-        t = t.and_at(others, more, rng)
+        t = t.and_at(others, more)
     residual, errors = cross_validate(t, choice)
     choice, model = everyone(t, choice, residual)
     wrong, noise_db = t.unexplained(model)
@@ -156,14 +160,14 @@ def choose(t: Training) -> Solution:
     start = t.start(material)
     trials = [Solution(effects, material, start, np.zeros((0, 0)), []) for effects in t.candidates]
     least_held = 2 if len(trials) > 1 else 1  # to choose effects by: one alone likes what others do not
-    if len(t.split.held) < least_held:
+    if len(t.held) < least_held:
         return _choose_of_few(t, trials)
     best, least = None, np.inf
     for trial in trials:  # each holds the one before it: what is no better with some is not tried with more
         if best is None:
-            trial = t.refined(trial, t.split.few(1), 2 * SHORT_STEPS, rounds=2)
+            trial = t.refined(trial, t.few(1), 2 * SHORT_STEPS, rounds=2)
         else:
-            trial = t.refined(replace(best, effects=trial.effects), t.split.few(1), SHORT_STEPS)
+            trial = t.refined(replace(best, effects=trial.effects), t.few(1), SHORT_STEPS)
         loss = t.held_loss(trial)
         kept = loss < BETTER * least
         t.note(_name(trial.effects), kept, loss)
@@ -181,12 +185,12 @@ def choose(t: Training) -> Solution:
 def _spared(t: Training, best: Solution, least: float) -> tuple[Solution, float]:
     """``best`` and its loss without those of :data:`RARE` that readings are predicted better without. Places held out are too
     few to say so alone: none of them may be behind a wall."""
-    chosen, places = best, np.union1d(t.split.few(1), t.split.held)
+    chosen, places = best, np.union1d(t.few(1), t.held)
     for name, on in RARE.items() if t.options.effects == "auto" and t.options.relevance is None else ():
         off: dict[str, Any] = dict.fromkeys(on, 0)
         fewer = replace(chosen.effects, **off)
         if fewer != chosen.effects:
-            trial = t.refined(replace(chosen, effects=fewer), t.split.few(1), SHORT_STEPS)
+            trial = t.refined(replace(chosen, effects=fewer), t.few(1), SHORT_STEPS)
             loss = t.part_loss(trial, places)
             kept = loss < BETTER * t.part_loss(chosen, places)
             t.note(f"no {name}", kept, loss)
@@ -197,8 +201,8 @@ def _spared(t: Training, best: Solution, least: float) -> tuple[Solution, float]
 def _choose_of_few(t: Training, trials: list[Solution]) -> Solution:
     """With too few receivers to hold any out: bounces as rooms have them, unless none fit much better."""
     if len(trials) == 1:
-        return t.refined(trials[0], t.split.kept, t.options.iterations, rounds=2)
-    single, room = (t.refined(trial, t.split.kept, t.options.iterations, rounds=2) for trial in trials[:2])
+        return t.refined(trials[0], t.kept, t.options.iterations, rounds=2)
+    single, room = (t.refined(trial, t.kept, t.options.iterations, rounds=2) for trial in trials[:2])
     models = [t.model(trial) for trial in (single, room)]
     wrong, also = (t.unexplained(model)[0] for model in models)
     counted = t.without({k: np.intersect1d(rows, also[k]) for k, rows in wrong.items() if k in also})
@@ -213,7 +217,7 @@ def _choose_of_few(t: Training, trials: list[Solution]) -> Solution:
 def merged(t: Training, best: Solution, least: float) -> Solution:
     """Materials by what the readings say, if that lowers the error of the places held out."""
     trial, by_shape = best, t.surface.by_shape
-    problem = t.problem(best.effects, best.material, t.split.few(2), best.parameters)
+    problem = t.problem(best.effects, best.material, t.few(2), best.parameters)
     for _ in range(MERGES):
         material, start = merge(problem, trial.parameters, t.surface.appearance, t.area, by_shape=by_shape)
         # What surfaces get of each other changes little with who is of which material: it is held.
@@ -222,7 +226,7 @@ def merged(t: Training, best: Solution, least: float) -> Solution:
         t.step()
     loss = t.held_loss(trial)
     # Few receivers held out say little, fewer materials that describe the others better say much.
-    same = len(t.split.kept) <= MOST_TO_CHOOSE  # receivers of both fits
+    same = len(t.kept) <= MOST_TO_CHOOSE  # receivers of both fits
     simpler = same and trial.losses[-1:] < best.losses[-1:]
     not_much_worse = 1.25
     keep = loss < least or (simpler and loss < not_much_worse * least)
@@ -242,7 +246,7 @@ def cross_validate(t: Training, choice: Solution) -> tuple[bool, ErrorModel | No
     """Whether the residual is wanted, or does not clearly raise the error of places held out, and the errors that then
     remain: of those held out; where they are few, of all, held out in turn. No errors where no whole spectra were measured."""
     free = isinstance(t.options.effects, str) and choice.effects.residual
-    if not len(t.split.held):
+    if not len(t.held):
         return choice.effects.residual, None
     places = np.stack([o.place.receiver for o in t.observations.values()])
     tried = (False, True) if free else (choice.effects.residual,)
@@ -251,7 +255,7 @@ def cross_validate(t: Training, choice: Solution) -> tuple[bool, ErrorModel | No
     gaps, most_to_judge = [], 200  # receivers that a residual is learned from: more make it no worse
     for held in _folds(t):
         kept = evenly(np.setdiff1d(np.arange(len(places)), held), most_to_judge)
-        own = choice if held is t.split.held else t.refined(choice, kept, SHORT_STEPS)
+        own = choice if held is t.held else t.refined(choice, kept, SHORT_STEPS)
         order += held.tolist()
         gaps += [np.linalg.norm(places[kept] - places[r], axis=1).min() for r in held]
         for residual, found in power.items():
@@ -269,7 +273,8 @@ def cross_validate(t: Training, choice: Solution) -> tuple[bool, ErrorModel | No
     for residual, error in loss.items():
         t.note("residual" if residual else "no residual", residual == keep, error)
     if not all(
-        isinstance(o.measured, SpectrumPixels) and o.target.trust is None for o in t.observations.values()
+        isinstance(o.measured, SpectrumPixels) and (o.target.trust == 1.0).all()
+        for o in t.observations.values()
     ):
         return keep, None
     shapes = [t.observations[k].place.shape for k in order]
@@ -283,10 +288,10 @@ def cross_validate(t: Training, choice: Solution) -> tuple[bool, ErrorModel | No
 
 def _folds(t: Training) -> list[np.ndarray]:
     """Places that are held out in turn to learn errors."""
-    folds = [t.split.held]
+    folds = [t.held]
     if len(t.observations) <= FEW_RECEIVERS:
-        others = np.setdiff1d(t.split.kept, t.split.always)
-        folds += np.array_split(others, max(len(others) // max(len(t.split.held), 2), 2))
+        others = np.setdiff1d(t.kept, t.always)
+        folds += np.array_split(others, max(len(others) // max(len(t.held), 2), 2))
     return folds
 
 

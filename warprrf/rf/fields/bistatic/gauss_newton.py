@@ -78,7 +78,7 @@ class Batch:
         found = []
         for every in alike.values():
             lobes, moments, _ = columns[every[0]].single.shape[1:]
-            numbers = len(material) * lobes * moments * sum(len(observations[k].target.db) for k in every)
+            numbers = len(material) * lobes * moments * sum(len(observations[k].target) for k in every)
             count = max(ceil(numbers / MOST_NUMBERS), 1)
             for own in np.array_split(every, min(count, len(every))):
                 parts = Columns.joined([columns[k] for k in own])
@@ -98,7 +98,7 @@ class Batch:
     @property
     def counts(self) -> list[int]:
         """How many readings each observation has, ``(B,)``."""
-        return [len(o.target.db) for o in self.observations]
+        return [len(o.target) for o in self.observations]
 
     @cached_property
     def target(self) -> Target:
@@ -179,8 +179,7 @@ class Batch:
         """Slopes ``table`` (C, N) of ``power`` (N,) where what changes all readings of an observation alike changes nothing."""
         for o, own in zip(self.observations, self.own, strict=True):
             if o.chain == OWN_GAIN:
-                trust = np.ones(own.stop - own.start) if o.target.trust is None else o.target.trust
-                known = (trust > 0).astype(float)
+                known = (o.target.trust > 0).astype(float)
                 alike = table[:, own] @ known / max(float(known @ power[own]), 1e-300)
                 table[:, own] -= alike[:, None] * power[own]
         return table
@@ -354,7 +353,7 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
         )
     layout = layout_of(problem, start)
     vector, damping, weight = layout.pack(start), 1e-3, 1.0 / NOISE_DB**2
-    count = max(sum(len(o.target.db) for o in problem.observations), 1)
+    count = max(sum(len(o.target) for o in problem.observations), 1)
     hessian, losses = np.eye(layout.size), []
     if steps == 0:
         hessian = _normal_equations(problem, start, layout)[0]
@@ -418,8 +417,8 @@ def _first_gain(problem: Problem, start: Parameters, chain: int) -> float:
     """ln of the gain that makes the chain's readings agree with what ``start`` predicts, in the median of their power."""
     ratio = [np.zeros(0)]
     for batch, _, expected in problem.evaluated(start):
-        read, censored = np.expm1(batch.target.db / NEPER), batch.target.censored
-        known = (read > 0) & (expected > 0) & (True if censored is None else ~censored)
+        read = np.expm1(batch.target.db / NEPER)
+        known = (read > 0) & (expected > 0) & ~batch.target.censored
         known &= np.repeat(batch.chain, batch.counts) == chain
         ratio.append(np.log(read[known] / expected[known]))
     every = np.concatenate(ratio)

@@ -182,9 +182,8 @@ class WeighedPaths:
     def turned(cls, view: View, weigh: Weigh, of_bin: np.ndarray, row: np.ndarray) -> WeighedPaths:
         """Those of one receiver that depend on arrival alone: bins are pixels, ``of_bin`` (D, B) that of their
         directions (:func:`pixel_means`), of which each reading is a ``row`` (N,)."""
-        hit = view.hits.face >= 0
-        pixel = np.arange(len(hit)) // view.tracer.grid.per_pixel
-        return cls(np.where(hit, pixel, -1), of_bin, row, _of_direct(view, weigh))
+        pixel = _pixel_of(len(view.hits.face), view.tracer.grid.per_pixel)
+        return cls(pixel, of_bin, row, _of_direct(view, weigh))
 
     @classmethod
     def of(

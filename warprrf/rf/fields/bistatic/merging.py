@@ -113,9 +113,8 @@ def _costs(problem: Problem, p: Parameters, unit_of: np.ndarray, owner: np.ndarr
                 change += (share - share[owner[unit]])[:, None] * c.further[a]
             own = np.flatnonzero(change.any(axis=0))
             new = np.maximum(power[own] + gain[own] * change[:, own], 0.0)
-            rise = (
-                huber(batch.target.part(own).error(new), batch.huber_db[own])[0].sum(axis=1) - loss[own].sum()
-            )
+            error = batch.target.take(own).error(new)
+            rise = huber(error, batch.huber_db[own])[0].sum(axis=1) - loss[own].sum()
             out[unit] += rise / NOISE_DB**2
     return out
 

@@ -23,7 +23,7 @@ from warprrf.kernels.radio.records import EXCESS_COLUMN, MIRROR, MIRRORED_COLUMN
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.fresnel import fresnel_curves
-from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT
+from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import Data, Measured
 from warprrf.rf.fields.bistatic.measured import (
     ArrayImage,
@@ -34,15 +34,17 @@ from warprrf.rf.fields.bistatic.measured import (
     pixel_means,
     read,
 )
-from warprrf.rf.positions import check_dataset, check_positions, question_unit
+from warprrf.rf.positions import check_dataset
 from warprrf.rf.spectra.beam import beam_operator
-from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.dataset import SpectrumDataset, question_spectra
+from warprrf.rf.spectra.levels import free_space_gain
 from warprrf.rf.spectra.readings import Readings, fading_db, path_weights, question_readings
 from warprrf.rf.spectra.spectrum import to_db
 from warprrf.rf.tracing.model import SETS, Effects, Layout, Model, Parameters
 from warprrf.rf.tracing.records import Bins, Materials
 from warprrf.rf.tracing.render import PathGains, materials_of, path_gains
 from warprrf.rf.tracing.tracer import SPECULAR, View
+from warprrf.rows import Rows
 
 OWN_GAIN = -2
 """In place of a measuring chain's index: readings of one place whose common gain is not known. Their sum tells it."""
@@ -125,40 +127,31 @@ def as_list(data: Data) -> list[Measured]:
 
 
 @dataclass(frozen=True)
-class Target:
+class Target(Rows):
     """What was read at one receiver, and how errors of it count.
 
     Attributes:
         db: readings, 10 log10(P / N0 + 1), shape ``(N,)``.
-        trust: by which errors are multiplied: 1 but for readings with noise of their own, 0 for those left out, shape
-            ``(N,)``; None for 1.
-        censored: readings that only say that there was no more, shape ``(N,)`` bool; None for none.
+        trust: by which errors are multiplied: 1, as by default, but for readings with noise of their own; 0 for those left out,
+            shape ``(N,)``.
+        censored: readings that only say that there was no more, shape ``(N,)`` bool; by default none.
+        sight: share of line of sight in each before any measurement, where those of it alone, which hold no material, count for
+            more, shape ``(N,)``; by default 0.
     """
 
     db: np.ndarray
-    trust: np.ndarray | None = None
-    censored: np.ndarray | None = None
+    trust: np.ndarray = None  # type: ignore[assignment]  # these are made when they are not given
+    censored: np.ndarray = None  # type: ignore[assignment]
+    sight: np.ndarray = None  # type: ignore[assignment]
 
-    @classmethod
-    def joined(cls, parts: Sequence[Target]) -> Target:
-        """Readings of several one after another."""
-        db, trust, censored = (
-            None
-            if all(getattr(t, name) is None for t in parts)
-            else np.concatenate(
-                [np.full(len(t.db), nothing) if (own := getattr(t, name)) is None else own for t in parts]
-            )
-            for name, nothing in (("db", 0.0), ("trust", 1.0), ("censored", False))
-        )
-        return cls(np.zeros(0) if db is None else db, trust, censored)
+    def __post_init__(self) -> None:
+        for name, value in (("trust", 1.0), ("censored", False), ("sight", 0.0)):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, np.broadcast_to(value, self.db.shape))
 
-    def part(self, index: np.ndarray) -> Target:
-        """Some of the readings."""
-        return Target(*(None if a is None else a[index] for a in (self.db, self.trust, self.censored)))  # type: ignore[arg-type]
-
-    def trusted(self, trust: np.ndarray) -> Target:
-        """The same with errors multiplied by ``trust`` (N,)."""
-        return replace(self, trust=trust * (1.0 if self.trust is None else self.trust))
+    def trusted(self, trust: np.ndarray | float) -> Target:
+        """The same with errors multiplied by ``trust``, (N,) or one number."""
+        return replace(self, trust=trust * self.trust)
 
     def gain(self, power: np.ndarray) -> float:
         """Under which predicted powers (N,) in units of the floor have the sum of what was read."""
@@ -167,22 +160,18 @@ class Target:
 
     def sums(self, power: np.ndarray) -> tuple[float, float]:
         """All that was read, and what predicted powers (N,) have of it, in units of the floor."""
-        known = 1.0 if self.trust is None else self.trust > 0
+        known = self.trust > 0
         return float((known * np.expm1(self.db / NEPER)).sum()), float((known * power).sum())
 
     def error(self, power: np.ndarray) -> np.ndarray:
         """Error of predicted powers ``(..., N)`` in units of the floor, as it counts [dB]."""
         error = NEPER * np.log1p(power) - self.db
-        if self.censored is not None:
-            error = np.where(self.censored, np.maximum(error, 0.0), error)
-        return np.asarray(error if self.trust is None else self.trust * error)
+        return np.asarray(self.trust * np.where(self.censored, np.maximum(error, 0.0), error))
 
     def slope(self, power: np.ndarray) -> np.ndarray:
         """Derivative of :meth:`error` to the power ``(N,)``."""
-        slope = NEPER / (1.0 + power)
-        if self.censored is not None:
-            slope = np.where(self.censored & (NEPER * np.log1p(power) <= self.db), 0.0, slope)
-        return np.asarray(slope if self.trust is None else self.trust * slope)
+        flat = self.censored & (NEPER * np.log1p(power) <= self.db)
+        return np.asarray(self.trust * np.where(flat, 0.0, NEPER / (1.0 + power)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,8 +190,6 @@ class Observation:
             readings that fade, whose decibels have a long tail of their own, and for totals, which may miss a mirror of
             metal: priors have weaker ones.
         robust: whether single readings may be wrong, so that errors count so among places held out too.
-        sight: share of line of sight in each reading before any measurement, where those of it alone, which hold no
-            material, count for more, shape ``(N,)``; else None.
         rows: which of the place's readings these are, shape ``(N,)``; None for all.
     """
 
@@ -215,16 +202,12 @@ class Observation:
     ratio: float = 1.0
     huber_db: float = HUBER_DB
     robust: bool = True
-    sight: np.ndarray | None = None
     rows: np.ndarray | None = None
     _kept: Cache = field(init=False, repr=False, default_factory=lambda: Cache(3))
 
     def part(self, index: np.ndarray) -> Observation:
         """That of some of the readings."""
-        sight = None if self.sight is None else self.sight[index]
-        return replace(
-            self, measured=self.measured.part(index), target=self.target.part(index), rows=index, sight=sight
-        )
+        return replace(self, measured=self.measured.part(index), target=self.target.take(index), rows=index)
 
     def losses(self, power: np.ndarray) -> np.ndarray:
         """Squared errors (N,) of predicted readings as they count [dB^2]."""
@@ -409,7 +392,7 @@ class Columns:
 
 def columns_of(o: Observation, effects: Effects, p: Parameters) -> Columns:
     """Those of an observation's groups, as light comes to them under parameters ``p`` of groups at the fit's carrier."""
-    p, count = p.at_ratio(o.ratio), len(o.target.db)
+    p, count = p.at_ratio(o.ratio), len(o.target)
     materials = materials_of(o.view.tracer, p, effects)
     groups, single = np.zeros(0, int), np.zeros((0, len(p.lobes), 3, count), np.float32)
     if effects.scatterings:
@@ -441,16 +424,12 @@ class Kind(ABC):
     one: Any
 
     @abstractmethod
-    def places(self, mesh: Mesh | None, device: DeviceLike) -> list[Place]:
-        """Where it was taken, checked."""
+    def places(self) -> list[Place]:
+        """Where it was taken; warns of powers that nobody can have read."""
 
     @abstractmethod
     def observe(self, place: Place, view: View) -> Observation:
         """What was read at ``place``, where ``view`` is seen."""
-
-    def ends(self) -> tuple[np.ndarray, np.ndarray]:
-        """Transmitter of each receiver and the receivers [m], shape ``(R, 3)`` each."""
-        return self.one.transmitters, self.one.receivers
 
     def frame(self) -> SpectrumDataset:
         """What a field's spectra are made with, if it is the first: floor and range are those of the powers."""
@@ -469,15 +448,12 @@ class _Spectra(Kind):
 
     one: SpectrumDataset
 
-    def ends(self) -> tuple[np.ndarray, np.ndarray]:
-        return np.broadcast_to(self.one.transmitter, self.one.receivers.shape), self.one.receivers
-
-    def places(self, mesh: Mesh | None, device: DeviceLike) -> list[Place]:
+    def places(self) -> list[Place]:
         one = self.one
-        receivers, transmitter = check_dataset(mesh, one, device=device)
+        question_spectra(one)
         return [
-            Place(self.number, np.array([r]), transmitter, receiver, one.frequency_hz, one.shape, one.air, one.beam_sigma_rad)
-            for r, receiver in enumerate(receivers)
+            Place(self.number, np.array([r]), one.transmitter, receiver, one.frequency_hz, one.shape, one.air, one.beam_sigma_rad)
+            for r, receiver in enumerate(one.receivers)
         ]  # fmt: skip
 
     def observe(self, place: Place, view: View) -> Observation:
@@ -486,7 +462,7 @@ class _Spectra(Kind):
         gain = one.path_gain[place.rows[0]].ravel()
         known = np.isfinite(gain)
         above = to_db(np.where(known, gain, 0.0), one.floor) - 10.0 * np.log10(one.floor)
-        target = Target(above, None if known.all() else known.astype(float))
+        target = Target(above, known)
         return Observation(place, view, measured, target, float(one.floor), robust=False)
 
     def frame(self) -> SpectrumDataset:
@@ -500,10 +476,9 @@ class _Tables(Kind):
     one: Readings
     _pointings: list[tuple[np.ndarray, np.ndarray] | None] = field(default_factory=list)
 
-    def places(self, mesh: Mesh | None, device: DeviceLike) -> list[Place]:
+    def places(self) -> list[Place]:
         one = self.one
         question_readings(one)
-        _check_places(mesh, one, device)
         names, chain = np.unique(np.asarray(one.chain), return_inverse=True)
         key = np.column_stack([one.transmitters, one.receivers, chain])
         first, own, count = np.unique(
@@ -541,10 +516,10 @@ class _Tables(Kind):
         # Of all power errors of single directions average out.
         unexplained = 0.5 if one.total else READING_ERROR_DB
         trust = NOISE_DB / np.hypot(np.hypot(unexplained, np.asarray(one.std_db)[rows]), fading)
-        target = Target(above, trust, one.power[rows] <= floors)
+        target = Target(above, trust, one.power[rows] <= floors, None if one.total else sight)  # type: ignore[arg-type]
         wide_db = 10.0  # of what fades or is all power; see :class:`Observation`
         huber_db = HUBER_DB if one.samples is None and not one.total else wide_db
-        return replace(bare, target=target, sight=None if one.total else sight, huber_db=huber_db)
+        return replace(bare, target=target, huber_db=huber_db)
 
 
 @dataclass(eq=False)
@@ -553,9 +528,8 @@ class _Arrays(Kind):
 
     one: ArraySpectra
 
-    def places(self, mesh: Mesh | None, device: DeviceLike) -> list[Place]:
+    def places(self) -> list[Place]:
         one = self.one
-        _check_places(mesh, one, device)
         return [
             Place(self.number, np.array([r]), *ends, one.frequency_hz, READINGS_SHAPE, one.air)
             for r, ends in enumerate(zip(one.transmitters, one.receivers, strict=True))
@@ -573,8 +547,7 @@ class _Arrays(Kind):
             known = known[np.round(np.linspace(0, len(known) - 1, most)).astype(int)]
         unit = 1.0
         if one.relative:  # of a size that prediction's is comparable to
-            distance = float(np.linalg.norm(place.receiver - place.transmitter))
-            unit = (SPEED_OF_LIGHT / one.frequency_hz / (4.0 * np.pi * distance)) ** 2
+            unit = float(free_space_gain(place.transmitter, place.receiver, one.frequency_hz))
         target, chain = Target(NEPER * np.log1p(power[known] / one.floor)), OWN_GAIN if one.relative else -1
         bare = Observation(place, view, measured.part(known), target, unit * one.floor, chain)
         start, single = Parameters.prior(view.tracer.surface.groups), SETS["single"]
@@ -583,7 +556,7 @@ class _Arrays(Kind):
         gain = bare.gain(start, total)
         spread = np.sqrt(scattered * np.maximum(2.0 * total - scattered, 0.0))
         std_db = NEPER * gain * spread / (1.0 + gain * total)
-        return replace(bare, target=target.trusted(NOISE_DB / np.hypot(NOISE_DB, std_db)), robust=True)
+        return replace(bare, target=target.trusted(NOISE_DB / np.hypot(NOISE_DB, std_db)))
 
 
 KINDS: dict[type, type[Kind]] = {SpectrumDataset: _Spectra, Readings: _Tables, ArraySpectra: _Arrays}
@@ -596,11 +569,6 @@ def kinds_of(data: Sequence[Measured]) -> list[Kind]:
         next(make for kind, make in KINDS.items() if isinstance(one, kind))(k, one)
         for k, one in enumerate(data)
     ]
-
-
-def chains_of(places: Sequence[Place]) -> list[str]:
-    """Names of the measuring chains of unknown gain."""
-    return sorted({place.chain for place in places} - {""})
 
 
 def observe(
@@ -645,17 +613,6 @@ def _pointings(one: Readings, view: View) -> tuple[np.ndarray, np.ndarray] | Non
     return path_weights(one, first, toward, toward, np.zeros(len(toward)), dtype=np.float32), row.reshape(-1)
 
 
-def _check_places(mesh: Mesh | None, one: Readings | ArraySpectra, device: DeviceLike) -> None:
-    wavelength_m = SPEED_OF_LIGHT / one.frequency_hz
-    if mesh is not None:
-        question_unit(mesh, wavelength_m)
-    transmitters, under = np.unique(one.transmitters, axis=0, return_inverse=True)
-    for k, transmitter in enumerate(transmitters):
-        receivers = np.unique(one.receivers[under.reshape(-1) == k], axis=0)
-        names = "ds.transmitters", "ds.receivers"
-        check_positions(mesh, transmitter, receivers, wavelength_m, names=names, device=device)
-
-
 def frame_of(data: Sequence[Measured]) -> SpectrumDataset:
     """What a field's spectra are made with, and its transmitter: the first data set of spectra, else an empty one that is like
     the first of readings."""
@@ -668,4 +625,8 @@ def places_of(data: Sequence[Measured], mesh: Mesh | None, device: DeviceLike) -
     Raises:
         ValueError: for a place where no field can hold; see :func:`warprrf.rf.positions.check_positions`.
     """
-    return [place for kind in kinds_of(data) for place in kind.places(mesh, device)]
+    found = []
+    for kind in kinds_of(data):
+        found += kind.places()
+        check_dataset(mesh, kind.one, device=device)
+    return found

@@ -13,7 +13,7 @@ from warprrf.checks import some_of, warn
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import Measured
 from warprrf.rf.fields.bistatic.gauss_newton import THROUGH_STD, Solution, layout_of
-from warprrf.rf.fields.bistatic.observations import NOISE_DB, frame_of, huber, observe
+from warprrf.rf.fields.bistatic.observations import NOISE_DB, huber, observe
 from warprrf.rf.fields.bistatic.options import MOST_BLOCKED, RARE, RAYS, evenly, total
 from warprrf.rf.fields.bistatic.training import Training
 from warprrf.rf.spectra.readings import Readings
@@ -71,8 +71,7 @@ def side_lobes(t: Training, choice: Solution) -> tuple[np.ndarray, np.ndarray]:
     places = [k for k, o in parts.items() if o.chain >= 0 and turned[o.place.data]]
     bare = [one.without_side_lobes() if isinstance(one, Readings) else one for one in t.data]
     seen = [parts[k] for k in places]
-    frequency_hz = frame_of(t.data).frequency_hz
-    lobes = observe(bare, [(o.place, o.view) for o in seen], frequency_hz, t.chains)
+    lobes = observe(bare, [(o.place, o.view) for o in seen], t.frequency_hz, t.chains)
     for k, lobe in zip(places, lobes, strict=True):
         parts[k] = replace(lobe.part(np.asarray(parts[k].rows)), ratio=parts[k].ratio)
     whole, main = (
@@ -115,7 +114,7 @@ def report_of(
     """What a fit decided and found, as numbers and text, where :meth:`Training.unexplained` found ``wrong`` and ``noise_db``."""
     report: dict[str, Any] = {
         "receivers": len(t.observations),
-        "held_out": len(t.split.held),
+        "held_out": len(t.held),
         "groups": t.surface.groups,
         "materials": int(choice.material.max()) + 1,
         "elements": len(t.surface.element_area),

@@ -1,7 +1,7 @@
 """What a fit learns from: what receivers see of the geometry, what was read there, and which of it is held out.
 
-:func:`trace` finds what is seen. A :class:`Split` says which places decide about effects and materials, and which are held
-out; a :class:`Training` has the observations of both, and fits and judges models by them.
+:func:`trace` finds what is seen. A :class:`Training` says which places decide about effects and materials, and which are held
+out, has the observations of both, and fits and judges models by them.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from warprrf.rf.fields.bistatic.observations import (
     Observation,
     Place,
     Seen,
-    chains_of,
     frame_of,
     observe,
 )
@@ -132,30 +131,77 @@ def check_rays(places: Sequence[Place], sub_pixels: int) -> None:
         )
 
 
-@dataclass(frozen=True)
-class Split:
-    """Places that a fit decides by, and all that it learns from.
+@dataclass(frozen=True, eq=False)
+class Training:
+    """One fit: what it learns from, and how.
 
     Attributes:
-        count: all places.
-        held, kept: places that are held out to decide by, and the others.
-        always: places that are never held out, one of each chain: without any its gain would not be known.
+        options: of the fit.
+        surface: of the geometry.
+        data: the data sets.
+        places: all of theirs.
+        held: of these, by index, the ones that are held out to decide by.
+        candidates: effects to choose from, the fewest first.
+        rng: chooses readings.
+        step: to be called after each fit.
+        observations: by place, of those that were traced.
+        parts: those readings of each that parameters are fitted to.
+        log: choices, as they are made.
     """
 
-    count: int
+    options: FitOptions
+    surface: Surface
+    data: Sequence[Measured]
+    places: Sequence[Place]
     held: np.ndarray
-    kept: np.ndarray
-    always: list[int]
+    candidates: list[Effects]
+    rng: np.random.Generator
+    step: Callable[..., None]
+    observations: dict[int, Observation] = field(default_factory=dict)
+    parts: dict[int, Observation] = field(default_factory=dict)
+    log: list[dict[str, Any]] = field(default_factory=list)
 
     @classmethod
-    def of(cls, places: Sequence[Place], quick: bool, rng: np.random.Generator) -> Split:
-        """That of ``places``; if ``quick`` none is held out."""
-        count, chain, most = len(places), [place.chain for place in places], 30
-        always, held = [chain.index(name) for name in chains_of(places)], np.zeros(0, int)
-        if count >= LEAST_RECEIVERS and not quick:
-            order = rng.permutation(count)
-            held = np.sort(order[~np.isin(order, always)][: min(int(count * HELD_OUT), most)])
-        return cls(count, held, np.setdiff1d(np.arange(count), held), always)
+    def of(
+        cls,
+        surface: Surface,
+        data: Sequence[Measured],
+        places: Sequence[Place],
+        options: FitOptions,
+        progress: Progress | None = None,
+    ) -> Training:
+        """That of a fit to what ``data`` holds of ``places``, of which nothing was traced yet. A quick one holds none out."""
+        count, rng = len(places), np.random.default_rng(options.seed)
+        candidates, none = options.candidates(frame_of(data).frequency_hz), np.zeros(0, int)
+        steps = 4 + len(candidates) + MERGES + (2 * count if count <= FEW_RECEIVERS else 3)
+        step = _counted(progress, count, steps)
+        found = cls(options, surface, data, places, none, candidates, rng, step)
+        if count < LEAST_RECEIVERS or options.quick:
+            return found
+        order, most = rng.permutation(count), 30
+        held = order[~np.isin(order, found.always)][: min(int(count * HELD_OUT), most)]
+        return replace(found, held=np.sort(held))
+
+    @cached_property
+    def frequency_hz(self) -> float:
+        """Carrier that parameters are of."""
+        return frame_of(self.data).frequency_hz
+
+    @cached_property
+    def chains(self) -> list[str]:
+        """Names of measuring chains whose gain is unknown."""
+        return sorted({place.chain for place in self.places} - {""})
+
+    @property
+    def always(self) -> list[int]:
+        """Places that are never held out, one of each chain: without any its gain would not be known."""
+        chain = [place.chain for place in self.places]
+        return [chain.index(name) for name in self.chains]
+
+    @property
+    def kept(self) -> np.ndarray:
+        """Places that are not held out."""
+        return np.setdiff1d(np.arange(len(self.places)), self.held)
 
     def few(self, times: int) -> np.ndarray:
         """Places that fits which only decide about something learn from, those of every chain among them."""
@@ -167,88 +213,42 @@ class Split:
     def deciding(self) -> np.ndarray:
         """Places by which effects and materials are decided: with few receivers all of them."""
         if len(self.held) < LEAST_RECEIVERS:
-            return np.arange(self.count)
+            return np.arange(len(self.places))
         return np.union1d(self.few(2), self.held)
 
-
-@dataclass(frozen=True, eq=False)
-class Training:
-    """One fit: what it learns from, and how.
-
-    Attributes:
-        options: of the fit.
-        candidates: effects to choose from, the fewest first.
-        surface: of the geometry.
-        split: which places decide.
-        observations: by place, of those that were traced.
-        parts: those readings of each that parameters are fitted to.
-        chains: names of measuring chains whose gain is unknown.
-        data: the data sets.
-        lobes: exponents.
-        step: to be called after each fit.
-        log: choices, as they are made.
-    """
-
-    options: FitOptions
-    candidates: list[Effects]
-    surface: Surface
-    split: Split
-    observations: dict[int, Observation]
-    parts: dict[int, Observation]
-    chains: list[str]
-    data: Sequence[Measured]
-    lobes: tuple[int, ...]
-    step: Callable[..., None]
-    log: list[dict[str, Any]] = field(default_factory=list)
-
-    @classmethod
-    def of(
-        cls,
-        seen: Sequence[Seen],
-        sought: Effects,
-        split: Split,
-        data: Sequence[Measured],
-        options: FitOptions,
-        rng: np.random.Generator,
-        progress: Progress | None = None,
-    ) -> Training:
-        """What ``data`` holds of the places that decide, where that is ``seen`` and effects were ``sought``."""
-        frequency_hz = frame_of(data).frequency_hz
-        candidates = _possible(options.candidates(frequency_hz), sought, data)
-        steps = 4 + len(candidates) + MERGES + (2 * split.count if split.count <= FEW_RECEIVERS else 3)
-        found = cls(
-            options, candidates, seen[0][1].tracer.surface, split, {}, {},
-            chains_of([place for place, _ in seen]), data, options.exponents(frequency_hz), _Steps(progress, split.count, steps),
-        )  # fmt: skip
-        return found.and_at(split.deciding, seen, rng)
-
-    def and_at(self, places: np.ndarray, seen: Sequence[Seen], rng: np.random.Generator) -> Training:
+    def and_at(self, places: np.ndarray, seen: Sequence[Seen]) -> Training:
         """With what was read at ``places`` (P,), where that is ``seen``, and readings of them that parameters are fitted to."""
-        frequency_hz = frame_of(self.data).frequency_hz
-        found = observe(self.data, seen, frequency_hz, self.chains)
-        parts = [self._part(o, rng) for o in found]
+        found = observe(self.data, seen, self.frequency_hz, self.chains)
+        parts = [self._part(o) for o in found]
         own = places.tolist()
         observations = _with(self.observations, own, found)
         return replace(self, observations=observations, parts=_with(self.parts, own, parts))
 
-    def _part(self, o: Observation, rng: np.random.Generator) -> Observation:
+    def _part(self, o: Observation) -> Observation:
         """Readings of a place that parameters are fitted to, and what they count."""
-        trust, db = o.target.trust, o.target.db
         readings, least = 12_000, 200  # of all places, and of each at least
         # Line of sight alone holds no material: it tells a chain's gain.
         known_better = 2.0
         # Of what comes through slabs more is left out (light between surfaces that passes them on its way), and what a
         # material must make up for there it lacks in the open.
         behind_walls = 0.5
-        known = np.arange(len(db)) if trust is None else np.flatnonzero(trust)
-        size = min(len(known), max(least, readings // self.split.count))
-        part = o.part(known[np.sort(rng.choice(len(known), size, replace=False))])
-        if part.sight is not None:
-            part = replace(part, target=part.target.trusted(1.0 + known_better * part.sight))
+        known = np.flatnonzero(o.target.trust)
+        size = min(len(known), max(least, readings // len(self.places)))
+        part = o.part(known[np.sort(self.rng.choice(len(known), size, replace=False))])
+        target = part.target.trusted(1.0 + known_better * part.target.sight)
         straight = o.view.paths.order == 0
         if not self.totals and (straight & (o.view.paths.slabs > 0)).any():
-            part = replace(part, target=part.target.trusted(np.full(len(part.target.db), behind_walls)))
-        return part
+            target = target.trusted(behind_walls)
+        return replace(part, target=target)
+
+    def as_sought(self, effects: Effects) -> Training:
+        """The same that chooses from slabs and edges as they were sought for ``effects``, and no more mirrors; of power alone
+        from one candidate."""
+        rare: dict[str, Any] = {"transmissions": effects.transmissions, "diffractions": effects.diffractions}
+        found = [replace(one, mirrors=min(one.mirrors, effects.mirrors), **rare) for one in self.candidates]
+        if len(found) > 1 and any(isinstance(one, ArraySpectra) for one in self.data):
+            found = [replace(one, mirrors=effects.mirrors) for one in found]  # they hear the phases of all
+        return replace(self, candidates=found[1:2] if len(found) > 1 and self.totals else found)
 
     def without_records(self) -> Training:
         """The same that keeps none of the records that are made again when they are asked for."""
@@ -261,12 +261,10 @@ class Training:
     @property
     def telling(self) -> np.ndarray:
         """Places whose readings parameters of materials are fitted to, those of every chain among them."""
-        readings, places = sum(len(o.target.db) for o in self.parts.values()), np.array(list(self.parts))
+        readings, places = sum(len(o.target) for o in self.parts.values()), np.array(list(self.parts))
         if readings <= MOST_READINGS:
             return places
-        return np.union1d(self.split.always, evenly(places, len(places) * MOST_READINGS // readings)).astype(
-            int
-        )
+        return np.union1d(self.always, evenly(places, len(places) * MOST_READINGS // readings)).astype(int)
 
     @property
     def names(self) -> list[str]:
@@ -276,7 +274,7 @@ class Training:
     @cached_property
     def totals(self) -> bool:
         """Whether power alone was read, which cannot tell bounces or materials apart."""
-        return _are_totals(self.data)
+        return all(isinstance(one, Readings) and one.total for one in self.data)
 
     @property
     def area(self) -> np.ndarray:
@@ -292,12 +290,13 @@ class Training:
 
     def start(self, material: np.ndarray) -> Parameters:
         """Parameters of materials before any measurement."""
-        prior = Parameters.prior(int(material.max()) + 1, self.lobes, reciprocal=self.options.reciprocal)
+        lobes = self.options.exponents(self.frequency_hz)
+        prior = Parameters.prior(int(material.max()) + 1, lobes, reciprocal=self.options.reciprocal)
         return replace(prior, log_through=self.known_through(material)[0])
 
     def known_through(self, material: np.ndarray) -> np.ndarray:
         """ln of the share that materials let through before any measurement, and its standard deviation, shape ``(2, M)``."""
-        eta, _, through = self.surface.slabs(frame_of(self.data).frequency_hz)
+        eta, _, through = self.surface.slabs(self.frequency_hz)
         std = np.where(np.abs(eta) > 0, KNOWN_THROUGH_STD, THROUGH_STD)
         return np.stack([np.bincount(material, own) for own in (through, std)]) / np.bincount(material)
 
@@ -340,9 +339,9 @@ class Training:
     def held_loss(self, choice: Solution) -> float:
         """Mean square error at the places held out, without residual [dB^2]: of all readings where they are few, else of
         those chosen."""
-        if len(self.split.held) <= LEAST_RECEIVERS:
-            return self.loss(self.model(choice), self.split.held)
-        return self.part_loss(choice, self.split.held)
+        if len(self.held) <= LEAST_RECEIVERS:
+            return self.loss(self.model(choice), self.held)
+        return self.part_loss(choice, self.held)
 
     def part_loss(self, choice: Solution, places: np.ndarray) -> float:
         """The same of the readings chosen of ``places``."""
@@ -361,12 +360,11 @@ class Training:
         normal = 1.4826  # standard deviation over the median size of normal errors
         for k, power in zip(tables, self.predicted(model, tables), strict=True):
             o, target = self.observations[k], self.observations[k].target
-            if target.trust is not None and target.censored is not None:
-                error = target.error(power)
-                wrong = np.flatnonzero(np.abs(error) > most_db)
-                rows |= {k: wrong} if len(wrong) else {}
-                clear = ~target.censored & (target.db > clear_db)
-                left.setdefault(self.names[o.place.data], []).extend((error / target.trust)[clear])
+            error = target.error(power)
+            wrong = np.flatnonzero(np.abs(error) > most_db)
+            rows |= {k: wrong} if len(wrong) else {}
+            clear = ~target.censored & (target.db > clear_db)
+            left.setdefault(self.names[o.place.data], []).extend((error / target.trust)[clear])
         return rows, {
             name: normal * float(np.median(np.abs(errors))) for name, errors in left.items() if errors
         }
@@ -376,7 +374,7 @@ class Training:
         observations, parts = dict(self.observations), dict(self.parts)
         for k, rows in wrong.items():
             o = observations[k]
-            counts = ~np.isin(np.arange(len(o.target.db)), rows)
+            counts = ~np.isin(np.arange(len(o.target)), rows)
             observations[k] = replace(o, target=o.target.trusted(counts))
             parts[k] = replace(parts[k], target=parts[k].target.trusted(counts[parts[k].rows]))
         return replace(self, observations=observations, parts=parts)
@@ -386,19 +384,17 @@ class Training:
         self.log.append({"term": what, "kept": bool(kept), "held_out_rmse_db": float(np.sqrt(loss))})
 
 
-@dataclass
-class _Steps:
-    """Progress of a fit whose steps are only estimated."""
+def _counted(progress: Progress | None, count: int, total: int) -> Callable[..., None]:
+    """What tells ``progress`` that one of ``total`` steps with ``count`` places is done; how many there are is estimated."""
+    done = 0
 
-    progress: Progress | None
-    count: int
-    total: int
-    done: int = 0
+    def step(*, last: bool = False) -> None:
+        nonlocal done
+        done = total if last else min(done + 1, total - 1)
+        if progress is not None:
+            progress("fit", done * count, total * count)
 
-    def __call__(self, *, last: bool = False) -> None:
-        self.done = self.total if last else min(self.done + 1, self.total - 1)
-        if self.progress is not None:
-            self.progress("fit", self.done * self.count, self.total * self.count)
+    return step
 
 
 def _with(
@@ -406,16 +402,3 @@ def _with(
 ) -> dict[int, Observation]:
     """Observations by place, in their order."""
     return dict(sorted([*known.items(), *zip(places, more, strict=True)]))
-
-
-def _are_totals(data: Sequence[Measured]) -> bool:
-    return all(isinstance(one, Readings) and one.total for one in data)
-
-
-def _possible(candidates: list[Effects], sought: Effects, data: Sequence[Measured]) -> list[Effects]:
-    """``candidates`` with slabs and edges as they were ``sought``, and with no more mirrors; of power alone one."""
-    rare: dict[str, Any] = {"transmissions": sought.transmissions, "diffractions": sought.diffractions}
-    found = [replace(one, mirrors=min(one.mirrors, sought.mirrors), **rare) for one in candidates]
-    if len(found) > 1 and any(isinstance(one, ArraySpectra) for one in data):
-        found = [replace(one, mirrors=sought.mirrors) for one in found]  # they hear the phases of all
-    return found[1:2] if len(found) > 1 and _are_totals(data) else found

@@ -48,7 +48,7 @@ from warprrf.rf.fields.harmonic.problem import Problem, harmonics
 from warprrf.rf.fields.harmonic.transport import Transport, transport
 from warprrf.rf.paths.trace import Paths
 from warprrf.rf.positions import Ends, check_dataset, warn_of_unmodelled
-from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.dataset import SpectrumDataset, question_spectra
 from warprrf.rf.spectra.spectrum import (
     Spectrum,
     angles_from_directions,
@@ -144,7 +144,9 @@ class HarmonicField(RadioField):
         chosen = with_settings(options or FieldOptions(), {**settings, "model": model})
         started = time.perf_counter()
         gaussians, mesh = _geometry(geometry)
-        receivers, transmitter = check_dataset(mesh, ds, device=device)
+        question_spectra(ds)
+        check_dataset(mesh, ds, device=device)
+        receivers, transmitter = ds.receivers, ds.transmitter
         warn_of_unmodelled(mesh, transmitter, receivers, frequency_hz=ds.frequency_hz, device=device)
         if mesh is None and (chosen.line_of_sight == "explicit" or chosen.interaction_point == "mesh"):
             raise ValueError('line_of_sight="explicit" and interaction_point="mesh" need a mesh; got none')
