@@ -226,7 +226,7 @@ class Question:
         return Found(unknown, np.concatenate(errors), rise, *at)
 
     def _gains(self, place: Place, points: np.ndarray, quick: bool) -> list[PathGains]:
-        """What is received at each of ``points`` under a place's transmitter; chains of mirrors are searched once for all."""
+        """What is received at each of ``points`` under a place's transmitter, all traced at once."""
         f = self.field
         tracer, model = f.tracer(place.transmitter), f.state
         if quick:
@@ -234,11 +234,7 @@ class Question:
         sub_pixels = 1 if quick else 2  # to the end, because the noise of few rays moves the least loss
         few = self._tracers.setdefault((place.seen_from, quick), tracer.on_grid(place.shape, sub_pixels))
         few.beam_sigma_rad = place.beam_sigma_rad
-        paths = few.paths(points, model.effects)
-        views = (
-            few.view(point, model.effects, paths=paths.of(np.array([k]))) for k, point in enumerate(points)
-        )
-        return [path_gains(view, model) for view in views]
+        return path_gains(few.view(points, model.effects), model).apart
 
     def descend(
         self, unknown: np.ndarray, *, quick: bool, near: Found | None = None, most: float = np.inf
