@@ -34,9 +34,8 @@ from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
 from warprrf.kernels.radio.records import MIRROR, SCATTER, SLAB
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.paths.mirror_paths import described, legs_of, passed, unobstructed
+from warprrf.rf.paths.mirror_paths import described
 from warprrf.rf.paths.path_set import Paths
-from warprrf.rf.paths.slabs import Slabs
 from warprrf.rf.paths.trace import MirrorTracer
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import Received
@@ -244,24 +243,21 @@ class ExactEngine:
         most = 4 if rays.sequence else 16  # each is a search: fewer after they hit first
         ray, every = self._some(rays, most)
         point, _, normal = self._met(rays, ray)
-        row, patch, met = self.mirrors.images.candidates(point, 1)
-        own = ((met[:, 0] - point[row]) * normal[row]).sum(axis=1) > 0
-        own &= patches.contains(patch[:, 0], met[:, 0])
-        row, patch, met = row[own], patch[own], met[own]
-        free = unobstructed(patches, tracer.transmitter, point[row], patch, met, tracer.grid.device)
-        ways: dict[str, tuple[np.ndarray, list[Slabs] | None]] = {"MS": (free.nonzero()[0], None)}
-        walls = self.mirrors.walls
+        ways = self.mirrors.images.candidates(point, 1)
+        own = ((ways.point[:, 0] - point[ways.row]) * normal[ways.row]).sum(axis=1) > 0
+        own &= patches.contains(ways.patch[:, 0], ways.point[:, 0])
+        ways = ways.take(own)
+        lit, walls = {"MS": ways.take(ways.unobstructed(tracer.grid.device))}, self.mirrors.walls
         if walls is not None:
-            legs = legs_of(patches, tracer.transmitter, point[row], patch, met, walls.clearance_m)
-            ways["MTS"] = passed(walls, *legs)
-        for name, (chosen, slabs) in ways.items():
-            found = point, (row[chosen], patch[chosen], met[chosen], np.ones(len(row))[chosen])
-            mirrors = described(patches, tracer.transmitter, *found, 1, walls, slabs)
-            image = self.surface.images(tracer.transmitter)[0][patch[chosen, 0]]
-            light = tracer.grid.unshadowed(rays.hits, image, ray[row[chosen]])
+            lit["MTS"] = ways.through(walls)[1]
+        for name, ways in lit.items():
+            row, patch = ways.row, ways.patch[:, 0]
+            mirrors = described(ways, 1 + (walls.most if walls else 0))
+            image = self.surface.images(tracer.transmitter)[0][patch]
+            light = tracer.grid.unshadowed(rays.hits, image, ray[row])
             k = np.flatnonzero(light.strength > 0)
-            own, image, mirrors = row[chosen][k], image[k], mirrors.take(k)
-            way, plane = point[own] - image, self.surface.plane_normal[patch[chosen, 0][k]]
+            own, image, mirrors = row[k], image[k], mirrors.take(k)
+            way, plane = point[own] - image, self.surface.plane_normal[patch[k]]
             before = tracer.specular(mirrors).interactions
             records = tracer.scattered(rays.seen, ray[own], every * light.strength[k], light.angle[k], before)
             departure = way - 2.0 * (way * plane).sum(axis=1)[:, None] * plane

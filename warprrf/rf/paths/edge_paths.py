@@ -20,8 +20,9 @@ from warprrf.kernels.radio.records import EDGE, MIRROR, SLAB
 from warprrf.rf.em.diffraction import EdgeRays, Pair, boundary_fields, diffraction_matrices
 from warprrf.rf.em.fresnel import SurfaceTable
 from warprrf.rf.paths.images import EdgeLeaves, MirrorImages
-from warprrf.rf.paths.mirror_paths import MirrorPaths, distinct, met_at, passed, unobstructed
+from warprrf.rf.paths.mirror_paths import MirrorPaths, met_at
 from warprrf.rf.paths.slabs import Walls
+from warprrf.rf.paths.ways import Ways, distinct, passed, stops_of
 from warprrf.rf.spectra.spectrum import transverse_basis
 from warprrf.rows import Rows
 
@@ -236,28 +237,24 @@ class EdgeFinder:
             return ways.take(np.zeros(0, int))
         ways = ways.take(np.flatnonzero((ways.patch < 0).all(axis=1)))
         start = np.repeat(self._beside(ways)[:, None], 2, axis=1)
-        rows, legs = passed(self.walls, start, ways.end)
-        one = np.flatnonzero(sum(s.count for s in legs) == 1)
-        ways, legs = ways.take(rows[one]), [s.take(one) for s in legs]
-        face, thickness = (
-            np.stack([getattr(s, name)[:, 0] for s in legs], axis=1) for name in ("face", "thickness_m")
-        )
+        rows, slab, thickness_m = passed(self.walls, start, ways.end)
+        one = (slab >= 0).sum(axis=(1, 2)) == 1
+        ways, face, thickness = ways.take(rows[one]), slab[one, :, 0], thickness_m[one, :, 0]
         here = ways.point[:, None]
         stop, _ = met_at(self.walls.mesh, face, here, ways.end - here)
         return replace(ways, slab=face, thickness_m=thickness, stop=stop)
 
     def _unobstructed(self, ways: _Ways) -> np.ndarray:
         """Whether both legs are free."""
-        patches = self.images.patches
         beside = self._beside(ways)
         found = np.ones(len(ways.edge), bool)
         for j in range(2):
             for mirrored in (False, True):
                 own = np.flatnonzero(found & ((ways.patch[:, j] >= 0) == mirrored))
-                edge, end = beside[own], ways.end[own, j]
                 patch, mirror = (a[own, j : j + int(mirrored)] for a in (ways.patch, ways.stop))
-                if len(own):
-                    found[own] = unobstructed(patches, end[:, None], edge, patch, mirror, self.images.device)
+                stops = stops_of(ways.end[own, j], mirror, beside[own])
+                legs = Ways.of(self.images.patches, own, patch, stops)
+                found[own] = legs.unobstructed(self.images.device)
         return found
 
     def _rays(self, ways: _Ways) -> EdgeRays:

@@ -27,7 +27,7 @@ from warprrf.kernels.radio.records import MIRROR, SCATTER, SLAB, SOURCE
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.edge_paths import EdgeFinder
 from warprrf.rf.paths.images import MirrorImages
-from warprrf.rf.paths.mirror_paths import MirrorPaths, ZoneRays, described, legs_of, passed, zone_paths
+from warprrf.rf.paths.mirror_paths import MirrorPaths, ZoneRays, described, zone_paths
 from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.paths.slabs import Slabs, Walls
 from warprrf.rf.spectra.spectrum import unit_beams
@@ -273,10 +273,9 @@ class Tracer:
         """Line of sight and mirror paths of ``receivers`` (R, 3) that ``effects`` want."""
         most = effects.transmissions
         walls = self.walls(most) if most else None
-        found = zone_paths(
-            self.images, receivers, effects.mirrors, self.wavelength_m, self.surface.position_error_m, progress, walls
-        )  # fmt: skip
-        found = self._delayed(found)
+        found = self._delayed(
+            zone_paths(self.images, receivers, effects.mirrors, self.wavelength_m, progress, walls)
+        )
         if not effects.diffractions:
             return found
         edges = self.kept.get(("edges", most), lambda: self._edges(walls))
@@ -517,39 +516,33 @@ class MirroredLight:
     """
 
     def __init__(self, tracer: Tracer, walls: Walls | None = None) -> None:
-        s, transmitter, grid = tracer.surface, tracer.transmitter, tracer.grid
+        s, grid = tracer.surface, tracer.grid
         largest = np.abs(s.front_normal).argmax(axis=1)
         way = 2 * largest + (np.take_along_axis(s.front_normal, largest[:, None], axis=1)[:, 0] < 0)
         self._piece = np.unique(6 * s.cell + way, return_inverse=True)[1]
         middle = s.middles(self._piece)
-        centre, image = s.mesh.triangles[middle].mean(axis=1), s.images(transmitter)[0]
-        piece, patch, point = tracer.images.candidates(centre, 1)
+        centre = s.mesh.triangles[middle].mean(axis=1)
+        ways = tracer.images.candidates(centre, 1)
         # Light must come from in front of the piece, of either side if it has two, and not from its own patch.
-        normal = s.front_normal[middle[piece]]
-        side = ((point[:, 0] - centre[piece]) * normal).sum(axis=1)
+        face = middle[ways.row]
+        normal = s.front_normal[face]
+        side = ((ways.point[:, 0] - centre[ways.row]) * normal).sum(axis=1)
         normal = np.where(s.two_sided & (side < 0)[:, None], -normal, normal)
-        own = np.flatnonzero((s.two_sided | (side > 0)) & (s.patch[middle[piece]] != patch[:, 0]))
-        order = own[np.lexsort((patch[own, 0], piece[own]))]
-        piece, patch, point, normal = piece[order], patch[order], point[order], normal[order]
-        lift_m = s.position_error_m
-        ends = centre[piece], patch, point, lift_m * normal
-        chosen = ZoneRays(s.patches, transmitter, 0.0, lift_m, grid.device).reached(*ends)
-        slabs = None
-        if walls is not None:
-            through = ZoneRays(s.patches, transmitter, 0.0, lift_m, grid.device, walls)
-            dark = np.flatnonzero(~chosen)
-            dark = dark[through.reached(*(a[dark] for a in ends))]
-            legs = legs_of(
-                s.patches, transmitter, (ends[0] + ends[3])[dark], patch[dark], point[dark], lift_m
-            )
-            arrived, slabs = passed(walls, *legs)
-            chosen = dark[arrived]
-        piece, patch, point, normal = piece[chosen], patch[chosen], point[chosen], normal[chosen]
-        found = piece, patch, point, np.ones(len(piece))
-        paths = tracer.specular(described(s.patches, transmitter, centre, found, 1, walls, slabs))
+        own = np.flatnonzero((s.two_sided | (side > 0)) & (s.patch[face] != ways.patch[:, 0]))
+        own = own[np.lexsort((ways.patch[own, 0], ways.row[own]))]
+        ways, normal = ways.take(own), normal[own]
+        off = ways.over(-1, centre[ways.row] + s.position_error_m * normal)
+        rays = ZoneRays(tracer.images, 0.0)
+        free = rays.reached(off)
+        if walls is None:
+            chosen, off = np.flatnonzero(free), off.take(free)
+        else:
+            chosen, off = rays.through(walls, off, free)
+        piece, patch, normal = off.row, off.patch[:, 0], normal[chosen]
+        ways = off.over(-1, centre[piece])
+        paths = tracer.specular(described(ways, 1 + (walls.most if walls else 0)))
         self.before = paths.interactions
-        patch = patch[:, 0]
-        self.image, self.patch = image[patch], patch
+        self.image, self.patch = s.images(tracer.transmitter)[0][patch], patch
         self._first = np.searchsorted(piece, np.arange(len(middle) + 1))
         way = self.image - centre[piece]
         length = np.linalg.norm(way, axis=1)
