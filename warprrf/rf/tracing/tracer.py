@@ -33,7 +33,7 @@ from warprrf.rf.paths.slabs import Slabs, Walls
 from warprrf.rf.spectra.spectrum import unit_beams
 from warprrf.rf.tracing.model import Effects
 from warprrf.rf.tracing.rays import NEAREST_M, Hits, Light, RayGrid
-from warprrf.rf.tracing.records import Interactions, Records, one_kind
+from warprrf.rf.tracing.records import Interactions, Records
 from warprrf.rf.tracing.surface import Surface
 
 MIRROR_SLACK_M = 0.1
@@ -316,7 +316,7 @@ class Tracer:
         seen, lights, made = {"": first}, dict[str, Light](), dict[str, Records]()
         for light, sight, most in wanted:
             if sight not in seen:
-                seen[sight] = self._turned(view) if sight == "M" else self.behind(first, most)
+                seen[sight] = self.turned(first) if sight == "M" else self.behind(first, most)
             rays = seen[sight]
             if light in ("S", "TS") and sight not in lights:
                 lights[sight] = self.light(rays)
@@ -373,26 +373,33 @@ class Tracer:
         chosen = np.flatnonzero((rays.hits.face >= 0) & np.isin(rays.ray % self.grid.per_pixel, places))
         m = self.mirrored(most)
         row, image = m.pairs(rays.hits.face[chosen])
-        row = chosen[row]
-        light = self.grid.unshadowed(rays.hits, m.image[image], row)
+        before = m.before.take(image) if most else None
+        return self.lit_by_images(rays, chosen[row], m.patch[image], before, times)[1]
+
+    def lit_by_images(
+        self, rays: Rays, row: np.ndarray, patch: np.ndarray, before: Interactions | None, times: float
+    ) -> tuple[np.ndarray, Records]:
+        """What the rays ``row`` (N,), each in place of ``times``, see by the transmitter's image in ``patch`` (N,): which of them
+        see any, and records of those, after the interactions ``before``, by default the mirror alone."""
+        images, s = self.surface.images(self.transmitter)[0], self.surface
+        light = self.grid.unshadowed(rays.hits, images[patch], row)
         k = np.flatnonzero(light.strength > 0)
-        before = m.before.take(image[k])
-        if not most:
-            way = m.image[image[k]] - light.point[k]
+        strength = light.strength[k] * self.grid.dtype.type(times)
+        if before is None:
+            way = images[patch[k]] - light.point[k]
             way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
-            cosine = np.abs(np.einsum("ni,ni->n", way, self.surface.plane_normal[m.patch[image[k]]]))
-            before = Interactions.of_mirrors(before.index[:, 0], cosine)
-        return self.scattered(
-            rays, row[k], light.strength[k] * self.grid.dtype.type(times), light.angle[k], before
-        )
+            cosine = np.abs(np.einsum("ni,ni->n", way, s.plane_normal[patch[k]]))
+            mirrors = Interactions.of_mirrors(s.patch_group[patch[k]], cosine)
+        else:
+            mirrors = before.take(k)
+        return k, self.scattered(rays, row[k], strength, light.angle[k], mirrors)
 
     def seen(self, rays: Rays) -> Records:
         """What rays see of elements."""
         hits, s = rays.hits, self.surface
         row = np.flatnonzero(hits.face >= 0)
-        each = row % len(hits.directions)
-        side = s.side_met(hits.face[row], hits.directions[each])
-        solid_angle = hits.solid_angle[row % len(hits.solid_angle)]
+        _, direction, solid_angle = hits.rays(row)
+        side = s.side_met(hits.face[row], direction)
         friis = (self.wavelength_m / (4.0 * np.pi)) ** 2
         power = friis * solid_angle * self.grid.transmittance(hits.range_m[row])
         return self._records(rays, row, power, side, np.zeros((len(row), 3)), SOURCE)
@@ -420,24 +427,12 @@ class Tracer:
         before: Interactions | None = None,
     ) -> Records:
         after, dtype = None if rays.after is None else rays.after.take(row), self.grid.dtype
-        legs = [
-            leg
-            for leg in (before, Interactions(index[:, None], angle[:, None], one_kind(last)), after)
-            if leg is not None
-        ]
+        own = Interactions.alike(index[:, None], angle[:, None], last)
+        met = Interactions.in_a_row([leg for leg in (before, own, after) if leg is not None])
         residual_row = -1 if after is not None else int(last == SOURCE or before is not None)
-        kinds = [
-            leg.kind if len(leg.kind) else one_kind(0) for leg in legs
-        ]  # of no record it does not matter
-        rows = max(map(len, kinds))
-        kind = np.concatenate(
-            [np.broadcast_to(own, (rows, leg.index.shape[1])) for own, leg in zip(kinds, legs, strict=True)],
-            axis=1,
-        )
         return Records(
-            np.asarray(power, dtype), rays.ray[row].astype(np.int32),
-            np.concatenate([leg.index for leg in legs], axis=1).astype(np.int32),
-            np.concatenate([leg.angle for leg in legs], axis=1).astype(dtype), kind, residual_row, self.grid.half_width,
+            np.asarray(power, dtype), rays.ray[row].astype(np.int32), met.index.astype(np.int32), met.angle.astype(dtype),
+            met.kind, residual_row, self.grid.half_width,
         )  # fmt: skip
 
     def _through(self, slabs: Slabs, way: np.ndarray) -> Interactions:
@@ -449,37 +444,32 @@ class Tracer:
         stops = np.arange(met.shape[1] + 2)[:, None] * way[more, None]
         turn[more] = np.where(met[more], turns(stops, normal), 0.0)
         thickness = np.nan_to_num(slabs.thickness_m) / self.wavelength_m
-        return Interactions(
-            np.where(met, s.group[slabs.face], -1),
-            np.stack([slabs.cosine, turn, thickness], axis=2),
-            one_kind(SLAB),
-        )
+        index = np.where(met, s.group[slabs.face], -1)
+        return Interactions.alike(index, np.stack([slabs.cosine, turn, thickness], axis=2), SLAB)
 
     def behind(self, rays: Rays, most: int) -> Rays:
         """``rays`` that go straight on through what they hit, and what they meet behind up to ``most`` slabs."""
         hits, walls = rays.hits, self.walls(most)
         ray = np.flatnonzero(hits.face >= 0)
         ray = ray[walls.passes[hits.face[ray]]]
-        origins = hits.origins[ray // (len(hits.face) // len(hits.origins))]
-        directions = hits.directions[ray % len(hits.directions)]
+        origins, directions, solid_angle = hits.rays(ray)
         row, face, range_m, slabs = walls.behind(origins, directions, hits.face[ray], hits.range_m[ray])
         after = self._through(slabs.reversed, -directions[row])
-        solid_angle = hits.solid_angle[ray[row] % len(hits.solid_angle)]
-        found = Hits(origins[row], directions[row], solid_angle, face.astype(np.int32), range_m)
+        found = Hits(origins[row], directions[row], solid_angle[row], face.astype(np.int32), range_m)
         return Rays(found, rays.ray[ray[row]], after)
 
-    def _turned(self, view: View) -> Rays:
-        """Rays turned at the mirrors that they hit, and what they hit there."""
-        s, grid, hits = self.surface, self.grid, view.hits
+    def turned(self, rays: Rays) -> Rays:
+        """``rays`` turned at the mirrors that they hit, and what they hit there."""
+        s, grid, hits = self.surface, self.grid, rays.hits
         ray = np.flatnonzero((hits.face >= 0) & (s.patch[hits.face] >= 0))
-        face, each = hits.face[ray], ray % len(grid.directions)
-        direction, normal = grid.directions[each], s.plane_normal[s.patch[face]]
+        face, (_, direction, solid_angle) = hits.face[ray], hits.rays(ray)
+        normal = s.plane_normal[s.patch[face]]
         normal = np.where((direction * normal).sum(axis=1, keepdims=True) > 0, -normal, normal)
         cosine = -(direction * normal).sum(axis=1)
-        turned = direction + 2.0 * cosine[:, None] * normal
-        solid_angle = grid.solid_angle[each] * grid.transmittance(hits.range_m[ray])
-        found = grid.hit_along(hits.points(ray) + s.position_error_m * normal, turned, solid_angle)
-        return Rays(found, ray, Interactions.of_mirrors(s.group[face], cosine))
+        onward = direction + 2.0 * cosine[:, None] * normal
+        start, left = hits.points(ray) + s.position_error_m * normal, grid.transmittance(hits.range_m[ray])
+        found = grid.hit_along(start, onward, solid_angle * left)
+        return Rays(found, rays.ray[ray], Interactions.of_mirrors(s.group[face], cosine))
 
     def adopted(self, view: View) -> View:
         """What :func:`view_of` found, as a view of this tracer."""
