@@ -41,3 +41,8 @@ def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     index = np.empty(len(rows), int)
     index[order] = np.cumsum(new) - 1
     return order[new], index, np.bincount(index)
+
+
+def sums_of(values: np.ndarray, owner: np.ndarray, count: int = 0) -> np.ndarray:
+    """Sums of the rows of ``values`` (N, K) that are each owner's, ``owner`` (N,), of at least ``count``: shape ``(C, K)``."""
+    return np.stack([np.bincount(owner, column, minlength=count) for column in values.T], axis=1)

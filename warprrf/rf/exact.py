@@ -248,7 +248,7 @@ class ExactEngine:
         if walls is not None:
             lit["MTS"] = ways.through(walls)[1]
         for name, ways in lit.items():
-            mirrors = described(ways, 1 + (walls.most if walls else 0))
+            mirrors = described(ways, 1, walls)
             before, patch = tracer.specular(mirrors).interactions, ways.patch[:, 0]
             k, records = tracer.lit_by_images(rays.seen, ray[ways.row], patch, before, every)
             yield self._paths(

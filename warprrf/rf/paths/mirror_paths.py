@@ -115,11 +115,6 @@ _EMPTY = {
 """What columns hold past a path's last mirror or slab."""
 
 
-def _width(order: int, walls: Walls | None) -> int:
-    """Most mirrors and slabs on a path, at least one."""
-    return max(order, 1) + (walls.most if walls else 0)
-
-
 def exact_paths(
     images: MirrorImages,
     receivers: np.ndarray,
@@ -136,7 +131,7 @@ def exact_paths(
     Raises:
         ValueError: before anything is traced, if more chains would be tried than ``images`` allow.
     """
-    patches, parts, most = images.patches, list[MirrorPaths](), _width(order, walls)
+    patches, parts = images.patches, list[MirrorPaths]()
     for k, ways in enumerate(images.search(receivers, order, progress)):
         for j in range(k):
             ways = ways.take(patches.contains(ways.patch[:, j], ways.point[:, j]))
@@ -147,7 +142,7 @@ def exact_paths(
         for own in found:
             # Sheets closer than the tolerance don't hide each other: seen at a slant, their mirror points lie further apart.
             once = distinct(own.row, own.point, 3.0 * patches.tolerance_m)
-            parts.append(described(own.take(once), most))
+            parts.append(described(own.take(once), order, walls))
     paths = MirrorPaths.joined(parts)
     return paths.take(np.argsort(paths.receiver, kind="stable"))
 
@@ -182,12 +177,12 @@ def zone_paths(
     Raises:
         ValueError: before anything is traced, if more chains would be tried than ``images`` allow.
     """
-    zone, parts, most = ZoneRays(images, wavelength_m), list[MirrorPaths](), _width(order, walls)
+    zone, parts = ZoneRays(images, wavelength_m), list[MirrorPaths]()
 
     def keep(ways: Ways, rays: ZoneRays) -> None:
         share = rays.share(ways)
         kept = share >= 0.05
-        parts.append(replace(described(ways.take(kept), most), share=share[kept]))
+        parts.append(replace(described(ways.take(kept), order, walls), share=share[kept]))
 
     for k, ways in enumerate(images.search(receivers, order, progress)):
         kept = np.ones(len(ways), bool)
@@ -334,8 +329,10 @@ class ZoneRays:
         )
 
 
-def described(ways: Ways, most: int) -> MirrorPaths:
-    """``ways`` as paths of ``most`` columns, with what is known of each mirror and slab."""
+def described(ways: Ways, order: int, walls: Walls | None) -> MirrorPaths:
+    """``ways`` with what is known of each mirror and slab, in columns for ``order`` mirrors and as many slabs as ``walls``
+    allow."""
+    most = max(order, 1) + (walls.most if walls else 0)
     row, mesh, normals = ways.row, ways.patches.mesh, ways.patches.normal[ways.patch]
     columns = []
     for k in range(ways.stops.shape[1] - 1):

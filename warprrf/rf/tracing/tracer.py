@@ -99,7 +99,7 @@ class View:
     paths: MirrorPaths
     records: dict[str, Records] = field(repr=False)
     keeps: bool = True
-    _beams: list[np.ndarray] = field(init=False, repr=False, default_factory=list)
+    _beams: Cache = field(init=False, repr=False, default_factory=lambda: Cache(1))
 
     @property
     def beams(self) -> np.ndarray:
@@ -108,10 +108,8 @@ class View:
         if sigma is None:
             raise ValueError("view: it was traced without a receiver's beam, expected one of a spectrum")
         grid = self.tracer.grid
-        made = self._beams or [unit_beams(self.paths.arrival, grid.shape, sigma, device=grid.device)]
-        if self.keeps:
-            self._beams[:] = made
-        return made[0]
+        make = partial(unit_beams, self.paths.arrival, grid.shape, sigma, device=grid.device)
+        return self._beams.get("beams", make) if self.keeps else make()
 
     @property
     def cell(self) -> np.ndarray:
@@ -135,12 +133,13 @@ class View:
 
     def traced(self, effects: Effects) -> dict[str, Records]:
         """The tables that count under ``effects``; they are traced when they are first asked for."""
-        wanted = [own.name for own in sequences(effects)]
-        made = self.tracer.trace(self, [own for own in sequences(effects) if own.name not in self.records])
+        wanted = sequences(effects)
+        made = self.tracer.trace(self, [own for own in wanted if own.name not in self.records])
         if made and self.keeps:
             with making:
                 self.records.update(made)
-        return {name: made[name] if name in made else self.records[name] for name in (SPECULAR, *wanted)}
+        every = self.records | made
+        return {name: every[name] for name in (SPECULAR, *(own.name for own in wanted))}
 
     def of(self, k: int) -> View:
         """That of receiver ``k`` alone; nothing but its line of sight and mirrors is known."""
@@ -322,10 +321,8 @@ class Tracer:
                 lights[sight] = self.light(rays)
             if light == "E":
                 table = self.seen(rays)
-            elif light == "MS":
-                table = self.lit_by_mirrors(rays)
-            elif light == "MTS":
-                table = self.lit_by_mirrors(rays, most)
+            elif light in ("MS", "MTS"):
+                table = self.lit_by_mirrors(rays, most if light == "MTS" else 0)
             elif light == "TS":
                 table = self.lit_through(rays, lights[sight], most)
             else:
@@ -381,7 +378,7 @@ class Tracer:
     ) -> tuple[np.ndarray, Records]:
         """What the rays ``row`` (N,), each in place of ``times``, see by the transmitter's image in ``patch`` (N,): which of them
         see any, and records of those, after the interactions ``before``, by default the mirror alone."""
-        images, s = self.surface.images(self.transmitter)[0], self.surface
+        images, s = self.surface.images(self.transmitter), self.surface
         light = self.grid.unshadowed(rays.hits, images[patch], row)
         k = np.flatnonzero(light.strength > 0)
         strength = light.strength[k] * self.grid.dtype.type(times)
@@ -402,7 +399,8 @@ class Tracer:
         side = s.side_met(hits.face[row], direction)
         friis = (self.wavelength_m / (4.0 * np.pi)) ** 2
         power = friis * solid_angle * self.grid.transmittance(hits.range_m[row])
-        return self._records(rays, row, power, side, np.zeros((len(row), 3)), SOURCE)
+        own = Interactions.alike(side[:, None], np.zeros((len(row), 1, 3)), SOURCE)
+        return self._records(rays, row, power, [own], 1)
 
     def scattered(
         self,
@@ -414,25 +412,19 @@ class Tracer:
     ) -> Records:
         """Records of scattering where the rays ``row`` hit, after the interactions ``before``."""
         group = self.surface.group[rays.hits.face[row]]
-        return self._records(rays, row, self.wavelength_m**2 * strength, group, angle, SCATTER, before)
+        own = Interactions.alike(group[:, None], angle[:, None], SCATTER)
+        met = [own] if before is None else [before, own]
+        return self._records(rays, row, self.wavelength_m**2 * strength, met, int(before is not None))
 
     def _records(
-        self,
-        rays: Rays,
-        row: np.ndarray,
-        power: np.ndarray,
-        index: np.ndarray,
-        angle: np.ndarray,
-        last: int,
-        before: Interactions | None = None,
+        self, rays: Rays, row: np.ndarray, power: np.ndarray, met: list[Interactions], residual_row: int
     ) -> Records:
-        after, dtype = None if rays.after is None else rays.after.take(row), self.grid.dtype
-        own = Interactions.alike(index[:, None], angle[:, None], last)
-        met = Interactions.in_a_row([leg for leg in (before, own, after) if leg is not None])
-        residual_row = -1 if after is not None else int(last == SOURCE or before is not None)
+        """Records of what the rays ``row`` see over ``met``, one after the other; the residual's row is that of direct sight."""
+        dtype, behind = self.grid.dtype, [] if rays.after is None else [rays.after.take(row)]
+        every = Interactions.in_a_row([*met, *behind])
         return Records(
-            np.asarray(power, dtype), rays.ray[row].astype(np.int32), met.index.astype(np.int32), met.angle.astype(dtype),
-            met.kind, residual_row, self.grid.half_width,
+            np.asarray(power, dtype), rays.ray[row].astype(np.int32), every.index.astype(np.int32),
+            every.angle.astype(dtype), every.kind, -1 if behind else residual_row, self.grid.half_width,
         )  # fmt: skip
 
     def _through(self, slabs: Slabs, way: np.ndarray) -> Interactions:
@@ -530,9 +522,9 @@ class MirroredLight:
             chosen, off = rays.through(walls, off, free)
         piece, patch, normal = off.row, off.patch[:, 0], normal[chosen]
         ways = off.over(-1, centre[piece])
-        paths = tracer.specular(described(ways, 1 + (walls.most if walls else 0)))
+        paths = tracer.specular(described(ways, 1, walls))
         self.before = paths.interactions
-        self.image, self.patch = s.images(tracer.transmitter)[0][patch], patch
+        self.image, self.patch = s.images(tracer.transmitter)[patch], patch
         self._first = np.searchsorted(piece, np.arange(len(middle) + 1))
         way = self.image - centre[piece]
         length = np.linalg.norm(way, axis=1)
