@@ -225,12 +225,8 @@ class ExactEngine:
 
     def _lit(self, rays: _Beams) -> Iterator[DiffusePaths]:
         """What the transmitter lights where rays hit, and what it lights through slabs."""
-        tracer, seen = self._tracer, rays.seen
-        light = tracer.light(seen)
-        lit = {"S": tracer.lit(seen, light)}
-        if self.mirrors.walls is not None:
-            lit["TS"] = tracer.lit_through(seen, light, self.effects.transmissions)
-        for name, records in lit.items():
+        tracer = self._tracer
+        for name, records in tracer.lit(rays.seen, self.effects.transmissions).items():
             out = rays.hits.points(records.ray) - tracer.transmitter
             yield self._paths(rays, records, np.linalg.norm(out, axis=1), out, name)
 

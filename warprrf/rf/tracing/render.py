@@ -157,14 +157,10 @@ class Interreflection:
             hit = np.flatnonzero(hits.face >= 0)
             side, met = np.repeat(new, ELEMENT_RAYS), surface.side_met(hits.face[hit], directions[hit])
             rays = Rays(hits, side)
-            light = tracer.light(rays)
-            tables = [(lit, tracer.lit(rays, light))]
+            seen = tracer.lit(rays, most)
+            tables = [(lit, seen["S"])]
             if most:
-                onward = tracer.behind(rays, most)
-                tables += [
-                    (through, tracer.lit_through(rays, light, most)),
-                    (behind, tracer.lit(onward, tracer.light(onward))),
-                ]
+                tables += [(through, seen["TS"]), (behind, tracer.lit(tracer.behind(rays, most), 0)["S"])]
             for table, found in tables:
                 table.append(replace(found, power=scale * found.power))
             rows.append(side[hit])

@@ -13,7 +13,7 @@ A :class:`Tracer` belongs to a surface, a transmitter and a grid of rays; what i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -32,7 +32,7 @@ from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.paths.slabs import Slabs, Walls
 from warprrf.rf.spectra.spectrum import unit_beams
 from warprrf.rf.tracing.model import Effects
-from warprrf.rf.tracing.rays import NEAREST_M, Hits, Light, RayGrid
+from warprrf.rf.tracing.rays import NEAREST_M, Hits, RayGrid
 from warprrf.rf.tracing.records import Interactions, Records
 from warprrf.rf.tracing.surface import Surface
 
@@ -309,24 +309,23 @@ class Tracer:
         found = self.paths(places, effects) if paths is None else paths
         return View(self, places, self.grid.hit(places), found, {SPECULAR: self.specular(found)}, keeps)
 
-    def trace(self, view: View, wanted: Iterable[Sequence]) -> dict[str, Records]:
+    def trace(self, view: View, wanted: list[Sequence]) -> dict[str, Records]:
         """Tables of sequences that a receiver sees, by name."""
         first = Rays(view.hits, np.arange(len(view.hits.face)))
-        seen, lights, made = {"": first}, dict[str, Light](), dict[str, Records]()
+        seen, lit, made = {"": first}, dict[str, dict[str, Records]](), dict[str, Records]()
+        deepest = max((own.slabs for own in wanted if own.light == "TS"), default=0)
         for light, sight, most in wanted:
             if sight not in seen:
                 seen[sight] = self.turned(first) if sight == "M" else self.behind(first, most)
             rays = seen[sight]
-            if light in ("S", "TS") and sight not in lights:
-                lights[sight] = self.light(rays)
             if light == "E":
                 table = self.seen(rays)
             elif light in ("MS", "MTS"):
                 table = self.lit_by_mirrors(rays, most if light == "MTS" else 0)
-            elif light == "TS":
-                table = self.lit_through(rays, lights[sight], most)
             else:
-                table = self.lit(rays, lights[sight])
+                if sight not in lit:
+                    lit[sight] = self.lit(rays, deepest)
+                table = lit[sight][light]
             made[Sequence(light, sight, most).name] = table
         return made
 
@@ -343,22 +342,19 @@ class Tracer:
         row = np.arange(len(p), dtype=np.int32)
         return Records(power, row, group.astype(np.int32), angle, kind.astype(np.int32))
 
-    def light(self, rays: Rays) -> Light:
-        """How the transmitter illuminates what rays hit."""
-        return self.grid.light(rays.hits, self.transmitter)
-
-    def lit(self, rays: Rays, light: Light) -> Records:
-        """What rays see of surfaces that the transmitter lights."""
-        return self.scattered(rays, light.lit, light.strength[light.lit], light.angle[light.lit])
-
-    def lit_through(self, rays: Rays, light: Light, most: int) -> Records:
-        """What rays see of surfaces that the transmitter lights through slabs, up to ``most``."""
-        row = light.shaded
-        arrived, slabs = self.walls(most).between(self.transmitter, light.point[row])
-        own = np.flatnonzero(slabs.count > 0)
-        row, slabs = row[arrived[own]], slabs.take(own)
-        before = self._through(slabs, light.point[row] - self.transmitter)
-        return self.scattered(rays, row, light.strength[row], light.angle[row], before)
+    def lit(self, rays: Rays, most: int) -> dict[str, Records]:
+        """What rays see of surfaces that the transmitter lights, ``"S"``, and, if ``most`` is not 0, through slabs, up to that
+        many, ``"TS"``."""
+        light = self.grid.light(rays.hits, self.transmitter)
+        found = {"S": self.scattered(rays, light.lit, light.strength[light.lit], light.angle[light.lit])}
+        if most:
+            row = light.shaded
+            arrived, slabs = self.walls(most).between(self.transmitter, light.point[row])
+            own = np.flatnonzero(slabs.count > 0)
+            row, slabs = row[arrived[own]], slabs.take(own)
+            before = self._through(slabs, light.point[row] - self.transmitter)
+            found["TS"] = self.scattered(rays, row, light.strength[row], light.angle[row], before)
+        return found
 
     def lit_by_mirrors(self, rays: Rays, most: int = 0) -> Records:
         """What some rays of each pixel see of surfaces that images of the transmitter light; with ``most`` those that they light
