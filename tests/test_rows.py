@@ -1,9 +1,9 @@
-"""Equal rows are found as NumPy finds them, and what belongs to them is averaged."""
+"""Equal rows are found as NumPy finds them, and rows are summed as one by one."""
 
 import numpy as np
 import pytest
 
-from warprrf.rows import distinct_rows, group_means
+from warprrf.rows import distinct_rows, sums_of
 
 
 @pytest.mark.parametrize(("count", "columns", "values"), [(0, 2, 3), (1, 3, 3), (400, 2, 12), (900, 3, 9)])
@@ -19,10 +19,10 @@ def test_distinct_rows_are_those_of_numpy(count, columns, values):
             assert np.array_equal(own, other.reshape(-1))
 
 
-def test_means_of_groups_are_those_of_their_members():
+def test_sums_are_those_of_each_owner_s_rows():
     rng = np.random.default_rng(0)
-    rows, values = rng.integers(0, 4, (200, 2)), rng.standard_normal((200, 3))
-    first, group, count = distinct_rows(rows)
-    found = group_means(values, group, count)
-    for mean, row in zip(found, rows[first], strict=True):
-        np.testing.assert_allclose(mean, values[(rows == row).all(axis=1)].mean(axis=0), rtol=1e-12)
+    values, owner = rng.normal(size=(50, 3)), rng.integers(0, 7, 50)
+    found = sums_of(values, owner, 9)
+    assert found.shape == (9, 3)
+    for k in range(9):
+        np.testing.assert_allclose(found[k], values[owner == k].sum(axis=0), atol=1e-14)

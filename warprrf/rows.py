@@ -44,7 +44,6 @@ def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return order[new], index, np.bincount(index)
 
 
-def group_means(values: np.ndarray, group: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Means over groups of the rows of ``values`` (N, K), shape ``(G, K)``: ``group`` (N,) says which group each row is of,
-    ``count`` (G,) how many each has, as :func:`distinct_rows` returns both."""
-    return np.stack([np.bincount(group, column, len(count)) for column in values.T], axis=1) / count[:, None]
+def sums_of(values: np.ndarray, owner: np.ndarray, count: int = 0) -> np.ndarray:
+    """Sums of the rows of ``values`` (N, K) that are each owner's, ``owner`` (N,), of at least ``count``: shape ``(C, K)``."""
+    return np.stack([np.bincount(owner, column, minlength=count) for column in values.T], axis=1)

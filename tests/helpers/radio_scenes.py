@@ -105,7 +105,7 @@ def is_wound_alike(vertices, faces):
 def mirror_paths(surface, transmitter, receivers, wavelength_m, order):
     """Line of sight and mirror paths on a field's surface, softly blocked."""
     images = MirrorImages(surface.patches, transmitter, slack_m=MIRROR_SLACK_M)
-    return zone_paths(images, receivers, order, wavelength_m, surface.position_error_m)
+    return zone_paths(images, receivers, order, wavelength_m)
 
 
 def observation(view, measured, floor, db=None, **how):

@@ -17,7 +17,7 @@ from warprrf.checks import Count, checked, positive
 from warprrf.geometry.mesh import Mesh, connected_pieces, edge_pairs, face_neighbours, smoothed_normals
 from warprrf.geometry.planar_patches import PlanarPatches, vertex_noise
 from warprrf.geometry.planes import Plane, PlaneConfig, detect_planes, drawn_by_place
-from warprrf.rows import distinct_rows, group_means
+from warprrf.rows import distinct_rows, sums_of
 
 
 @checked
@@ -244,7 +244,7 @@ def _gathered(patches: PlanarPatches, cell_m: float) -> np.ndarray:
     key[edge, 2] = np.floor(stretch)
     target, chosen = np.arange(count), np.flatnonzero(movable)
     _, group, members = distinct_rows(key[chosen])
-    centre = group_means(mesh.vertices[chosen], group, members)
+    centre = sums_of(mesh.vertices[chosen], group) / members[:, None]
     gap = np.linalg.norm(mesh.vertices[chosen] - centre[group], axis=1)
     first = np.lexsort((gap, group))[np.cumsum(members) - members]
     target[chosen] = chosen[first][group]

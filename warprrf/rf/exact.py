@@ -31,12 +31,11 @@ from warprrf import device as _device
 from warprrf.checks import check_array, check_count, check_seed
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
-from warprrf.kernels.radio.records import MIRROR, SCATTER, SLAB
+from warprrf.kernels.radio.records import MIRROR, SCATTER
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.paths.mirror_paths import described, legs_of, passed, unobstructed
+from warprrf.rf.paths.mirror_paths import described
 from warprrf.rf.paths.path_set import Paths
-from warprrf.rf.paths.slabs import Slabs
 from warprrf.rf.paths.trace import MirrorTracer
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import Received
@@ -50,7 +49,7 @@ from warprrf.rf.spectra.spectrum import (
 )
 from warprrf.rf.tracing.model import SETS, Effects
 from warprrf.rf.tracing.rays import Hits, RayGrid
-from warprrf.rf.tracing.records import Interactions, Records, SlabMaterials, one_kind
+from warprrf.rf.tracing.records import Interactions, Records, SlabMaterials
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import Rays, Tracer
 from warprrf.rows import Rows
@@ -98,6 +97,11 @@ class _Beams:
     length_m: np.ndarray
     sequence: str
     times: int = 1
+
+    @property
+    def reach_m(self) -> np.ndarray:
+        """Length from the receiver to what they hit [m], shape ``(N,)``."""
+        return self.length_m + self.hits.range_m
 
     @property
     def seen(self) -> Rays:
@@ -186,7 +190,7 @@ class ExactEngine:
             depth = rays.sequence.count("S") + 1
             for own in reversed(met if rays is first else [rays]):
                 if rays is first and e.scatter_mirror:
-                    waiting.append(self._turned(own))
+                    waiting.append(self._on(own, self._tracer.turned(own.seen), own.reach_m, "M"))
                 if depth < e.scatterings:
                     waiting.append(self._scattered_on(own, depth))
 
@@ -216,25 +220,13 @@ class ExactEngine:
         if self.mirrors.walls is None or not self.effects.scatter_mirror:
             return
         behind = self._tracer.behind(rays.seen, self.effects.transmissions)
-        hits, after = behind.hits, behind.after
-        if after is not None and len(behind.ray):
-            kind = np.full((1, after.index.shape[1]), SLAB, np.int32)
-            index = after.index.astype(np.int32)
-            passed = Records(hits.solid_angle, behind.ray, index, after.angle, kind).powers(self.materials)
-            length = rays.length_m[behind.ray]
-            sequence = "T" + rays.sequence
-            yield _Beams(
-                replace(hits, solid_angle=passed), rays.ray[behind.ray], length, sequence, rays.times
-            )
+        if len(behind.ray):
+            yield self._on(rays, behind, rays.length_m, "T")
 
     def _lit(self, rays: _Beams) -> Iterator[DiffusePaths]:
         """What the transmitter lights where rays hit, and what it lights through slabs."""
-        tracer, seen = self._tracer, rays.seen
-        light = tracer.light(seen)
-        lit = {"S": tracer.lit(seen, light)}
-        if self.mirrors.walls is not None:
-            lit["TS"] = tracer.lit_through(seen, light, self.effects.transmissions)
-        for name, records in lit.items():
+        tracer = self._tracer
+        for name, records in tracer.lit(rays.seen, self.effects.transmissions).items():
             out = rays.hits.points(records.ray) - tracer.transmitter
             yield self._paths(rays, records, np.linalg.norm(out, axis=1), out, name)
 
@@ -244,28 +236,20 @@ class ExactEngine:
         most = 4 if rays.sequence else 16  # each is a search: fewer after they hit first
         ray, every = self._some(rays, most)
         point, _, normal = self._met(rays, ray)
-        row, patch, met = self.mirrors.images.candidates(point, 1)
-        own = ((met[:, 0] - point[row]) * normal[row]).sum(axis=1) > 0
-        own &= patches.contains(patch[:, 0], met[:, 0])
-        row, patch, met = row[own], patch[own], met[own]
-        free = unobstructed(patches, tracer.transmitter, point[row], patch, met, tracer.grid.device)
-        ways: dict[str, tuple[np.ndarray, list[Slabs] | None]] = {"MS": (free.nonzero()[0], None)}
-        walls = self.mirrors.walls
+        ways = self.mirrors.images.candidates(point, 1)
+        own = ((ways.point[:, 0] - point[ways.row]) * normal[ways.row]).sum(axis=1) > 0
+        own &= patches.contains(ways.patch[:, 0], ways.point[:, 0])
+        ways = ways.take(own)
+        lit, walls = {"MS": ways.take(ways.unobstructed(tracer.grid.device))}, self.mirrors.walls
         if walls is not None:
-            legs = legs_of(patches, tracer.transmitter, point[row], patch, met, walls.clearance_m)
-            ways["MTS"] = passed(walls, *legs)
-        for name, (chosen, slabs) in ways.items():
-            found = point, (row[chosen], patch[chosen], met[chosen], np.ones(len(row))[chosen])
-            mirrors = described(patches, tracer.transmitter, *found, 1, walls, slabs)
-            image = self.surface.images(tracer.transmitter)[0][patch[chosen, 0]]
-            light = tracer.grid.unshadowed(rays.hits, image, ray[row[chosen]])
-            k = np.flatnonzero(light.strength > 0)
-            own, image, mirrors = row[chosen][k], image[k], mirrors.take(k)
-            way, plane = point[own] - image, self.surface.plane_normal[patch[chosen, 0][k]]
-            before = tracer.specular(mirrors).interactions
-            records = tracer.scattered(rays.seen, ray[own], every * light.strength[k], light.angle[k], before)
-            departure = way - 2.0 * (way * plane).sum(axis=1)[:, None] * plane
-            yield self._paths(rays, records, np.linalg.norm(way, axis=1), departure, name)
+            lit["MTS"] = ways.through(walls)[1]
+        for name, ways in lit.items():
+            mirrors = described(ways, 1, walls)
+            before, patch = tracer.specular(mirrors).interactions, ways.patch[:, 0]
+            k, records = tracer.lit_by_images(rays.seen, ray[ways.row], patch, before, every)
+            yield self._paths(
+                rays, records, mirrors.length_m[k], mirrors.point[k, 0] - tracer.transmitter, name
+            )
 
     def _paths(
         self, rays: _Beams, records: Records, legs: np.ndarray, departure: np.ndarray, name: str
@@ -273,20 +257,10 @@ class ExactEngine:
         """Paths over where rays hit, ``legs`` (N,) from the transmitter; ``records`` name rows of ``rays``."""
         grid = self._tracer.grid
         row, ray = records.ray, rays.ray[records.ray]
-        length = rays.length_m[row] + rays.hits.range_m[row] + legs
+        length = rays.reach_m[row] + legs
         beams = _lattice_beams(grid.sub_pixels, self.shape, self.beam_sigma_rad, str(self.device))[ray]
         power, direction = records.powers(self.materials), grid.directions[ray]
         return DiffusePaths(direction, power, length, departure, beams, name + rays.sequence)
-
-    def _turned(self, rays: _Beams) -> _Beams:
-        """Rays turned at the mirrors that they hit."""
-        ray = np.flatnonzero((rays.hits.face >= 0) & (self.surface.patch[rays.hits.face] >= 0))
-        point, direction, normal = self._met(rays, ray)
-        cosine = -(direction * normal).sum(axis=1)
-        mirror = Interactions.of_mirrors(self.surface.group[rays.hits.face[ray]], cosine)
-        onward = direction + 2.0 * cosine[:, None] * normal
-        records = Records(self._left(rays, ray), ray, mirror.index, mirror.angle, mirror.kind)
-        return self._on(rays, ray, point, normal, onward, records, "M")
 
     def _scattered_on(self, rays: _Beams, depth: int) -> _Beams:
         """Some of the rays scattered where they hit, one direction each, drawn by the cosine."""
@@ -301,22 +275,21 @@ class ExactEngine:
         cos_out = np.clip(-(direction * normal).sum(axis=1), 0.0, 1.0)
         cos_mirror = np.clip(2.0 * up * cos_out + (onward * direction).sum(axis=1), -1.0, 1.0)
         angle = np.column_stack([up, cos_out, cos_mirror])[:, None]
-        group = self.surface.group[rays.hits.face[ray]]
-        records = Records(
-            every * np.pi * self._left(rays, ray), ray, group[:, None], angle, one_kind(SCATTER),
-            half_width=self._tracer.grid.half_width,
-        )  # fmt: skip
-        return replace(self._on(rays, ray, point, normal, onward, records, "S"), times=every * rays.times)
+        surface = Interactions.alike(self.surface.group[rays.hits.face[ray], None], angle, SCATTER)
+        grid = self._tracer.grid
+        weight = every * np.pi * (rays.hits.rays(ray)[2] * grid.transmittance(rays.hits.range_m[ray]))
+        hits = grid.hit_along(point + ENDPOINT_CLEARANCE * normal, onward, weight)
+        found = self._on(rays, Rays(hits, ray, surface), rays.reach_m, "S")
+        return replace(found, times=every * rays.times)
 
-    def _on(
-        self, rays: _Beams, ray: np.ndarray, point: np.ndarray, normal: np.ndarray, onward: np.ndarray, weighed: Records, name: str
-    ) -> _Beams:  # fmt: skip
-        """Rays that go on from where the rows ``ray`` hit, with the power of ``weighed`` in the place of solid angles."""
-        hits = self._tracer.grid.hit_along(
-            point + ENDPOINT_CLEARANCE * normal, onward, weighed.powers(self.materials)
-        )
-        length = rays.length_m[ray] + rays.hits.range_m[ray]
-        return _Beams(hits, rays.ray[ray], length, name + rays.sequence, rays.times)
+    def _on(self, rays: _Beams, onward: Rays, length_m: np.ndarray, name: str) -> _Beams:
+        """Rays that go on, ``length_m`` (N,) from the receiver, with what interactions leave of their solid angles."""
+        hits, met, own = onward.hits, onward.after, rays.ray[onward.ray]
+        if met is not None:
+            width, power = self._tracer.grid.half_width, hits.solid_angle
+            records = Records(power, own, met.index, met.angle, met.kind, half_width=width)
+            hits = replace(hits, solid_angle=records.powers(self.materials))
+        return _Beams(hits, own, length_m[onward.ray], name + rays.sequence, rays.times)
 
     def _some(self, rays: _Beams, most: int) -> tuple[np.ndarray, int]:
         """Of the rays those that hit something, at most so many of a pixel: a lattice again. How many each of them stands for."""
@@ -326,14 +299,9 @@ class ExactEngine:
         place = rays.ray % per_pixel // rays.times
         return np.flatnonzero((rays.hits.face >= 0) & (place % every == every // 2)), every
 
-    def _left(self, rays: _Beams, ray: np.ndarray) -> np.ndarray:
-        """Solid angles, less what the air absorbs up to where the rays hit, shape ``(N,)``."""
-        angle = rays.hits.solid_angle[ray % len(rays.hits.solid_angle)]
-        return np.asarray(angle * self._tracer.grid.transmittance(rays.hits.range_m[ray]))
-
     def _met(self, rays: _Beams, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Where the rows ``ray`` hit, their directions, and normals of what they meet, on the side that they meet, (N, 3) each."""
-        direction = rays.hits.directions[ray % len(rays.hits.directions)]
+        direction = rays.hits.rays(ray)[1]
         normal = self.surface.mesh.face_normals[rays.hits.face[ray]]
         away = (normal * direction).sum(axis=1, keepdims=True) > 0
         return rays.hits.points(ray), direction, np.where(away, -normal, normal)

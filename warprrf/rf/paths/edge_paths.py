@@ -20,8 +20,9 @@ from warprrf.kernels.radio.records import EDGE, MIRROR, SLAB
 from warprrf.rf.em.diffraction import EdgeRays, Pair, boundary_fields, diffraction_matrices
 from warprrf.rf.em.fresnel import SurfaceTable
 from warprrf.rf.paths.images import EdgeLeaves, MirrorImages
-from warprrf.rf.paths.mirror_paths import MirrorPaths, distinct, met_at, passed, unobstructed
+from warprrf.rf.paths.mirror_paths import MirrorPaths, met_at
 from warprrf.rf.paths.slabs import Walls
+from warprrf.rf.paths.ways import Ways, distinct, passed, stops_of
 from warprrf.rf.spectra.spectrum import transverse_basis
 from warprrf.rows import Rows
 
@@ -172,13 +173,13 @@ class EdgeFinder:
         for sieve in (self._in_reach, self._strong, self._on_mirrors):
             ways = ways.take(np.flatnonzero(sieve(ways)))
         free = self._unobstructed(ways)
-        ways = _Ways.joined([ways.take(free), self._passing(ways.take(~free))])
+        ways = _EdgeWays.joined([ways.take(free), self._passing(ways.take(~free))])
         # Wedges before the borders of their faces.
         ways = ways.take(np.argsort(self.edges.n[ways.edge], kind="stable"))
         paths = self._described(ways.take(ways.distinct(3.0 * self.images.patches.tolerance_m)))
         return paths.take(np.lexsort((paths.length_m, paths.receiver)))
 
-    def _over(self, row: np.ndarray, edge: np.ndarray, patch: np.ndarray, end: np.ndarray) -> _Ways:
+    def _over(self, row: np.ndarray, edge: np.ndarray, patch: np.ndarray, end: np.ndarray) -> _EdgeWays:
         """Of receivers ``row`` (L,), between two points ``end`` (L, 2, 3) each, over the edges ``edge`` (L,), by images of either
         in ``patch`` (L, 2)."""
         e, patches = self.edges.take(edge), self.images.patches
@@ -203,9 +204,9 @@ class EdgeFinder:
         share = np.divide(depth, between, out=np.zeros_like(depth), where=between != 0)
         stop = np.where(mirrored, point[:, None] + share * (image - point[:, None]), np.nan)
         slab, solid = np.full(patch.shape, -1), np.full(patch.shape, np.nan)
-        return _Ways(row, edge, patch, slab, stop, solid, point, at, leg, angle, direction, end)
+        return _EdgeWays(row, edge, patch, slab, stop, solid, point, at, leg, angle, direction, end)
 
-    def _in_reach(self, ways: _Ways) -> np.ndarray:
+    def _in_reach(self, ways: _EdgeWays) -> np.ndarray:
         """Whether the point lies on the edge, both legs in the air and what is mirrored not in the mirror's own plane."""
         patches, n = self.images.patches, self.edges.n[ways.edge] * np.pi
         height = (ways.point[:, None] * patches.normal[ways.patch]).sum(axis=2) - patches.offset[ways.patch]
@@ -213,54 +214,50 @@ class EdgeFinder:
         on_edge = (ways.at > 0) & (ways.at < self.edges.length[ways.edge])
         return np.asarray(on_edge & ((ways.angle <= n[:, None]) & apart).all(axis=1))
 
-    def _strong(self, ways: _Ways) -> np.ndarray:
+    def _strong(self, ways: _EdgeWays) -> np.ndarray:
         """Whether paths reach -80 dB of an unobstructed straight path between the ends, even if every face and mirror reflects
         all."""
         most = np.abs(boundary_fields(self._rays(ways))).sum(axis=0) * ways.direct / ways.leg.sum(axis=1)
         return np.asarray(20.0 * np.log10(np.maximum(most, 1e-300)) > -80.0)
 
-    def _on_mirrors(self, ways: _Ways) -> np.ndarray:
+    def _on_mirrors(self, ways: _EdgeWays) -> np.ndarray:
         mirrored = ways.patch >= 0
         found = np.ones(mirrored.shape, bool)
         found[mirrored] = self.images.patches.contains(ways.patch[mirrored], ways.stop[mirrored])
         return np.asarray(found.all(axis=1))
 
-    def _beside(self, ways: _Ways) -> np.ndarray:
+    def _beside(self, ways: _EdgeWays) -> np.ndarray:
         """Points off the edges, halfway between their faces, so that rays to them do not meet these, shape ``(L, 3)``."""
         off = 2.0 * self.images.patches.tolerance_m + ENDPOINT_CLEARANCE
         return np.asarray(ways.point + off * self.edges.outward[ways.edge])
 
-    def _passing(self, ways: _Ways) -> _Ways:
+    def _passing(self, ways: _EdgeWays) -> _EdgeWays:
         """Those without a mirror that pass one slab."""
         if self.walls is None:
             return ways.take(np.zeros(0, int))
         ways = ways.take(np.flatnonzero((ways.patch < 0).all(axis=1)))
         start = np.repeat(self._beside(ways)[:, None], 2, axis=1)
-        rows, legs = passed(self.walls, start, ways.end)
-        one = np.flatnonzero(sum(s.count for s in legs) == 1)
-        ways, legs = ways.take(rows[one]), [s.take(one) for s in legs]
-        face, thickness = (
-            np.stack([getattr(s, name)[:, 0] for s in legs], axis=1) for name in ("face", "thickness_m")
-        )
+        rows, slab, thickness_m = passed(self.walls, start, ways.end)
+        one = (slab >= 0).sum(axis=(1, 2)) == 1
+        ways, face, thickness = ways.take(rows[one]), slab[one, :, 0], thickness_m[one, :, 0]
         here = ways.point[:, None]
         stop, _ = met_at(self.walls.mesh, face, here, ways.end - here)
         return replace(ways, slab=face, thickness_m=thickness, stop=stop)
 
-    def _unobstructed(self, ways: _Ways) -> np.ndarray:
+    def _unobstructed(self, ways: _EdgeWays) -> np.ndarray:
         """Whether both legs are free."""
-        patches = self.images.patches
         beside = self._beside(ways)
         found = np.ones(len(ways.edge), bool)
         for j in range(2):
             for mirrored in (False, True):
                 own = np.flatnonzero(found & ((ways.patch[:, j] >= 0) == mirrored))
-                edge, end = beside[own], ways.end[own, j]
                 patch, mirror = (a[own, j : j + int(mirrored)] for a in (ways.patch, ways.stop))
-                if len(own):
-                    found[own] = unobstructed(patches, end[:, None], edge, patch, mirror, self.images.device)
+                stops = stops_of(ways.end[own, j], mirror, beside[own])
+                legs = Ways.of(self.images.patches, own, patch, stops)
+                found[own] = legs.unobstructed(self.images.device)
         return found
 
-    def _rays(self, ways: _Ways) -> EdgeRays:
+    def _rays(self, ways: _EdgeWays) -> EdgeRays:
         e = ways.edge
         cosine = (ways.direction[:, 0] * self.edges.along[e]).sum(axis=1)
         angle, leg = ways.angle.T, ways.leg.T
@@ -272,7 +269,7 @@ class EdgeFinder:
             return -np.ones(len(patch)), np.ones(len(patch))
         return self.table.reflection(self.images.patches.group[patch], cosine, self.wavelength_m)
 
-    def _described(self, ways: _Ways) -> EdgePaths:
+    def _described(self, ways: _EdgeWays) -> EdgePaths:
         edges, patches, rays = self.edges.take(ways.edge), self.images.patches, self._rays(ways)
         faces, cosines = patches.face_patch[edges.face], rays.incidence_cosines()
         reflected = [self._reflection(faces[:, j], cosines[2 + j]) for j in range(2)]
@@ -323,7 +320,7 @@ class EdgeFinder:
 
 
 @dataclass(frozen=True)
-class _Ways(Rows):
+class _EdgeWays(Rows):
     """L ways over an edge each: the index of the ``receiver`` (L,) and of the ``edge`` (L,); the ``patch`` that mirrors or the face
     of the ``slab`` (L, 2) before and behind, -1 for none, where that ``stop`` is (L, 2, 3), and the ``thickness_m`` of a solid
     (L, 2); the ``point`` on the edge (L, 3) and ``at`` how far along (L,); and of both legs, unfolded at mirrors, lengths ``leg``

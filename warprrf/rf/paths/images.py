@@ -27,6 +27,7 @@ from warprrf.kernels.radio import edges as edge_kernels
 from warprrf.kernels.radio import mirrors as kernels
 from warprrf.kernels.radio.edges import find_over_edges
 from warprrf.kernels.radio.mirrors import IN_PLANE
+from warprrf.rf.paths.ways import Ways, stops_of
 from warprrf.rows import Rows
 
 MOST_KEPT = 4_000_000  # pairs of a chain and a patch to try up to which all chains are found once and kept
@@ -103,9 +104,7 @@ class MirrorImages:
             Chains(np.zeros((1, 0), np.int32), self.transmitter[None], np.zeros((1, 3)), np.array([2.0]))
         ]
 
-    def search(
-        self, points: np.ndarray, order: int, progress: Progress | None = None
-    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    def search(self, points: np.ndarray, order: int, progress: Progress | None = None) -> Iterator[Ways]:
         """The straight way to each of ``points``, then :meth:`candidates` of 1, 2 ... ``order`` reflections.
 
         Args:
@@ -131,24 +130,20 @@ class MirrorImages:
                 progress("mirrors", round(parts * behind / max(ends[-1], 1.0)), parts)
 
         nothing = np.zeros((len(points), 0), np.int32), np.zeros((len(points), 0, 3))
-        yield np.arange(len(points)), *nothing
+        yield self._ways(points, np.arange(len(points)), *nothing)
         for k in range(1, order + 1):
             yield self.candidates(points, k, tick)
             tick(1.0)
 
     def candidates(
         self, points: np.ndarray, order: int, tick: Callable[[float], None] = lambda share: None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Chains of ``order`` reflections whose points lie in the boxes of their patches; nothing is cast.
+    ) -> Ways:
+        """Ways of ``order`` reflections whose points lie in the boxes of their patches, by point; nothing is cast.
 
         Args:
             points: Where the chains end [m], shape ``(N, 3)``.
             order: Reflections, at least 1.
             tick: Called now and then with the share of the search that is behind.
-
-        Returns:
-            Index of the point ``(L,)``, patches ``(L, order)`` and mirror points [m] ``(L, order, 3)``, both from the
-            transmitter on.
         """
         parts = [(np.zeros(0, int), np.zeros((0, order), np.int32), np.zeros((0, order, 3)))]
         if len(points) and len(self.patches):
@@ -160,7 +155,10 @@ class MirrorImages:
                 tick(share)
         row, patch, found = (np.concatenate(p) for p in zip(*parts, strict=True))
         by_row = np.argsort(row, kind="stable")
-        return row[by_row], patch[by_row], found[by_row]
+        return self._ways(points, row[by_row], patch[by_row], found[by_row])
+
+    def _ways(self, points: np.ndarray, row: np.ndarray, patch: np.ndarray, found: np.ndarray) -> Ways:
+        return Ways.of(self.patches, row, patch, stops_of(self.transmitter, found, points[row]))
 
     def seen_from(self, point: np.ndarray) -> MirrorImages:
         """Images of another transmitter in the same patches."""

@@ -17,15 +17,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from warprrf.device import DeviceLike, Progress
-from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, Mesh, vectors_across
-from warprrf.geometry.planar_patches import PlanarPatches
+from warprrf.device import Progress
+from warprrf.geometry.mesh import Mesh, vectors_across
 from warprrf.kernels.radio.records import EDGE, MIRROR, SLAB
 from warprrf.rf.paths.images import MirrorImages
 from warprrf.rf.paths.polarisation import turns
-from warprrf.rf.paths.slabs import Slabs, Walls
+from warprrf.rf.paths.slabs import Walls
+from warprrf.rf.paths.ways import Ways, distinct, stops_of
 from warprrf.rows import Rows
 
 
@@ -132,28 +131,18 @@ def exact_paths(
     Raises:
         ValueError: before anything is traced, if more chains would be tried than ``images`` allow.
     """
-    patches, source, parts = images.patches, images.transmitter, list[MirrorPaths]()
-    for k, (row, patch, point) in enumerate(images.search(receivers, order, progress)):
+    patches, parts = images.patches, list[MirrorPaths]()
+    for k, ways in enumerate(images.search(receivers, order, progress)):
         for j in range(k):
-            own = patches.contains(patch[:, j], point[:, j])
-            row, patch, point = row[own], patch[own], point[own]
-        # Sheets closer than the tolerance don't hide each other: seen at a slant, their mirror points lie further apart.
-        free = unobstructed(patches, source, receivers[row], patch, point, images.device)
-        clear = np.flatnonzero(free)
-        clear = clear[distinct(row[clear], point[clear], 3.0 * patches.tolerance_m)]
-        found = row[clear], patch[clear], point[clear], np.ones(len(clear))
-        parts.append(described(patches, source, receivers, found, order, walls))
+            ways = ways.take(patches.contains(ways.patch[:, j], ways.point[:, j]))
+        free = ways.unobstructed(images.device)
+        found = [ways.take(free)]
         if walls is not None:
-            dark = np.flatnonzero(~free)
-            legs = legs_of(
-                patches, source, receivers[row[dark]], patch[dark], point[dark], patches.tolerance_m
-            )
-            through, slabs = passed(walls, *legs)
-            through = dark[through]
-            own = distinct(row[through], point[through], 3.0 * patches.tolerance_m)
-            own, slabs = through[own], [s.take(own) for s in slabs]
-            found = row[own], patch[own], point[own], np.ones(len(own))
-            parts.append(described(patches, source, receivers, found, order, walls, slabs))
+            found.append(ways.take(~free).through(walls)[1])
+        for own in found:
+            # Sheets closer than the tolerance don't hide each other: seen at a slant, their mirror points lie further apart.
+            once = distinct(own.row, own.point, 3.0 * patches.tolerance_m)
+            parts.append(described(own.take(once), order, walls))
     paths = MirrorPaths.joined(parts)
     return paths.take(np.argsort(paths.receiver, kind="stable"))
 
@@ -163,7 +152,6 @@ def zone_paths(
     receivers: np.ndarray,
     order: int,
     wavelength_m: float,
-    position_error_m: float,
     progress: Progress | None = None,
     walls: Walls | None = None,
 ) -> MirrorPaths:
@@ -175,11 +163,11 @@ def zone_paths(
     freely or through.
 
     Args:
-        images: Its boxes say how far beside its faces a patch may still mirror.
+        images: Its boxes say how far beside its faces a patch may still mirror, the tolerance of its patches what the position
+            error of the surface is: zones are wider, and rays end that much before it [m].
         receivers: Positions [m].
         order: Most reflections.
         wavelength_m: Wavelength [m].
-        position_error_m: Position error of the surface: zones are wider, and rays end that much before it [m].
         progress: Called with the stage ``"mirrors"``.
         walls: What may be passed.
 
@@ -189,28 +177,23 @@ def zone_paths(
     Raises:
         ValueError: before anything is traced, if more chains would be tried than ``images`` allow.
     """
-    patches, source = images.patches, images.transmitter
-    zone = ZoneRays(patches, source, wavelength_m, position_error_m, images.device)
-    through = replace(zone, walls=walls)
-    parts = list[MirrorPaths]()
-    for k, (row, patch, point) in enumerate(images.search(receivers, order, progress)):
-        kept = np.ones(len(row), bool)
+    zone, parts = ZoneRays(images, wavelength_m), list[MirrorPaths]()
+
+    def keep(ways: Ways, rays: ZoneRays) -> None:
+        share = rays.share(ways)
+        kept = share >= 0.05
+        parts.append(replace(described(ways.take(kept), order, walls), share=share[kept]))
+
+    for k, ways in enumerate(images.search(receivers, order, progress)):
+        kept = np.ones(len(ways), bool)
         if k > 1 or walls is not None:
-            free = zone.reached(receivers[row], patch, point)
+            free = zone.reached(ways)
             kept = free if k > 1 else kept
         if walls is not None:
-            dark = np.flatnonzero(~free)
-            dark = dark[through.reached(receivers[row[dark]], patch[dark], point[dark])]
-            legs = legs_of(patches, source, receivers[row[dark]], patch[dark], point[dark], position_error_m)
-            own, slabs = passed(walls, *legs)
-            dark = dark[own]
-            kept[dark] = False
-            share = through.share(receivers[row[dark]], patch[dark], point[dark])
-            found = row[dark], patch[dark], point[dark], share
-            parts.append(described(patches, source, receivers, found, order, walls, slabs))
-        row, patch, point = row[kept], patch[kept], point[kept]
-        found = row, patch, point, zone.share(receivers[row], patch, point)
-        parts.append(described(patches, source, receivers, found, order, walls))
+            own, beyond = zone.through(walls, ways, free)
+            kept[own] = False
+            keep(beyond, replace(zone, walls=walls))
+        keep(ways.take(kept), zone)
     return MirrorPaths.joined(parts)
 
 
@@ -229,12 +212,14 @@ _SAMPLES = np.array(
 class ZoneRays:
     """Rays that fill Fresnel zones on a surface with a position error; see :func:`zone_paths`."""
 
-    patches: PlanarPatches
-    source: np.ndarray
+    images: MirrorImages
     wavelength_m: float
-    position_error_m: float
-    device: DeviceLike
     walls: Walls | None = None
+
+    @property
+    def position_error_m(self) -> float:
+        """Of the surface [m]."""
+        return self.images.patches.tolerance_m
 
     def radius(self, near: np.ndarray, far: np.ndarray) -> np.ndarray:
         """Radius of the first zone between two legs, widened by the mesh's error [m]."""
@@ -242,24 +227,24 @@ class ZoneRays:
             self.wavelength_m * near * far / np.maximum(near + far, 1e-9) + self.position_error_m**2
         )
 
-    def share(self, ends: np.ndarray, patch: np.ndarray, point: np.ndarray) -> np.ndarray:
+    def share(self, ways: Ways) -> np.ndarray:
         """Share of each path's rays that arrive, shape ``(L,)``."""
-        return self._mirror_share(ends, patch, point) if patch.shape[1] else self._direct_share(ends)
+        return self._mirror_share(ways) if ways.patch.shape[1] else self._direct_share(ways)
 
-    def _direct_share(self, receivers: np.ndarray) -> np.ndarray:
+    def _direct_share(self, ways: Ways) -> np.ndarray:
         """That of line of sight, by rays over the zone's widest place."""
-        count = len(receivers)
-        way = self.source - receivers
+        count, source, receivers = len(ways), ways.stops[:, 0], ways.stops[:, 1]
+        way = source - receivers
         length = np.linalg.norm(way, axis=1)
         radius = self.radius(0.5 * length, 0.5 * length)
         u, v = vectors_across(way / np.maximum(length, 1e-12)[:, None])
         offset = _SAMPLES[:, 0, None] * u[:, None] + _SAMPLES[:, 1, None] * v[:, None]
-        middle = (0.5 * (receivers + self.source))[:, None] + radius[:, None, None] * offset
+        middle = (0.5 * (receivers + source))[:, None] + radius[:, None, None] * offset
         start = np.broadcast_to(receivers[:, None], middle.shape).reshape(-1, 3)
         middle = middle.reshape(-1, 3)
         free = self.clear(start, self._past(start, middle))
         left = np.flatnonzero(free)
-        end = np.broadcast_to(self.source, (len(left), 3))
+        end = source[left // len(_SAMPLES)]
         free[left] = self.clear(self._past(end, middle[left]), end)
         return np.asarray(free.reshape(count, len(_SAMPLES)).mean(axis=1))
 
@@ -269,17 +254,17 @@ class ZoneRays:
         length = np.linalg.norm(way, axis=1, keepdims=True)
         return np.asarray(b + 2.0 * self.position_error_m / np.maximum(length, 1e-12) * way)
 
-    def _mirror_share(self, ends: np.ndarray, patch: np.ndarray, point: np.ndarray) -> np.ndarray:
+    def _mirror_share(self, ways: Ways) -> np.ndarray:
         """That of mirror paths; a zone cuts a patch's plane in an ellipse, longer by 1 / cos."""
-        count, order = patch.shape
-        legs = np.diff(stops_of(self.source, point, ends), axis=1)
+        count, order = ways.patch.shape
+        legs = np.diff(ways.stops, axis=1)
         lengths = np.linalg.norm(legs, axis=2)
         along = legs / np.maximum(lengths, 1e-12)[..., None]
         before = np.cumsum(lengths, axis=1)[:, :-1]
         radius = self.radius(before, lengths.sum(axis=1)[:, None] - before)
-        around = np.repeat(point[:, None], len(_SAMPLES), axis=1)
+        around = np.repeat(ways.point[:, None], len(_SAMPLES), axis=1)
         for k in range(order):
-            normal = self.patches.normal[patch[:, k]]
+            normal = ways.patches.normal[ways.patch[:, k]]
             cosine = np.abs((along[:, k] * normal).sum(axis=1))
             across = np.cross(along[:, k], normal)
             size = np.linalg.norm(across, axis=1, keepdims=True)
@@ -287,28 +272,29 @@ class ZoneRays:
             further = np.cross(normal, across) / np.maximum(cosine, 0.05)[:, None]
             offset = _SAMPLES[:, 0, None] * across[:, None] + _SAMPLES[:, 1, None] * further[:, None]
             around[:, :, k] += radius[:, k, None, None] * offset
-        each, which = (np.repeat(a, len(_SAMPLES), axis=0) for a in (ends, patch))
-        met = self.reached(each, which, around.reshape(-1, order, 3))
+        each = ways.take(np.repeat(np.arange(count), len(_SAMPLES)))
+        met = self.reached(each.over(slice(1, -1), around.reshape(-1, order, 3)))
         return met.reshape(count, len(_SAMPLES)).mean(axis=1)
 
-    def reached(
-        self, ends: np.ndarray, patch: np.ndarray, point: np.ndarray, lift: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Whether each leg reaches its patch and nothing stands between, or nothing but walls, shape ``(L,)``.
-
-        ``lift`` is added to ``ends`` where rays start, for ends on a surface.
-        """
-        free = np.ones(len(patch), bool)
-        here = ends if lift is None else ends + lift
-        for k in range(patch.shape[1] - 1, -1, -1):
-            own = np.flatnonzero(free)
-            free[own] = self._meets(here[own], point[own, k], patch[own, k])
-            normal, offset = self.patches.normal[patch[:, k]], self.patches.offset[patch[:, k]]
+    def reached(self, ways: Ways) -> np.ndarray:
+        """Whether each leg reaches its patch and nothing stands between, or nothing but walls, shape ``(L,)``."""
+        free, here = np.ones(len(ways), bool), ways.stops[:, -1]
+        for k in range(ways.patch.shape[1] - 1, -1, -1):
+            own, point, patch = np.flatnonzero(free), ways.point[:, k], ways.patch[:, k]
+            free[own] = self._meets(here[own], point[own], patch[own])
+            normal, offset = ways.patches.normal[patch], ways.patches.offset[patch]
             side = np.sign((here * normal).sum(axis=1) - offset)
-            here = point[:, k] + (self.position_error_m * side)[:, None] * normal
-        own, last = np.flatnonzero(free), point[:, 0] if patch.shape[1] else here
-        free[own] = self.clear(last[own], np.broadcast_to(self.source, (len(own), 3)))
+            here = point + (self.position_error_m * side)[:, None] * normal
+        own = np.flatnonzero(free)
+        free[own] = self.clear(ways.stops[own, 1], ways.stops[own, 0])
         return free
+
+    def through(self, walls: Walls, ways: Ways, free: np.ndarray) -> tuple[np.ndarray, Ways]:
+        """Which of those that are not ``free`` (L,) arrive through some of ``walls``, and those, with what each passes."""
+        dark = np.flatnonzero(~free)
+        dark = dark[replace(self, walls=walls).reached(ways.take(dark))]
+        own, beyond = ways.take(dark).through(walls)
+        return dark[own], beyond
 
     def clear(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Whether nothing lies between a and b (N, 3), or nothing but walls, but within the position error of either end."""
@@ -316,7 +302,7 @@ class ZoneRays:
         length = np.linalg.norm(way, axis=1)
         toward = way / np.maximum(length, 1e-12)[:, None]
         start = a + self.position_error_m * toward
-        hit = self.patches.mesh.cast(start, toward, device=self.device)
+        hit = self.images.patches.mesh.cast(start, toward, device=self.images.device)
         free = (length <= 2 * self.position_error_m) | (hit.t >= length - 2 * self.position_error_m)
         if self.walls is not None:
             dark = np.flatnonzero(~free)
@@ -325,7 +311,7 @@ class ZoneRays:
 
     def _meets(self, start: np.ndarray, target: np.ndarray, patch: np.ndarray) -> np.ndarray:
         """Whether the ray from ``start`` first meets a surface, behind walls perhaps, at ``target``, on the plane of ``patch``."""
-        p, reached = self.patches, np.ones(len(start), bool)
+        p, reached = self.images.patches, np.ones(len(start), bool)
         if self.walls is not None:
             back = (start - target) / np.maximum(np.linalg.norm(start - target, axis=1, keepdims=True), 1e-12)
             before = target + 3.0 * self.position_error_m * back
@@ -333,7 +319,7 @@ class ZoneRays:
             start = before
         way = target - start
         length = np.linalg.norm(way, axis=1)
-        hit = p.mesh.cast(start, way / np.maximum(length, 1e-12)[:, None], device=self.device)
+        hit = p.mesh.cast(start, way / np.maximum(length, 1e-12)[:, None], device=self.images.device)
         near = np.abs(hit.t - length) <= 2.0 * self.position_error_m
         met = p.face_patch[np.maximum(hit.face, 0)]
         # A torn seam of the patch passes for it, another patch does not.
@@ -343,109 +329,29 @@ class ZoneRays:
         )
 
 
-def unobstructed(
-    patches: PlanarPatches,
-    source: np.ndarray,
-    ends: np.ndarray,
-    patch: np.ndarray,
-    point: np.ndarray,
-    device: DeviceLike,
-) -> np.ndarray:
-    """Whether every leg of each path is free, shape ``(L,)``.
-
-    See :func:`legs_of`; a leg is also drawn out by the clearance that :meth:`Mesh.visible` leaves at ends, so that whatever
-    lies further off than the tolerance is met.
-    """
-    begin, end = legs_of(patches, source, ends, patch, point, patches.tolerance_m)
-    toward = (end - begin) / np.maximum(np.linalg.norm(end - begin, axis=2, keepdims=True), 1e-12)
-    begin[:, 1:] -= ENDPOINT_CLEARANCE * toward[:, 1:]
-    end[:, :-1] += ENDPOINT_CLEARANCE * toward[:, :-1]
-    free = np.ones(len(patch), bool)
-    for k in range(patch.shape[1] + 1):
-        own = np.flatnonzero(free)
-        free[own] = patches.mesh.visible(begin[own, k], end[own, k], device=device) if len(own) else False
-    return free
-
-
-def legs_of(
-    patches: PlanarPatches,
-    source: np.ndarray,
-    ends: np.ndarray,
-    patch: np.ndarray,
-    point: np.ndarray,
-    lift_m: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Starts and ends of the legs of each path, shape ``(L, k + 1, 3)``: off their mirrors by ``lift_m``, so that the mirrors'
-    own faces are not met."""
-    stops = stops_of(source, point, ends)
-    begin, end = stops[:, :-1].copy(), stops[:, 1:].copy()
-    for k in range(patch.shape[1]):
-        normal, offset = patches.normal[patch[:, k]], patches.offset[patch[:, k]]
-        for place, leg, other in ((end, k, k), (begin, k + 1, k + 2)):
-            side = np.sign((stops[:, other] * normal).sum(axis=1) - offset)
-            place[:, leg] += (lift_m * side)[:, None] * normal
-    return begin, end
-
-
-def passed(walls: Walls, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, list[Slabs]]:
-    """Which paths arrive through slabs, at most as many as ``walls`` allow, and what each leg passes on those."""
-    rows, slabs = np.arange(len(begin)), list[Slabs]()
-    for k in range(begin.shape[1]):
-        arrived, found = walls.between(begin[rows, k], end[rows, k])
-        rows, slabs = rows[arrived], [*(s.take(arrived) for s in slabs), found]
-    count = sum((s.count for s in slabs), np.zeros(len(rows), int))
-    few = np.flatnonzero((count > 0) & (count <= walls.most))
-    return rows[few], [s.take(few) for s in slabs]
-
-
-def distinct(row: np.ndarray, point: np.ndarray, distance_m: float) -> np.ndarray:
-    """Indices of paths that no earlier one of the same receiver repeats, all points within ``distance_m``, sorted."""
-    if point.shape[1] == 0 or len(row) < 2:
-        return np.arange(len(row))
-    # Other receivers' points are further away than any of its own that count.
-    place = np.column_stack([3.0 * distance_m * row, point[:, 0]])
-    a, b = cKDTree(place).query_pairs(distance_m, output_type="ndarray").T
-    same = np.zeros(len(row), bool)
-    same[b[(np.linalg.norm(point[a] - point[b], axis=2) <= distance_m).all(axis=1)]] = True
-    return np.flatnonzero(~same)
-
-
-def described(
-    patches: PlanarPatches,
-    source: np.ndarray,
-    receivers: np.ndarray,
-    found: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-    order: int,
-    walls: Walls | None = None,
-    slabs: list[Slabs] | None = None,
-) -> MirrorPaths:
-    """Rows of paths of one order (receiver, patch, point, share) over what ``slabs`` each leg passes, what they lack of all
-    columns filled up."""
-    kept = np.flatnonzero(found[3] >= 0.05)
-    row, patch, point, share = (a[kept] for a in found)
+def described(ways: Ways, order: int, walls: Walls | None) -> MirrorPaths:
+    """``ways`` with what is known of each mirror and slab, in columns for ``order`` mirrors and as many slabs as ``walls``
+    allow."""
     most = max(order, 1) + (walls.most if walls else 0)
-    normal, slab = patches.normal[patch], np.full(patch.shape, -1, np.int32)
-    thickness = np.full(patch.shape, np.nan)
-    if slabs is not None:
-        stops = stops_of(source, point, receivers[row])
-        columns: list[tuple[np.ndarray, ...]] = []
-        for k, s in enumerate(s.take(kept) for s in slabs):
-            here = stops[:, k, None]
-            at, turned = met_at(patches.mesh, s.face, here, stops[:, k + 1, None] - here)
-            columns.append((np.full_like(s.face, -1), s.face, at, turned, s.thickness_m))
-            columns.append(tuple(a[:, k : k + 1] for a in (patch, slab, point, normal, thickness)))
-        patch, slab, point, normal, thickness = (
-            np.concatenate(c, axis=1) for c in zip(*columns, strict=True)
-        )
-        first = np.argsort((patch < 0) & (slab < 0), axis=1, kind="stable")
-        patch, slab, thickness = (np.take_along_axis(a, first, axis=1) for a in (patch, slab, thickness))
-        point, normal = (np.take_along_axis(a, first[..., None], axis=1) for a in (point, normal))
+    row, mesh, normals = ways.row, ways.patches.mesh, ways.patches.normal[ways.patch]
+    columns = []
+    for k in range(ways.stops.shape[1] - 1):
+        here, face, mirror = ways.stops[:, k, None], ways.slab[:, k], slice(k, k + 1)
+        at, turned = met_at(mesh, face, here, ways.stops[:, k + 1, None] - here)
+        columns.append((np.full_like(face, -1), face, at, turned, ways.thickness_m[:, k]))
+        own = ways.patch[:, mirror]
+        nothing = np.full_like(own, -1), np.full(own.shape, np.nan)
+        columns.append((own, nothing[0], ways.point[:, mirror], normals[:, mirror], nothing[1]))
+    patch, slab, point, normal, thickness = (np.concatenate(c, axis=1) for c in zip(*columns, strict=True))
+    first = np.argsort((patch < 0) & (slab < 0), axis=1, kind="stable")
+    patch, slab, thickness = (np.take_along_axis(a, first, axis=1) for a in (patch, slab, thickness))
+    point, normal = (np.take_along_axis(a, first[..., None], axis=1) for a in (point, normal))
     count = ((patch >= 0) | (slab >= 0)).sum(axis=1)
     length, arrival = np.zeros(len(row)), np.zeros((len(row), 3))
     cosine, turn = np.zeros((2, *patch.shape))
     for k in np.unique(count):
         own = np.flatnonzero(count == k)
-        stops = stops_of(source, point[own, :k], receivers[row[own]])
+        stops = stops_of(ways.stops[own, 0], point[own, :k], ways.stops[own, -1])
         legs = np.diff(stops, axis=1)
         lengths = np.linalg.norm(legs, axis=2)
         along = legs / np.maximum(lengths, 1e-12)[..., None]
@@ -455,7 +361,19 @@ def described(
 
     code = np.where(slab >= 0, SLAB, np.where(patch >= 0, MIRROR, 0)).astype(np.int8)
     return MirrorPaths(
-        row, patch, slab, point, share, length, 0.0 * length, arrival, normal, cosine, turn, thickness, code
+        row,
+        patch,
+        slab,
+        point,
+        np.ones(len(row)),
+        length,
+        0.0 * length,
+        arrival,
+        normal,
+        cosine,
+        turn,
+        thickness,
+        code,
     ).of_width(most)
 
 
@@ -466,8 +384,3 @@ def met_at(mesh: Mesh, face: np.ndarray, start: np.ndarray, way: np.ndarray) -> 
     with np.errstate(invalid="ignore", divide="ignore"):  # where none is met
         part = ((mesh.triangles[face, 0] - start) * normal).sum(axis=-1) / (way * normal).sum(axis=-1)
     return start + part[..., None] * way, normal
-
-
-def stops_of(source: np.ndarray, point: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Transmitter, mirror points and receiver of each path, shape ``(L, k + 2, 3)``."""
-    return np.concatenate([np.broadcast_to(source, (len(ends), 1, 3)), point, ends[:, None]], axis=1)

@@ -19,6 +19,7 @@ from scipy.spatial.distance import cdist
 
 from warprrf.geometry.mesh import Mesh, components, connected_pieces, edge_pairs
 from warprrf.geometry.splats.gaussians import Y00, Gaussians
+from warprrf.rows import sums_of
 
 SHAPES = 6  # numbers that tell shapes apart
 
@@ -90,7 +91,7 @@ def colour_groups(
         split = _halved(feature[own], size[own]) if s >= 0 else _joined(feature[own], curved)
         piece[own] = split + (piece.max() + 1 if s > owner.min() else 0)
     area = np.bincount(piece, size)
-    colour = np.stack([np.bincount(piece, size * channel) for channel in feature.T], axis=1) / area[:, None]
+    colour = sums_of(size[:, None] * feature, piece) / area[:, None]
     flat = np.bincount(piece, size * (owner >= 0))
     material = _alike(colour, flat, area)
     return piece[unit].astype(np.int32), material.astype(np.int32), colour
@@ -114,7 +115,7 @@ def _colours(unit: np.ndarray, owner: np.ndarray, size: np.ndarray, colours: Col
     weight, log = colours.weight, np.log(np.clip(colours.rgb, 0.01, 1.0))
     total = np.bincount(unit, weight, minlength=count)
     known = total > 1e-9
-    mean = np.stack([np.bincount(unit, weight * channel, minlength=count) for channel in log.T], axis=1)
+    mean = sums_of(weight[:, None] * log, unit, count)
     mean[known] = mean[known] / total[known, None]
     for s in np.unique(owner[~known]):
         seen = (owner == s) & known
@@ -189,9 +190,7 @@ def _alike(colour: np.ndarray, flat: np.ndarray, area: np.ndarray) -> np.ndarray
         tiny = int(whole.argmin())
         if len(whole) < 2 or whole[tiny] >= GROUP_M2:
             return material
-        centre = (
-            np.stack([np.bincount(material, area * channel) for channel in colour.T], axis=1) / whole[:, None]
-        )
+        centre = sums_of(area[:, None] * colour, material) / whole[:, None]
         gap = np.linalg.norm(centre - centre[tiny], axis=1)
         gap[tiny] = np.inf
         material[material == tiny] = gap.argmin()
@@ -261,7 +260,7 @@ def _moments(mesh: Mesh, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     weight = np.repeat(mesh.areas + 1e-12, 3) / 3.0
     who, x = np.repeat(owner, 3), x.reshape(-1, 3)
     total = np.bincount(who, weight)
-    centre = np.stack([np.bincount(who, weight * c) for c in x.T], axis=1) / total[:, None]
+    centre = sums_of(weight[:, None] * x, who) / total[:, None]
     x = x - centre[who]
     second = [np.bincount(who, weight * x[:, i] * x[:, j]) / total for i in range(3) for j in range(3)]
     return centre, np.stack(second, axis=1).reshape(-1, 3, 3)

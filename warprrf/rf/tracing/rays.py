@@ -44,10 +44,16 @@ class Hits:
     face: np.ndarray
     range_m: np.ndarray
 
+    def rays(self, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of the rays of index ``ray`` (N,) where they start [m] and their unit vectors, shape ``(N, 3)``, and solid angles
+        [sr], shape ``(N,)``."""
+        each = max(len(self.face) // max(len(self.origins), 1), 1)
+        start, toward = mesh_rays.rays_of(self.origins, self.directions, each, ray)
+        return start, toward, self.solid_angle[ray % len(self.solid_angle)]
+
     def points(self, ray: np.ndarray) -> np.ndarray:
         """Where the rays of index ``ray`` (N,) hit [m], shape ``(N, 3)``; NaN or infinite where they hit nothing."""
-        each = len(self.face) // len(self.origins)
-        start, toward = mesh_rays.rays_of(self.origins, self.directions, each, ray)
+        start, toward, _ = self.rays(ray)
         with np.errstate(invalid="ignore"):
             return np.asarray(start + self.range_m[ray, None] * toward)
 

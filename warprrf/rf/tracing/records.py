@@ -32,7 +32,7 @@ class Interactions:
     Attributes:
         index: group of each, from the transmitter on, -1 for none, shape ``(N, K)``.
         angle: its angles, see :mod:`warprrf.kernels.radio.records`, shape ``(N, K, 3)``.
-        kind: as of :class:`Records`, shape ``(N, K)`` or ``(1, K)``; one column stands for all.
+        kind: as of :class:`Records`, shape ``(N, K)`` or ``(1, K)``.
     """
 
     index: np.ndarray
@@ -40,23 +40,32 @@ class Interactions:
     kind: np.ndarray
 
     @classmethod
+    def alike(cls, index: np.ndarray, angle: np.ndarray, kind: int) -> Interactions:
+        """Those of one ``kind`` all."""
+        return cls(index, angle, np.full((1, index.shape[1]), kind, np.int32))
+
+    @classmethod
     def of_mirrors(cls, group: np.ndarray, cosine: np.ndarray) -> Interactions:
         """One mirror each: group ``(N,)`` and cosine of incidence ``(N,)``."""
-        return cls(
-            group[:, None],
-            np.column_stack([cosine, 0.0 * cosine, 0.0 * cosine])[:, None],
-            one_kind(kernels.MIRROR),
+        angle = np.column_stack([cosine, 0.0 * cosine, 0.0 * cosine])
+        return cls.alike(group[:, None], angle[:, None], kernels.MIRROR)
+
+    @classmethod
+    def in_a_row(cls, legs: Sequence[Interactions]) -> Interactions:
+        """Those of each of ``legs`` after those of the one before."""
+        # Of no record kinds do not matter.
+        kinds = [leg.kind if len(leg.kind) else np.zeros_like(leg.kind, shape=(1, 1)) for leg in legs]
+        most = max(map(len, kinds))
+        wide = [np.broadcast_to(k, (most, leg.index.shape[1])) for k, leg in zip(kinds, legs, strict=True)]
+        index, angle = (
+            np.concatenate(own, axis=1) for own in ([leg.index for leg in legs], [leg.angle for leg in legs])
         )
+        return cls(index, angle, np.concatenate(wide, axis=1))
 
     def take(self, rows: np.ndarray) -> Interactions:
         """Those of ``rows``."""
         kind = self.kind if len(self.kind) == 1 else self.kind[rows]
         return Interactions(self.index[rows], self.angle[rows], kind)
-
-
-def one_kind(kind: int) -> np.ndarray:
-    """``kind`` of all interactions of all records."""
-    return np.full((1, 1), kind, np.int32)
 
 
 @dataclass(frozen=True, eq=False)

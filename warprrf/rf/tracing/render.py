@@ -128,10 +128,9 @@ class Interreflection:
         most: slabs that first scatterings may pass, at most.
 
     Attributes:
-        lit: what the rays of sides see of first scatterings: records whose ray is the side, of irradiance where the
-            transmitter gives cos(theta_i) / d1^2 [1/m^2].
-        through: the same of surfaces that are lit through slabs.
-        behind: the same of surfaces that are seen through slabs.
+        lit: what the rays of sides see of first scatterings, by sequence: of surfaces that the transmitter lights, ``"S"``, of
+            those that it lights through slabs, ``"TS"``, and of lit ones that are seen through slabs, ``"ST"``. Records whose
+            ray is the side, of irradiance where the transmitter gives cos(theta_i) / d1^2 [1/m^2].
         between: irradiance of sides (rows) by radiance of sides (columns), shape ``(E, E)``: those of first sides, and of
             second ones that light can reach; solids' inner ones are left dark.
     """
@@ -149,7 +148,7 @@ class Interreflection:
         lift_m = 0.02  # rays start so far off the surface
         shift = np.random.default_rng(0).random((2, len(surface.element_area)))
         scale = np.float32(np.pi / ELEMENT_RAYS * (4.0 * np.pi / tracer.wavelength_m) ** 2)
-        lit, through, behind = list[Records](), list[Records](), list[Records]()
+        tables: dict[str, list[Records]] = {}
         rows, columns, values, new = [], [], [], known
         while len(new):
             directions = _hemispheres(normal[new], shift[:, new % shift.shape[1]])
@@ -157,16 +156,11 @@ class Interreflection:
             hit = np.flatnonzero(hits.face >= 0)
             side, met = np.repeat(new, ELEMENT_RAYS), surface.side_met(hits.face[hit], directions[hit])
             rays = Rays(hits, side)
-            light = tracer.light(rays)
-            tables = [(lit, tracer.lit(rays, light))]
+            lit = tracer.lit(rays, most)
             if most:
-                onward = tracer.behind(rays, most)
-                tables += [
-                    (through, tracer.lit_through(rays, light, most)),
-                    (behind, tracer.lit(onward, tracer.light(onward))),
-                ]
-            for table, found in tables:
-                table.append(replace(found, power=scale * found.power))
+                lit["ST"] = tracer.lit(tracer.behind(rays, most), 0)["S"]
+            for name, found in lit.items():
+                tables.setdefault(name, []).append(replace(found, power=scale * found.power))
             rows.append(side[hit])
             columns.append(met)
             values.append(
@@ -174,11 +168,7 @@ class Interreflection:
             )
             new = np.setdiff1d(met, known)
             known = np.union1d(known, new)
-        self.lit = Records.joined(lit)
-        self.through, self.behind = (
-            Records.joined(tables) if tables else self.lit.take(np.zeros(0, int))
-            for tables in (through, behind)
-        )
+        self.lit = {name: Records.joined(parts) for name, parts in tables.items()}
         pairs = tuple(map(np.concatenate, (rows, columns)))
         self.between = csr_matrix((np.concatenate(values), pairs), shape=(surface.element_sides,) * 2)
 
@@ -192,7 +182,7 @@ def irradiance(tracer: Tracer, p: Parameters, effects: Effects) -> np.ndarray | 
     light = tracer.kept.get(("interreflection", most), lambda: Interreflection(tracer.of_transmitter, most))
     materials = Materials(p, tracer.slabs, device=tracer.grid.device)
     share = p.scattered_share[tracer.surface.side_group] / np.pi
-    tables = [light.lit, light.through] + [light.behind] * effects.scatter_mirror
+    tables = [table for name, table in light.lit.items() if name != "ST" or effects.scatter_mirror]
     got = sum(np.bincount(r.ray, r.powers(materials), minlength=sides) for r in tables)
     if effects.mirror_scatter:
         for onto in (tracer.mirrored(slabs).onto for slabs in {0, most}):

@@ -29,6 +29,7 @@ from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, is_name_alone, itu_name
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.slabs import Walls
 from warprrf.rf.tracing.groups import SHAPES, Colours, colour_groups, shape_groups
+from warprrf.rows import sums_of
 
 ELEMENT_M = 0.5  # width of an element in a room
 ELEMENTS = 30_000
@@ -147,8 +148,8 @@ class Surface:
         """Of each piece of the surface, ``piece`` (F,) of each face, the face nearest to its middle."""
         centre = self.mesh.triangles.mean(axis=1)
         area = np.maximum(np.bincount(piece, self.mesh.areas), 1e-12)
-        sums = [np.bincount(piece, self.mesh.areas * x) / area for x in centre.T]
-        gap = np.linalg.norm(centre - np.stack(sums, axis=1)[piece], axis=1)
+        middle = sums_of(self.mesh.areas[:, None] * centre, piece) / area[:, None]
+        gap = np.linalg.norm(centre - middle[piece], axis=1)
         order = np.lexsort((gap, piece))
         return order[np.searchsorted(piece[order], np.arange(len(area)))]
 
@@ -314,10 +315,10 @@ class Surface:
         )  # fmt: skip
         return replace(found, group=self.patch_group)  # edges ask what their faces are made of
 
-    def images(self, transmitter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Image of ``transmitter`` (3,) in every patch's plane, ``(P, 3)``, and its height over it, ``(P,)`` [m]."""
+    def images(self, transmitter: np.ndarray) -> np.ndarray:
+        """Image of ``transmitter`` (3,) in every patch's plane [m], shape ``(P, 3)``."""
         height = self.plane_normal @ transmitter - self.plane_offset
-        return transmitter - 2.0 * height[:, None] * self.plane_normal, height
+        return np.asarray(transmitter - 2.0 * height[:, None] * self.plane_normal)
 
 
 def _patches_and_colours(

@@ -13,7 +13,7 @@ A :class:`Tracer` belongs to a surface, a transmitter and a grid of rays; what i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -27,13 +27,13 @@ from warprrf.kernels.radio.records import MIRROR, SCATTER, SLAB, SOURCE
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.edge_paths import EdgeFinder
 from warprrf.rf.paths.images import MirrorImages
-from warprrf.rf.paths.mirror_paths import MirrorPaths, ZoneRays, described, legs_of, passed, zone_paths
+from warprrf.rf.paths.mirror_paths import MirrorPaths, ZoneRays, described, zone_paths
 from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.paths.slabs import Slabs, Walls
 from warprrf.rf.spectra.spectrum import unit_beams
 from warprrf.rf.tracing.model import Effects
-from warprrf.rf.tracing.rays import NEAREST_M, Hits, Light, RayGrid
-from warprrf.rf.tracing.records import Interactions, Records, one_kind
+from warprrf.rf.tracing.rays import NEAREST_M, Hits, RayGrid
+from warprrf.rf.tracing.records import Interactions, Records
 from warprrf.rf.tracing.surface import Surface
 
 MIRROR_SLACK_M = 0.1
@@ -99,7 +99,7 @@ class View:
     paths: MirrorPaths
     records: dict[str, Records] = field(repr=False)
     keeps: bool = True
-    _beams: list[np.ndarray] = field(init=False, repr=False, default_factory=list)
+    _beams: Cache = field(init=False, repr=False, default_factory=lambda: Cache(1))
 
     @property
     def beams(self) -> np.ndarray:
@@ -108,10 +108,8 @@ class View:
         if sigma is None:
             raise ValueError("view: it was traced without a receiver's beam, expected one of a spectrum")
         grid = self.tracer.grid
-        made = self._beams or [unit_beams(self.paths.arrival, grid.shape, sigma, device=grid.device)]
-        if self.keeps:
-            self._beams[:] = made
-        return made[0]
+        make = partial(unit_beams, self.paths.arrival, grid.shape, sigma, device=grid.device)
+        return self._beams.get("beams", make) if self.keeps else make()
 
     @property
     def cell(self) -> np.ndarray:
@@ -135,12 +133,13 @@ class View:
 
     def traced(self, effects: Effects) -> dict[str, Records]:
         """The tables that count under ``effects``; they are traced when they are first asked for."""
-        wanted = [own.name for own in sequences(effects)]
-        made = self.tracer.trace(self, [own for own in sequences(effects) if own.name not in self.records])
+        wanted = sequences(effects)
+        made = self.tracer.trace(self, [own for own in wanted if own.name not in self.records])
         if made and self.keeps:
             with making:
                 self.records.update(made)
-        return {name: made[name] if name in made else self.records[name] for name in (SPECULAR, *wanted)}
+        every = self.records | made
+        return {name: every[name] for name in (SPECULAR, *(own.name for own in wanted))}
 
     def of(self, k: int) -> View:
         """That of receiver ``k`` alone; nothing but its line of sight and mirrors is known."""
@@ -273,10 +272,9 @@ class Tracer:
         """Line of sight and mirror paths of ``receivers`` (R, 3) that ``effects`` want."""
         most = effects.transmissions
         walls = self.walls(most) if most else None
-        found = zone_paths(
-            self.images, receivers, effects.mirrors, self.wavelength_m, self.surface.position_error_m, progress, walls
-        )  # fmt: skip
-        found = self._delayed(found)
+        found = self._delayed(
+            zone_paths(self.images, receivers, effects.mirrors, self.wavelength_m, progress, walls)
+        )
         if not effects.diffractions:
             return found
         edges = self.kept.get(("edges", most), lambda: self._edges(walls))
@@ -311,26 +309,23 @@ class Tracer:
         found = self.paths(places, effects) if paths is None else paths
         return View(self, places, self.grid.hit(places), found, {SPECULAR: self.specular(found)}, keeps)
 
-    def trace(self, view: View, wanted: Iterable[Sequence]) -> dict[str, Records]:
+    def trace(self, view: View, wanted: list[Sequence]) -> dict[str, Records]:
         """Tables of sequences that a receiver sees, by name."""
         first = Rays(view.hits, np.arange(len(view.hits.face)))
-        seen, lights, made = {"": first}, dict[str, Light](), dict[str, Records]()
+        seen, lit, made = {"": first}, dict[str, dict[str, Records]](), dict[str, Records]()
+        deepest = max((own.slabs for own in wanted if own.light == "TS"), default=0)
         for light, sight, most in wanted:
             if sight not in seen:
-                seen[sight] = self._turned(view) if sight == "M" else self.behind(first, most)
+                seen[sight] = self.turned(first) if sight == "M" else self.behind(first, most)
             rays = seen[sight]
-            if light in ("S", "TS") and sight not in lights:
-                lights[sight] = self.light(rays)
             if light == "E":
                 table = self.seen(rays)
-            elif light == "MS":
-                table = self.lit_by_mirrors(rays)
-            elif light == "MTS":
-                table = self.lit_by_mirrors(rays, most)
-            elif light == "TS":
-                table = self.lit_through(rays, lights[sight], most)
+            elif light in ("MS", "MTS"):
+                table = self.lit_by_mirrors(rays, most if light == "MTS" else 0)
             else:
-                table = self.lit(rays, lights[sight])
+                if sight not in lit:
+                    lit[sight] = self.lit(rays, deepest)
+                table = lit[sight][light]
             made[Sequence(light, sight, most).name] = table
         return made
 
@@ -347,22 +342,19 @@ class Tracer:
         row = np.arange(len(p), dtype=np.int32)
         return Records(power, row, group.astype(np.int32), angle, kind.astype(np.int32))
 
-    def light(self, rays: Rays) -> Light:
-        """How the transmitter illuminates what rays hit."""
-        return self.grid.light(rays.hits, self.transmitter)
-
-    def lit(self, rays: Rays, light: Light) -> Records:
-        """What rays see of surfaces that the transmitter lights."""
-        return self.scattered(rays, light.lit, light.strength[light.lit], light.angle[light.lit])
-
-    def lit_through(self, rays: Rays, light: Light, most: int) -> Records:
-        """What rays see of surfaces that the transmitter lights through slabs, up to ``most``."""
-        row = light.shaded
-        arrived, slabs = self.walls(most).between(self.transmitter, light.point[row])
-        own = np.flatnonzero(slabs.count > 0)
-        row, slabs = row[arrived[own]], slabs.take(own)
-        before = self._through(slabs, light.point[row] - self.transmitter)
-        return self.scattered(rays, row, light.strength[row], light.angle[row], before)
+    def lit(self, rays: Rays, most: int) -> dict[str, Records]:
+        """What rays see of surfaces that the transmitter lights, ``"S"``, and, if ``most`` is not 0, through slabs, up to that
+        many, ``"TS"``."""
+        light = self.grid.light(rays.hits, self.transmitter)
+        found = {"S": self.scattered(rays, light.lit, light.strength[light.lit], light.angle[light.lit])}
+        if most:
+            row = light.shaded
+            arrived, slabs = self.walls(most).between(self.transmitter, light.point[row])
+            own = np.flatnonzero(slabs.count > 0)
+            row, slabs = row[arrived[own]], slabs.take(own)
+            before = self._through(slabs, light.point[row] - self.transmitter)
+            found["TS"] = self.scattered(rays, row, light.strength[row], light.angle[row], before)
+        return found
 
     def lit_by_mirrors(self, rays: Rays, most: int = 0) -> Records:
         """What some rays of each pixel see of surfaces that images of the transmitter light; with ``most`` those that they light
@@ -374,29 +366,37 @@ class Tracer:
         chosen = np.flatnonzero((rays.hits.face >= 0) & np.isin(rays.ray % self.grid.per_pixel, places))
         m = self.mirrored(most)
         row, image = m.pairs(rays.hits.face[chosen])
-        row = chosen[row]
-        light = self.grid.unshadowed(rays.hits, m.image[image], row)
+        before = m.before.take(image) if most else None
+        return self.lit_by_images(rays, chosen[row], m.patch[image], before, times)[1]
+
+    def lit_by_images(
+        self, rays: Rays, row: np.ndarray, patch: np.ndarray, before: Interactions | None, times: float
+    ) -> tuple[np.ndarray, Records]:
+        """What the rays ``row`` (N,), each in place of ``times``, see by the transmitter's image in ``patch`` (N,): which of them
+        see any, and records of those, after the interactions ``before``, by default the mirror alone."""
+        images, s = self.surface.images(self.transmitter), self.surface
+        light = self.grid.unshadowed(rays.hits, images[patch], row)
         k = np.flatnonzero(light.strength > 0)
-        before = m.before.take(image[k])
-        if not most:
-            way = m.image[image[k]] - light.point[k]
+        strength = light.strength[k] * self.grid.dtype.type(times)
+        if before is None:
+            way = images[patch[k]] - light.point[k]
             way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
-            cosine = np.abs(np.einsum("ni,ni->n", way, self.surface.plane_normal[m.patch[image[k]]]))
-            before = Interactions.of_mirrors(before.index[:, 0], cosine)
-        return self.scattered(
-            rays, row[k], light.strength[k] * self.grid.dtype.type(times), light.angle[k], before
-        )
+            cosine = np.abs(np.einsum("ni,ni->n", way, s.plane_normal[patch[k]]))
+            mirrors = Interactions.of_mirrors(s.patch_group[patch[k]], cosine)
+        else:
+            mirrors = before.take(k)
+        return k, self.scattered(rays, row[k], strength, light.angle[k], mirrors)
 
     def seen(self, rays: Rays) -> Records:
         """What rays see of elements."""
         hits, s = rays.hits, self.surface
         row = np.flatnonzero(hits.face >= 0)
-        each = row % len(hits.directions)
-        side = s.side_met(hits.face[row], hits.directions[each])
-        solid_angle = hits.solid_angle[row % len(hits.solid_angle)]
+        _, direction, solid_angle = hits.rays(row)
+        side = s.side_met(hits.face[row], direction)
         friis = (self.wavelength_m / (4.0 * np.pi)) ** 2
         power = friis * solid_angle * self.grid.transmittance(hits.range_m[row])
-        return self._records(rays, row, power, side, np.zeros((len(row), 3)), SOURCE)
+        own = Interactions.alike(side[:, None], np.zeros((len(row), 1, 3)), SOURCE)
+        return self._records(rays, row, power, [own], 1)
 
     def scattered(
         self,
@@ -408,37 +408,19 @@ class Tracer:
     ) -> Records:
         """Records of scattering where the rays ``row`` hit, after the interactions ``before``."""
         group = self.surface.group[rays.hits.face[row]]
-        return self._records(rays, row, self.wavelength_m**2 * strength, group, angle, SCATTER, before)
+        own = Interactions.alike(group[:, None], angle[:, None], SCATTER)
+        met = [own] if before is None else [before, own]
+        return self._records(rays, row, self.wavelength_m**2 * strength, met, int(before is not None))
 
     def _records(
-        self,
-        rays: Rays,
-        row: np.ndarray,
-        power: np.ndarray,
-        index: np.ndarray,
-        angle: np.ndarray,
-        last: int,
-        before: Interactions | None = None,
+        self, rays: Rays, row: np.ndarray, power: np.ndarray, met: list[Interactions], residual_row: int
     ) -> Records:
-        after, dtype = None if rays.after is None else rays.after.take(row), self.grid.dtype
-        legs = [
-            leg
-            for leg in (before, Interactions(index[:, None], angle[:, None], one_kind(last)), after)
-            if leg is not None
-        ]
-        residual_row = -1 if after is not None else int(last == SOURCE or before is not None)
-        kinds = [
-            leg.kind if len(leg.kind) else one_kind(0) for leg in legs
-        ]  # of no record it does not matter
-        rows = max(map(len, kinds))
-        kind = np.concatenate(
-            [np.broadcast_to(own, (rows, leg.index.shape[1])) for own, leg in zip(kinds, legs, strict=True)],
-            axis=1,
-        )
+        """Records of what the rays ``row`` see over ``met``, one after the other; the residual's row is that of direct sight."""
+        dtype, behind = self.grid.dtype, [] if rays.after is None else [rays.after.take(row)]
+        every = Interactions.in_a_row([*met, *behind])
         return Records(
-            np.asarray(power, dtype), rays.ray[row].astype(np.int32),
-            np.concatenate([leg.index for leg in legs], axis=1).astype(np.int32),
-            np.concatenate([leg.angle for leg in legs], axis=1).astype(dtype), kind, residual_row, self.grid.half_width,
+            np.asarray(power, dtype), rays.ray[row].astype(np.int32), every.index.astype(np.int32),
+            every.angle.astype(dtype), every.kind, -1 if behind else residual_row, self.grid.half_width,
         )  # fmt: skip
 
     def _through(self, slabs: Slabs, way: np.ndarray) -> Interactions:
@@ -450,37 +432,32 @@ class Tracer:
         stops = np.arange(met.shape[1] + 2)[:, None] * way[more, None]
         turn[more] = np.where(met[more], turns(stops, normal), 0.0)
         thickness = np.nan_to_num(slabs.thickness_m) / self.wavelength_m
-        return Interactions(
-            np.where(met, s.group[slabs.face], -1),
-            np.stack([slabs.cosine, turn, thickness], axis=2),
-            one_kind(SLAB),
-        )
+        index = np.where(met, s.group[slabs.face], -1)
+        return Interactions.alike(index, np.stack([slabs.cosine, turn, thickness], axis=2), SLAB)
 
     def behind(self, rays: Rays, most: int) -> Rays:
         """``rays`` that go straight on through what they hit, and what they meet behind up to ``most`` slabs."""
         hits, walls = rays.hits, self.walls(most)
         ray = np.flatnonzero(hits.face >= 0)
         ray = ray[walls.passes[hits.face[ray]]]
-        origins = hits.origins[ray // (len(hits.face) // len(hits.origins))]
-        directions = hits.directions[ray % len(hits.directions)]
+        origins, directions, solid_angle = hits.rays(ray)
         row, face, range_m, slabs = walls.behind(origins, directions, hits.face[ray], hits.range_m[ray])
         after = self._through(slabs.reversed, -directions[row])
-        solid_angle = hits.solid_angle[ray[row] % len(hits.solid_angle)]
-        found = Hits(origins[row], directions[row], solid_angle, face.astype(np.int32), range_m)
+        found = Hits(origins[row], directions[row], solid_angle[row], face.astype(np.int32), range_m)
         return Rays(found, rays.ray[ray[row]], after)
 
-    def _turned(self, view: View) -> Rays:
-        """Rays turned at the mirrors that they hit, and what they hit there."""
-        s, grid, hits = self.surface, self.grid, view.hits
+    def turned(self, rays: Rays) -> Rays:
+        """``rays`` turned at the mirrors that they hit, and what they hit there."""
+        s, grid, hits = self.surface, self.grid, rays.hits
         ray = np.flatnonzero((hits.face >= 0) & (s.patch[hits.face] >= 0))
-        face, each = hits.face[ray], ray % len(grid.directions)
-        direction, normal = grid.directions[each], s.plane_normal[s.patch[face]]
+        face, (_, direction, solid_angle) = hits.face[ray], hits.rays(ray)
+        normal = s.plane_normal[s.patch[face]]
         normal = np.where((direction * normal).sum(axis=1, keepdims=True) > 0, -normal, normal)
         cosine = -(direction * normal).sum(axis=1)
-        turned = direction + 2.0 * cosine[:, None] * normal
-        solid_angle = grid.solid_angle[each] * grid.transmittance(hits.range_m[ray])
-        found = grid.hit_along(hits.points(ray) + s.position_error_m * normal, turned, solid_angle)
-        return Rays(found, ray, Interactions.of_mirrors(s.group[face], cosine))
+        onward = direction + 2.0 * cosine[:, None] * normal
+        start, left = hits.points(ray) + s.position_error_m * normal, grid.transmittance(hits.range_m[ray])
+        found = grid.hit_along(start, onward, solid_angle * left)
+        return Rays(found, rays.ray[ray], Interactions.of_mirrors(s.group[face], cosine))
 
     def adopted(self, view: View) -> View:
         """What :func:`view_of` found, as a view of this tracer."""
@@ -517,39 +494,33 @@ class MirroredLight:
     """
 
     def __init__(self, tracer: Tracer, walls: Walls | None = None) -> None:
-        s, transmitter, grid = tracer.surface, tracer.transmitter, tracer.grid
+        s, grid = tracer.surface, tracer.grid
         largest = np.abs(s.front_normal).argmax(axis=1)
         way = 2 * largest + (np.take_along_axis(s.front_normal, largest[:, None], axis=1)[:, 0] < 0)
         self._piece = np.unique(6 * s.cell + way, return_inverse=True)[1]
         middle = s.middles(self._piece)
-        centre, image = s.mesh.triangles[middle].mean(axis=1), s.images(transmitter)[0]
-        piece, patch, point = tracer.images.candidates(centre, 1)
+        centre = s.mesh.triangles[middle].mean(axis=1)
+        ways = tracer.images.candidates(centre, 1)
         # Light must come from in front of the piece, of either side if it has two, and not from its own patch.
-        normal = s.front_normal[middle[piece]]
-        side = ((point[:, 0] - centre[piece]) * normal).sum(axis=1)
+        face = middle[ways.row]
+        normal = s.front_normal[face]
+        side = ((ways.point[:, 0] - centre[ways.row]) * normal).sum(axis=1)
         normal = np.where(s.two_sided & (side < 0)[:, None], -normal, normal)
-        own = np.flatnonzero((s.two_sided | (side > 0)) & (s.patch[middle[piece]] != patch[:, 0]))
-        order = own[np.lexsort((patch[own, 0], piece[own]))]
-        piece, patch, point, normal = piece[order], patch[order], point[order], normal[order]
-        lift_m = s.position_error_m
-        ends = centre[piece], patch, point, lift_m * normal
-        chosen = ZoneRays(s.patches, transmitter, 0.0, lift_m, grid.device).reached(*ends)
-        slabs = None
-        if walls is not None:
-            through = ZoneRays(s.patches, transmitter, 0.0, lift_m, grid.device, walls)
-            dark = np.flatnonzero(~chosen)
-            dark = dark[through.reached(*(a[dark] for a in ends))]
-            legs = legs_of(
-                s.patches, transmitter, (ends[0] + ends[3])[dark], patch[dark], point[dark], lift_m
-            )
-            arrived, slabs = passed(walls, *legs)
-            chosen = dark[arrived]
-        piece, patch, point, normal = piece[chosen], patch[chosen], point[chosen], normal[chosen]
-        found = piece, patch, point, np.ones(len(piece))
-        paths = tracer.specular(described(s.patches, transmitter, centre, found, 1, walls, slabs))
+        own = np.flatnonzero((s.two_sided | (side > 0)) & (s.patch[face] != ways.patch[:, 0]))
+        own = own[np.lexsort((ways.patch[own, 0], ways.row[own]))]
+        ways, normal = ways.take(own), normal[own]
+        off = ways.over(-1, centre[ways.row] + s.position_error_m * normal)
+        rays = ZoneRays(tracer.images, 0.0)
+        free = rays.reached(off)
+        if walls is None:
+            chosen, off = np.flatnonzero(free), off.take(free)
+        else:
+            chosen, off = rays.through(walls, off, free)
+        piece, patch, normal = off.row, off.patch[:, 0], normal[chosen]
+        ways = off.over(-1, centre[piece])
+        paths = tracer.specular(described(ways, 1, walls))
         self.before = paths.interactions
-        patch = patch[:, 0]
-        self.image, self.patch = image[patch], patch
+        self.image, self.patch = s.images(tracer.transmitter)[patch], patch
         self._first = np.searchsorted(piece, np.arange(len(middle) + 1))
         way = self.image - centre[piece]
         length = np.linalg.norm(way, axis=1)

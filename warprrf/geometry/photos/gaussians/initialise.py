@@ -23,7 +23,7 @@ from warprrf.geometry.photos.posed.images import GreyPhotos, PosedPhotos
 from warprrf.geometry.photos.posed.sparse import SparseModel, clean_points, detect_room_planes
 from warprrf.geometry.planes import Plane, aligned, directions, plane_axes
 from warprrf.geometry.splats.gaussians import Y00, Gaussians, quaternions_of
-from warprrf.rows import distinct_rows, group_means
+from warprrf.rows import distinct_rows, sums_of
 
 SPREAD = 0.65  # standard deviation of a disc in units of the spacing: little light leaks between neighbours
 
@@ -93,7 +93,7 @@ def _blocks(
     key, fine, color = (np.concatenate(c) for c in zip(*cells, strict=True))
     _, parent, members = distinct_rows(key)
     whole, centre, middle = len(members), fine.mean(axis=1), color.mean(axis=1)
-    coarse_centre, coarse = (group_means(of, parent, members) for of in (centre, middle))
+    coarse_centre, coarse = (sums_of(of, parent) / members[:, None] for of in (centre, middle))
     # To cut a block costs 3 Gaussians and removes about the variance between its parts, with a share of what lies
     # within them; the largest gains first, half of the room for either size.
     within = ((color - middle[:, None]) ** 2).sum(axis=2).mean(axis=1)

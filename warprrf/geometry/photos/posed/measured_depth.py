@@ -13,7 +13,7 @@ from warprrf.geometry.photos.posed.poses import DepthFile, read_depth
 from warprrf.geometry.photos.posed.sparse import SparseModel
 from warprrf.geometry.photos.posed.undistort import stored_pixels
 from warprrf.geometry.splats.camera import Camera, slopes_of
-from warprrf.rows import distinct_rows, group_means
+from warprrf.rows import distinct_rows, sums_of
 
 
 def range_maps(sparse: SparseModel, files: Mapping[str, DepthFile]) -> dict[str, tuple[Camera, np.ndarray]]:
@@ -113,4 +113,4 @@ def _cloud(
     # 0.03: one point for each cube of this side
     cell = np.floor(xyz / 0.03).astype(np.int64)
     _, group, count = distinct_rows(cell)
-    return group_means(xyz, group, count), group_means(rgb, group, count)
+    return sums_of(xyz, group) / count[:, None], sums_of(rgb, group) / count[:, None]

@@ -16,8 +16,8 @@ import numpy as np
 from warprrf.kernels.radio.records import MIRROR, SLAB
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.paths.mirror_paths import stops_of
 from warprrf.rf.paths.polarisation import chain_amplitude, vertical_ends
+from warprrf.rf.paths.ways import stops_of
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.tracing.model import Effects, Layout, Parameters
 from warprrf.rf.tracing.rays import RayGrid
