@@ -284,6 +284,10 @@ def test_errors_name_the_row_of_a_link_whatever_else_is_under_its_transmitter(fi
     other = TX + [0.3, 0.0, 0.0]
     with pytest.raises(ValueError, match=r"receivers\[2\].*inside a solid"):
         field.spectrum([AIR, AIR, IN_CUPBOARD], [other, TX, other])
+    with pytest.raises(ValueError, match=r"receivers\[2\].*inside a solid"):
+        wr.trace_paths(
+            scene(), transmitter=[other, TX, other], receivers=[AIR, AIR, IN_CUPBOARD], frequency_hz=F
+        )
     table = wr.Readings(TX, [AIR, AIR, IN_CUPBOARD, AIR + 0.1], np.full(4, 1e-9), F, 1e-14)
     with pytest.raises(ValueError, match=r"ds.receivers\[2\].*inside a solid"):
         wr.RadioField.fit(scene(), table)

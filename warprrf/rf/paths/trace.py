@@ -163,11 +163,13 @@ def _check_question(
     """Refuse places that :func:`trace_paths` cannot answer for, and warn of what it leaves out."""
     mesh, wavelength_m = as_mesh(mesh_or_scene), SPEED_OF_LIGHT / frequency_hz
     question_unit(mesh, wavelength_m)
+    receivers = ends.shaped(ends.receivers)
+    check_positions(mesh, ends.transmitters, receivers, wavelength_m, on_surfaces=True, device=device)
+    modelled = {"transmission": transmissions > 0, "diffraction": diffractions > 0}
     for source, own in ends.groups():
-        points = ends.shaped(ends.receivers[own])
-        check_positions(mesh, source, points, wavelength_m, on_surfaces=True, device=device)
-        modelled = {"transmission": transmissions > 0, "diffraction": diffractions > 0}
-        warn_of_unmodelled(mesh, source, points, frequency_hz=frequency_hz, device=device, **modelled)
+        warn_of_unmodelled(
+            mesh, source, ends.receivers[own], frequency_hz=frequency_hz, device=device, **modelled
+        )
 
 
 class MirrorTracer:
