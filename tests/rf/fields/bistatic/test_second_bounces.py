@@ -21,7 +21,7 @@ from warprrf.rf.spectra.spectrum import to_db
 from warprrf.rf.tracing.model import SETS, Effects, Parameters
 from warprrf.rf.tracing.render import materials_of
 from warprrf.rf.tracing.surface import Surface
-from warprrf.rf.tracing.tracer import Tracer
+from warprrf.rf.tracing.tracer import Rays, Tracer
 
 WAVELENGTH = SPEED_OF_LIGHT / F
 RECEIVERS = RECEIVERS[:6]
@@ -54,6 +54,25 @@ def test_a_mirror_lights_the_sides_of_a_thin_board_that_face_it():
     toward = np.array([-1.0, 0.8, 0.5]) - surface.mesh.triangles.mean(axis=1)
     np.testing.assert_array_equal(lit[of_board], ((normal * toward).sum(axis=1) > 0)[of_board])
     assert 0 < lit[of_board].sum() < len(of_board)
+
+
+def test_an_image_lights_those_of_some_rays_that_meet_a_face_turned_to_it(scene):
+    """Every ray of a receiver is asked about the image in one wall: what is seen is of the rays that meet other surfaces."""
+    surface = Surface.of(scene)
+    tracer = Tracer.of(surface, np.asarray(TX, float), F, SHAPE, 1)
+    view = tracer.view(RECEIVERS[0], SETS["single"])
+    patch = int(np.bincount(surface.patch[surface.patch >= 0]).argmax())
+    image = surface.images(tracer.transmitter)[patch]
+    row = np.flatnonzero(view.hits.face >= 0)[::-1]
+    rays = Rays(view.hits, 10 + np.arange(len(view.hits.face)))
+    seen_by, records = tracer.lit_by_images(rays, row, np.full(len(row), patch), None, 1.0)
+    normal, direction = surface.mesh.face_normals[view.hits.face[row]], view.hits.directions[row]
+    normal = np.where((normal * direction).sum(axis=1, keepdims=True) > 0, -normal, normal)
+    lit = np.flatnonzero(((image - view.hits.points(row)) * normal).sum(axis=1) > 1e-6)
+    assert 0 < len(lit) < len(row)
+    np.testing.assert_array_equal(seen_by, lit)
+    np.testing.assert_array_equal(records.ray, 10 + row[lit])
+    np.testing.assert_array_equal(records.index[:, -1], surface.group[view.hits.face[row[lit]]])
 
 
 def test_materials_under_a_transmitter_are_made_once(scene):
