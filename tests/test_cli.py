@@ -13,7 +13,7 @@ from rays_by_definition import gaussians
 
 import warprrf as wr
 from warprrf import cli
-from warprrf.cli.inputs import read_positions, read_receivers
+from warprrf.cli.inputs import load_geometry, read_positions, read_receivers
 from warprrf.cli.views import _look_at
 from warprrf.rf.fields.bistatic.options import FitOptions
 from warprrf.rf.fields.harmonic.fitting import FieldOptions
@@ -43,6 +43,17 @@ def test_help_shows_an_example_that_the_parser_takes(command, capsys):
     assert examples
     for words in examples:
         cli._parser().parse_args(words.split())  # raises where an example is wrong
+
+
+def test_a_scene_may_be_named_in_capitals(tmp_path):
+    for name in ("meshes", "textures", "materials.json"):
+        (tmp_path / name).symlink_to(SCENE.parent / name)
+    (tmp_path / "ROOM.XML").write_bytes(SCENE.read_bytes())
+    none = dict.fromkeys(("mesh", "materials", "unit", "up", "simplify"))
+    found = load_geometry(
+        tmp_path / "ROOM.XML", SimpleNamespace(**none, allow_outside=True, extrapolate=False)
+    )
+    assert isinstance(found, wr.Scene) and len(found.materials) > 1
 
 
 def test_scenes_that_name_itu_materials_alone_go_in(tmp_path, capsys):
