@@ -1,5 +1,5 @@
-"""Tables: dataclasses whose arrays have a row for each thing, taken from and put together alike; rows that are equal, and their
-means."""
+"""Tables: dataclasses whose arrays have a row for each thing, taken from and put together alike; equal rows, and sums of
+rows."""
 
 from __future__ import annotations
 

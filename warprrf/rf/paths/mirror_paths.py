@@ -361,20 +361,8 @@ def described(ways: Ways, order: int, walls: Walls | None) -> MirrorPaths:
 
     code = np.where(slab >= 0, SLAB, np.where(patch >= 0, MIRROR, 0)).astype(np.int8)
     return MirrorPaths(
-        row,
-        patch,
-        slab,
-        point,
-        np.ones(len(row)),
-        length,
-        0.0 * length,
-        arrival,
-        normal,
-        cosine,
-        turn,
-        thickness,
-        code,
-    ).of_width(most)
+        row, patch, slab, point, np.ones(len(row)), length, 0.0 * length, arrival, normal, cosine, turn, thickness, code
+    ).of_width(most)  # fmt: skip
 
 
 def met_at(mesh: Mesh, face: np.ndarray, start: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
