@@ -204,6 +204,18 @@ def test_sionnas_boxes_of_sheets_are_rooms(name, rt):
     assert len(wr.sample_receivers(scene, 50, seed=0)) == 50
 
 
+def test_a_hole_in_the_floor_is_no_edge_of_the_room():
+    whole = subdivided(room(), 0.0, 0.0)
+    middle = whole.triangles.mean(axis=1)
+    hole = (middle[:, 2] == 0.0) & (np.linalg.norm(middle - [2.5, 2.0, 0.0], axis=1) < 0.3)
+    torn, over = Mesh(whole.vertices, whole.faces[~hole]), middle[hole] + [0.0, 0.0, 1.0]
+    assert (torn.cast(over, np.tile([0.0, 0.0, -1.0], (len(over), 1))).face < 0).sum() > 2
+    for known in (TX, None):
+        assert is_free(torn, over, known).all()
+        assert not is_free(torn, over - [0.0, 0.0, 1.1], known).any()
+        assert not is_free(torn, over + [4.0, 0.0, 0.0], known).any()
+
+
 def test_two_rooms_with_a_door_are_one_air():
     """Each room a shell of its own, one wound the other way, with a doorway in both shells."""
 

@@ -236,7 +236,13 @@ def parted(
     found = np.zeros(len(points), dtype=bool)
     asked = np.arange(len(points))
     if known is not None:
-        asked = np.flatnonzero(~mesh.visible(points, known, device=device))
+        beside_m = [
+            1.3e-5,
+            0.7e-5,
+            1.1e-5,
+        ]  # a segment through a vertex may slip through a surface, not two of them
+        seen = [mesh.visible(points, known + step, device=device) for step in (0.0, beside_m)]
+        asked = np.flatnonzero(~np.logical_and(*seen))
     if len(asked) == 0:
         return found
     own, rooms = points[asked], _rooms(mesh) if known is None else ()
@@ -475,8 +481,16 @@ def _is_sealed(mesh: Mesh, known: np.ndarray, device: DeviceLike) -> bool:
 
 
 def _is_over(mesh: Mesh, points: np.ndarray, device: DeviceLike) -> np.ndarray:
-    """Whether there is something below each of ``points`` (N, 3) [m], shape ``(N,)``, bool."""
-    return mesh.cast(points, np.tile([0.0, 0.0, -1.0], (len(points), 1)), device=device).face >= 0
+    """Whether there is something below each of ``points`` (N, 3) [m], shape ``(N,)``, bool: straight below, or around a hole
+    in the floor, in most directions that are 45 degrees off at most."""
+
+    def met(asked: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        hit = mesh.cast(asked, directions, per_origin=len(directions), device=device)
+        return np.asarray(hit.valid.reshape(len(asked), len(directions)).mean(axis=1) > 0.5)
+
+    found = met(points, np.array([[0.0, 0.0, -1.0]]))
+    found[~found] = met(points[~found], lattice(_DIRECTIONS, -0.71, -1.0))
+    return found
 
 
 def _spread(mesh: Mesh) -> np.ndarray:

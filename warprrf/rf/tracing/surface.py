@@ -29,13 +29,13 @@ from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, is_name_alone, itu_name
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.slabs import Walls
 from warprrf.rf.tracing.groups import SHAPES, Colours, colour_groups, shape_groups
-from warprrf.rows import sums_of
+from warprrf.rows import distinct_rows, sums_of
 
 ELEMENT_M = 0.5  # width of an element in a room
 ELEMENTS = 30_000
 """Larger scenes have wider elements, so that there are about so many: light between them takes up to 50 kB each. The
 least width holds up to 7500 m^2 of surfaces (a hall's), the largest of 25 m up to 19 km^2 (a town's)."""
-LARGEST_FACE = 1.2  # elements' widths; longer edges are split, so that elements can be small
+LARGEST_FACE = 0.6  # elements' widths; longer edges are split, so that cells can be small
 POSITION_ERROR_M = 0.02  # of a reconstructed surface: shadow rays end so far before it
 TRUE_ERROR_M = 1e-4
 LOSSY = 4.0 * (1.0 - 0.06j)
@@ -401,10 +401,9 @@ def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray, width_m: float) 
     ``width_m``."""
     centre, along = mesh.triangles.mean(axis=1), 3  # cells along an element
     cells = np.floor(along * (centre - mesh.bounds[0]) / width_m).astype(np.int64)
-    key = np.column_stack([group, patch, cells // along])
-    element = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
-    cell = np.unique(np.column_stack([element, cells]), axis=0, return_inverse=True)[1]
-    return {"element": element, "cell": cell.reshape(-1).astype(np.int32)}
+    element = distinct_rows(np.column_stack([group, patch, cells // along]))[1].astype(np.int32)
+    cell = distinct_rows(np.column_stack([element, cells]))[1].astype(np.int32)
+    return {"element": element, "cell": cell}
 
 
 def largest_groups(mesh: Mesh, patch: np.ndarray, group: np.ndarray, patches: int) -> np.ndarray:
