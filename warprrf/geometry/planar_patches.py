@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
 from warprrf.checks import check_similarity, warn
+from warprrf.geometry.edges import Edges, mesh_edges
 from warprrf.geometry.mesh import Mesh, components, edge_pairs, vectors_across
 from warprrf.kernels.rays.mesh import OverlapFaces, find_overlaps
 from warprrf.kernels.rays.patches import PatchFaces, lie_in_patches
@@ -67,6 +68,14 @@ class PlanarPatches:
 
     def __len__(self) -> int:
         return len(self.offset)
+
+    @cached_property
+    def edges(self) -> Edges:
+        """Edges between patches: what is one patch has none, however its faces are bent by errors."""
+        patch = np.maximum(self.face_patch, 0)
+        normal = np.where(self.face_patch[:, None] >= 0, self.normal[patch], 0.0)
+        turned = (normal * self.mesh.face_normals).sum(axis=1) < 0
+        return mesh_edges(self.mesh, np.where(turned[:, None], -normal, normal), self.group[patch])
 
     @classmethod
     def from_planes(

@@ -13,9 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from warprrf.device import Progress, with_progress
-from warprrf.geometry.edges import Edges, mesh_edges
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
-from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.kernels.radio.records import EDGE, MIRROR, SLAB
 from warprrf.rf.em.diffraction import EdgeRays, Pair, boundary_fields, diffraction_matrices
 from warprrf.rf.em.fresnel import SurfaceTable
@@ -99,15 +97,6 @@ class EdgePaths(Rows):
         return MirrorPaths.joined([found, edges.take(np.flatnonzero(share > 0))])
 
 
-def patch_edges(patches: PlanarPatches) -> Edges:
-    """Edges between planar patches: what is one patch has none, however its faces are bent by errors."""
-    own = patches.face_patch >= 0
-    normal = np.where(own[:, None], patches.normal[np.maximum(patches.face_patch, 0)], 0.0)
-    turned = (normal * patches.mesh.face_normals).sum(axis=1) < 0
-    group = patches.group[np.maximum(patches.face_patch, 0)]
-    return mesh_edges(patches.mesh, np.where(turned[:, None], -normal, normal), group)
-
-
 class EdgeFinder:
     """Paths of one transmitter over the edges of a mesh.
 
@@ -130,7 +119,7 @@ class EdgeFinder:
         group: np.ndarray,
     ) -> None:
         self.images, self.wavelength_m, self.table = images, wavelength_m, table
-        self.edges, self.walls, self.group = patch_edges(images.patches), walls, group
+        self.edges, self.walls, self.group = images.patches.edges, walls, group
         self._leaves = EdgeLeaves(self.edges, images.device)
 
     def find(self, receivers: np.ndarray, mirrors: int = 1, progress: Progress | None = None) -> EdgePaths:
