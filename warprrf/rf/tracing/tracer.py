@@ -486,8 +486,7 @@ class MirroredLight:
         walls: if any, the images are those whose light comes through some of these, before or behind the mirror.
 
     Attributes:
-        image: of each pair of a piece and an image that lights it [m], shape ``(N, 3)``.
-        patch: its mirror, shape ``(N,)``.
+        patch: of each pair of a piece and an image that lights it the mirror, shape ``(N,)``.
         before: what its light meets on the way to the middle of the piece.
         onto: its light on the sides of elements: records whose ray is the side, of irradiance where the transmitter gives
             cos(theta_i) / d1^2 [1/m^2].
@@ -519,10 +518,9 @@ class MirroredLight:
         piece, patch, normal = off.row, off.patch[:, 0], normal[chosen]
         ways = off.over(-1, centre[piece])
         paths = tracer.specular(described(ways, 1, walls))
-        self.before = paths.interactions
-        self.image, self.patch = s.images(tracer.transmitter)[patch], patch
+        self.before, self.patch = paths.interactions, patch
         self._first = np.searchsorted(piece, np.arange(len(middle) + 1))
-        way = self.image - centre[piece]
+        way = s.images(tracer.transmitter)[patch] - centre[piece]
         length = np.linalg.norm(way, axis=1)
         toward = way / np.maximum(length, 1e-12)[:, None]
         cos_in = np.maximum((toward * normal).sum(axis=1), 0.0)

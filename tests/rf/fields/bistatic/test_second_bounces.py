@@ -49,7 +49,8 @@ def test_a_mirror_lights_the_sides_of_a_thin_board_that_face_it():
     lit = np.zeros(len(surface.mesh.faces), bool)
     rows, images = tracer.mirrored().pairs(of_board)
     lit[of_board[rows]] = True
-    np.testing.assert_allclose(tracer.mirrored().image[images], np.tile([-1.0, 0.8, 0.5], (len(images), 1)))
+    image = surface.images(tracer.transmitter)[tracer.mirrored().patch[images]]
+    np.testing.assert_allclose(image, np.tile([-1.0, 0.8, 0.5], (len(images), 1)))
     normal = surface.mesh.face_normals
     toward = np.array([-1.0, 0.8, 0.5]) - surface.mesh.triangles.mean(axis=1)
     np.testing.assert_array_equal(lit[of_board], ((normal * toward).sum(axis=1) > 0)[of_board])
