@@ -14,10 +14,10 @@ import numpy as np
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh, joined
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.rf.tracing.surface import (
-    LARGEST_FACE,
     Surface,
     element_width,
     largest_groups,
+    longest_edge,
     named_faces,
     objects_of,
     split_long,
@@ -64,7 +64,7 @@ class Room:
         mesh = patches.mesh if isinstance(patches, PlanarPatches) else as_mesh(geometry, "geometry")
         material, names = named_faces(geometry, mesh)
         once = np.flatnonzero(mesh.first_at_place == np.arange(len(mesh.faces)))
-        cut, parent = split_long(mesh, once, LARGEST_FACE * element_width(surface.mesh))
+        cut, parent = split_long(mesh, once, longest_edge(element_width(surface.mesh)))
         near, count = surface.mesh.closest(cut.triangles.mean(axis=1)), len(surface.mesh.faces)
         along = np.abs((surface.mesh.face_normals[near.face] * cut.face_normals).sum(axis=1))
         at = _first_at_place(surface, cut)[count:]

@@ -35,7 +35,6 @@ ELEMENT_M = 0.5  # width of an element in a room
 ELEMENTS = 30_000
 """Larger scenes have wider elements, so that there are about so many: light between them takes up to 50 kB each. The
 least width holds up to 7500 m^2 of surfaces (a hall's), the largest of 25 m up to 19 km^2 (a town's)."""
-LARGEST_FACE = 0.6  # elements' widths; longer edges are split, so that cells can be small
 POSITION_ERROR_M = 0.02  # of a reconstructed surface: shadow rays end so far before it
 TRUE_ERROR_M = 1e-4
 LOSSY = 4.0 * (1.0 - 0.06j)
@@ -233,7 +232,7 @@ class Surface:
             least_m2 = 0.2 * min(element_m, ELEMENT_M) ** 2
             patch, planes = _mirrors(_apart(patches, alike[group]), least_m2)
         sides = patches.two_sided
-        mesh, parent = split_long(mesh, np.flatnonzero(patches.once), LARGEST_FACE * element_m)
+        mesh, parent = split_long(mesh, np.flatnonzero(patches.once), longest_edge(element_m))
         group, patch = group[parent].astype(np.int32), patch[parent].astype(np.int32)
         return cls(
             mesh=mesh, normal=np.asarray(normal[parent]), patch=patch, plane_normal=planes[0], plane_offset=planes[1],
@@ -427,6 +426,12 @@ def element_width(mesh: Mesh) -> float:
             "Mesh(1e-3 * vertices, faces), else the part of it that was measured"
         )
     return width_m
+
+
+def longest_edge(element_m: float) -> float:
+    """Longer edges of faces are split, so that cells can be small [m]. In scenes wider than a room faces are twice as long:
+    mirrors would light so many pieces that a fit to a town took twice the memory."""
+    return (0.6 if element_m <= ELEMENT_M else 1.2) * element_m
 
 
 def _mirrors(patches: PlanarPatches, least_m2: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
