@@ -64,7 +64,10 @@ def test_no_figure_is_typed(page):
     assert {*re.findall(r"\d+\.\d+ (?:dB|%|n?s|ms|mm|cm|degrees|times)(?!\w)", typed)} <= SETTINGS
 
 
-STALE: set[str] = set()
+STALE = {
+    "arrays", "bistatic", "edited", "lobby_seeds", "locate", "measured_flat", "measured_hall", "measured_office", "measurements",
+    "office", "outside", "suggest",
+}  # fmt: skip
 """Result files of before what they depend on computed something else; their pages say so. What is made anew leaves this list."""
 
 
@@ -122,9 +125,9 @@ def test_geometry_is_counted_up_with_its_steps():
 
 
 def test_a_file_that_is_older_than_what_it_depends_on_is_found(monkeypatch):
-    assert tables.common.older("office") == []
+    assert tables.common.older("bare_mesh") == []
     monkeypatch.setitem(tables.common.VERSIONS, "bistatic", 99)
-    assert tables.common.older("office") == ["bistatic"] and tables.common.older("truths") == []
+    assert tables.common.older("bare_mesh") == ["bistatic"] and tables.common.older("truths") == []
 
 
 def test_where_the_field_is_behind_is_a_line_a_figure_with_the_worst_margin(monkeypatch):
