@@ -156,8 +156,8 @@ class View:
 
     def kept_paths(self, effects: Effects) -> np.ndarray:
         """Which line of sight and mirror paths count, shape ``(L,)`` bool."""
-        mirrors, slabs = ((self.paths.code == kind).sum(axis=1) for kind in (MIRROR, SLAB))
-        few = (mirrors <= effects.mirrors) & (slabs <= effects.transmissions)
+        order, slabs = self.paths.order, (self.paths.code == SLAB).sum(axis=1)
+        few = (order <= effects.mirrors) & (slabs <= effects.transmissions)
         few &= ~self.paths.over_edge | (effects.diffractions > 0)
         return np.asarray(few & (~self.paths.in_sight | effects.line_of_sight))
 
