@@ -207,10 +207,8 @@ def test_elements_grow_with_the_scene():
     assert len(large.element_area) < 2.0 * ELEMENTS
     assert few.element_area.max() < 2.0 * ELEMENT_M**2
     assert large.element_area.sum() == pytest.approx(large.mesh.areas.sum())
-    for surface, share in (
-        (few, 0.6),
-        (large, 1.2),
-    ):  # of elements' widths: finer faces would double a town's memory
+    # The longest edge in elements' widths: finer faces would double a town's memory.
+    for surface, share in ((few, 0.6), (large, 1.2)):
         t = surface.mesh.triangles
         longest = np.linalg.norm(np.roll(t, -1, axis=1) - t, axis=2).max()
         assert 0.5 < longest / (share * element_width(surface.mesh)) <= 1.0

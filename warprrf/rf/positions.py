@@ -236,13 +236,10 @@ def parted(
     found = np.zeros(len(points), dtype=bool)
     asked = np.arange(len(points))
     if known is not None:
-        beside_m = [
-            1.3e-5,
-            0.7e-5,
-            1.1e-5,
-        ]  # a segment through a vertex may slip through a surface, not two of them
-        seen = [mesh.visible(points, known + step, device=device) for step in (0.0, beside_m)]
-        asked = np.flatnonzero(~np.logical_and(*seen))
+        # A segment through a vertex may slip through a surface; another one beside it does not.
+        beside = known + [1.3e-5, 0.7e-5, 1.1e-5]
+        seen = mesh.visible(points, known, device=device) & mesh.visible(points, beside, device=device)
+        asked = np.flatnonzero(~seen)
     if len(asked) == 0:
         return found
     own, rooms = points[asked], _rooms(mesh) if known is None else ()

@@ -429,8 +429,8 @@ def element_width(mesh: Mesh) -> float:
 
 
 def longest_edge(element_m: float) -> float:
-    """Longer edges of faces are split, so that cells can be small [m]. In scenes wider than a room faces are twice as long:
-    mirrors would light so many pieces that a fit to a town took twice the memory."""
+    """Longest edge of a face [m]: longer ones are split, so that cells can be small. In streets and towns, whose elements are
+    wider, it is twice as many of them: shorter edges doubled the memory of a fit to a town."""
     return (0.6 if element_m <= ELEMENT_M else 1.2) * element_m
 
 

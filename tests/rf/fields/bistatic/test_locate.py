@@ -14,11 +14,8 @@ from warprrf.rf.spectra.spectrum import directions_from_angles, pixel_solid_angl
 from warprrf.rf.tracing.render import path_gains
 
 UNSEEN = np.array([[3.9, 2.0, 1.4], [1.7, 3.1, 1.2]])
-OFF_BORDERS = UNSEEN + [
-    0.0013,
-    0.0007,
-    0.0011,
-]  # no ray hits two faces of a wall at once, where either may be met
+OFF_BORDERS = UNSEEN + [0.0013, 0.0007, 0.0011]
+"""Places from which no ray hits the border of two faces, where either may be met."""
 OTHERS = np.array([[4.4, 0.6, 2.3], [0.7, 3.5, 2.4], [4.5, 3.6, 2.5]])
 TURN = np.radians(137.0)
 
