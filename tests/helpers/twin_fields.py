@@ -42,6 +42,6 @@ def known_field(**changes) -> BistaticField:
         "effects": replace(SETS["single"], residual=False),
         "parameters": Parameters(weight, np.log([2.0, 5.0, 1.0]), np.log([0.75, 0.36, 0.99]), LOBES),
         "material": surface.material,
-        "residual": np.zeros((2, surface.cells)),
+        "residual": np.zeros((2, len(surface.cells))),
     }
     return BistaticField(**(given | changes))

@@ -208,8 +208,10 @@ def test_light_that_mirrors_throw_has_its_images_length(dry):
     before, after = (np.bincount(r.ray, r.powers(materials), field.surface.element_sides) for r in onto)
     lit = np.flatnonzero(before)
     assert len(lit) > 40
-    middle = field.surface.middles(field.surface.element)
-    centre = np.tile(field.surface.mesh.triangles[middle].mean(axis=1), (2, 1))  # of both sides
+    tiles = field.surface.tiles
+    centre = np.tile(
+        tiles.centre[tiles.middles(field.surface.cells.element[tiles.cell])], (2, 1)
+    )  # of both sides
     np.testing.assert_allclose(after[lit] / before[lit], passed(by_image(centre[lit])), rtol=0.02)
 
 
@@ -226,7 +228,7 @@ def test_two_and_three_bounces_in_a_sphere_have_the_chords_lengths():
     field = BistaticField(
         surface=surface, transmitter=np.array([0.02, 0.0, 0.0]), frequency_hz=F, shape=SHAPE, floor=1e-20,
         range_db=(-200.0, -80.0), beam_sigma_rad=np.radians(5.0), parameters=parameters, material=np.zeros(groups, int),
-        residual=np.zeros((2, surface.cells)),
+        residual=np.zeros((2, len(surface.cells))),
         effects=Effects(False, 0, 2, mirror_scatter=False, scatter_mirror=False),
     )  # fmt: skip
     thrice = replace(field, effects=replace(field.effects, scatterings=3))

@@ -113,19 +113,20 @@ def test_readings_made_of_a_fields_own_paths_have_no_error_but_the_one_put_in(fi
 
 def test_what_is_learned_of_surfaces_is_shown_on_them(field):
     surface, p = field.surface, field.parameters
+    group = surface.group[surface.tiles.face]
     smooth = np.exp(p.log_mirror) / (np.exp(p.log_mirror) + p.weight.sum(axis=1))
     height_m = 1e-3 * room.learned(field, "roughness")
     loss = np.exp(-((4 * np.pi * height_m / field.wavelength_m) ** 2))
-    np.testing.assert_allclose(loss, smooth[surface.group], rtol=1e-6)
+    np.testing.assert_allclose(loss, smooth[group], rtol=1e-6)
     gamma = (1 - np.sqrt(1 + np.exp(p.log_excess))) / (1 + np.sqrt(1 + np.exp(p.log_excess)))
     wanted = 10 * np.log10(np.exp(p.log_mirror) * gamma**2)
-    np.testing.assert_allclose(room.learned(field, "reflection"), wanted[surface.group], atol=0.05)
+    np.testing.assert_allclose(room.learned(field, "reflection"), wanted[group], atol=0.05)
     known = field.gain_std_db()
     unmeasured = dataclasses.replace(field, fitted_on=np.zeros((0, 3)), fitted_under=None).gain_std_db()
     prior = 10 / np.log(10) * np.hypot(SHARED[0], OWN[0])
     np.testing.assert_allclose(unmeasured, prior)
     assert (known <= unmeasured).all() and known.min() < 0.5 * prior
-    assert room.learned(field, "uncertainty").shape == (len(surface.mesh.faces),)
+    assert room.learned(field, "uncertainty").shape == (len(surface.tiles.face),)
 
 
 def test_things_are_sorted_by_what_they_are(tmp_path, field):

@@ -39,7 +39,7 @@ def colourings(subject: Subject) -> list[str]:
 
 
 def learned(field: BistaticField, kind: str, progress: Progress | None = None) -> np.ndarray:
-    """What ``field`` learned of each face of its own mesh, shape ``(F,)``.
+    """What ``field`` learned of each tile of its surface, shape ``(N,)``.
 
     Args:
         kind: ``"reflection"``: power mirrored at normal incidence [dB]; ``"scattering"``: power scattered under even
@@ -47,14 +47,14 @@ def learned(field: BistaticField, kind: str, progress: Progress | None = None) -
             standard deviation of the gain of what a surface scatters, by what the measurements saw of it [dB].
         progress: of the last, which takes seconds.
     """
-    surface, p = field.surface, field.parameters
+    surface, p, tiles = field.surface, field.parameters, field.surface.tiles
     if kind == "uncertainty":
-        return field.gain_std_db(progress)[surface.element]
+        return field.gain_std_db(progress)[surface.cells.element[tiles.cell]]
     if kind == "roughness":
         height_m = field.wavelength_m / (4.0 * np.pi) * np.sqrt(np.maximum(-p.log_smooth, 0.0))
-        return np.asarray(1e3 * height_m[surface.group])
+        return np.asarray(1e3 * height_m[surface.group[tiles.face]])
     share = p.mirrored_share if kind == "reflection" else p.scattered_share
-    return np.asarray(10.0 * np.log10(np.maximum(share, 1e-12))[surface.group])
+    return np.asarray(10.0 * np.log10(np.maximum(share, 1e-12))[surface.group[tiles.face]])
 
 
 def face_colours(
@@ -69,10 +69,14 @@ def face_colours(
     elif kind == "learned materials" and isinstance(field, BistaticField):
         mesh, index = field.surface.mesh, field.material[field.surface.group]
         names = [field.surface.group_names[g] for g in np.unique(field.material, return_index=True)[1]]
-    elif kind in LEARNED and isinstance(field, BistaticField):  # whose mesh has more, smaller faces
+    elif kind in LEARNED and isinstance(field, BistaticField):
         low, high, unit, name = LEARNED[kind]
         shades = pictures.coloured(learned(field, kind, progress), low, high, name)
-        return field.surface.mesh, shades, pictures.colour_bar(low, high, unit, name)
+        return (
+            field.surface.tiles.fan,
+            np.repeat(shades, 5, axis=0),
+            pictures.colour_bar(low, high, unit, name),
+        )
     elif kind == "photo colours":
         seen = mesh.face_colours if subject.gaussians is None else _of_splats(mesh, subject.gaussians)
         known = np.round(np.asarray(seen) * 255.0)

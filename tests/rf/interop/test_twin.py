@@ -168,7 +168,7 @@ def test_slabs_are_as_thick_as_the_scene_or_the_caller_says_and_else_let_nothing
 
 def test_what_no_material_can_hold_is_said(field, tmp_path):
     assert wr.interop.write_twin(field, tmp_path / "plain").left_out == ()
-    residual = np.full((2, field.surface.cells), np.log(10**0.1))
+    residual = np.full((2, len(field.surface.cells)), np.log(10**0.1))
     parameters = replace(field.parameters, log_gain=np.log(10**0.35))
     rich = replace(
         field, parameters=parameters, residual=residual, effects=replace(field.effects, residual=True)

@@ -349,7 +349,7 @@ def _left_out(field: BistaticField, half_spaces: Sequence[str]) -> tuple[str, ..
     if field.effects.diffractions:
         found.append("paths over edges: simulate has Sionna RT find none")
     if field.effects.residual:
-        squares = np.average(field.residual[0] ** 2, weights=np.bincount(s.cell, s.mesh.areas))
+        squares = np.average(field.residual[0] ** 2, weights=np.bincount(s.tiles.cell, s.tiles.area))
         found.append(f"residuals within groups, {NEPER * np.sqrt(squares):.2f} dB rms over area")
     if field.effects.scatterings and p.reciprocal:
         found.append("reciprocity: scattered power changes when transmitter and receiver are swapped")

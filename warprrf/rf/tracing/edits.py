@@ -13,19 +13,19 @@ import numpy as np
 
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh, joined
 from warprrf.geometry.planar_patches import PlanarPatches
+from warprrf.rf.tracing.cells import Cells
 from warprrf.rf.tracing.surface import (
+    CELLS_ALONG,
     Surface,
     element_width,
     largest_groups,
-    longest_edge,
     named_faces,
     objects_of,
-    split_long,
 )
 
 PARALLEL = 0.97
 """Least cosine between the normals of a face and of what it lies on: errors of 2 cm turn elements of 10 cm by 14 degrees."""
-_OF_FACES = "normal", "patch", "group", "element", "cell", "face_object"
+_OF_FACES = "normal", "patch", "group", "face_object"
 
 
 @dataclass(frozen=True)
@@ -58,19 +58,14 @@ class Room:
         """A geometry in the place of ``surface``.
 
         A face is of the group that its material's name says; else of the one that it lies on, to within the surface's error of
-        position; else of a new one, called by its material or ``"new"``.
+        position; else of a new one, called by its material or ``"new"``. One that lies on several is cut.
         """
         patches = None if isinstance(geometry, Surface) else getattr(geometry, "patches", None)
         mesh = patches.mesh if isinstance(patches, PlanarPatches) else as_mesh(geometry, "geometry")
         material, names = named_faces(geometry, mesh)
         once = np.flatnonzero(mesh.first_at_place == np.arange(len(mesh.faces)))
-        cut, parent = split_long(mesh, once, longest_edge(element_width(surface.mesh)))
-        near, count = surface.mesh.closest(cut.triangles.mean(axis=1)), len(surface.mesh.faces)
-        along = np.abs((surface.mesh.face_normals[near.face] * cut.face_normals).sum(axis=1))
-        at = _first_at_place(surface, cut)[count:]
-        lies = (at < count) | (near.distance <= surface.position_error_m) & (along > PARALLEL)
-        face = np.where(at < count, at, near.face)
-        group, groups = np.where(lies, surface.group[face], -1), list(surface.group_names)
+        cut, group, parent = _lying_on(surface, Mesh(mesh.vertices, mesh.faces[once]))
+        parent, groups = once[parent], list(surface.group_names)
         label = np.full(len(parent), len(names)) if material is None else material[parent]
         for k, name in enumerate((*names, "new")):
             own = (label == k) & ((group < 0) | (name in surface.group_names))
@@ -90,34 +85,61 @@ def edited(surface: Surface, room: Room, **slabs: np.ndarray) -> tuple[Surface, 
     stays = (at < count) & (room.face_material == np.append(s.group, -1)[np.minimum(at, count)])
     kept = np.isin(first[:count], at[stays])
     if kept.all() and stays.all():
-        return surface, np.arange(s.cells)
+        return surface, np.arange(len(s.cells))
     face = np.flatnonzero(kept)
     own = {name: getattr(s, name)[face] for name in _OF_FACES}
-    vertices, corners, lies_on, things = s.mesh.vertices, s.mesh.faces[face], s.cell[face], s.object_names
+    vertices, corners, things = s.mesh.vertices, s.mesh.faces[face], s.object_names
+    cells, lies_on = s.cells.take(face)
     planes = s.plane_normal, s.plane_offset
     if not stays.all():
         part, more, planes = _cut(s, room, ~stays)
         own = {name: np.concatenate([own[name], more[name]]) for name in _OF_FACES}
         corners = np.concatenate([corners, part.mesh.faces + len(vertices)])
         vertices, things = np.concatenate([vertices, part.mesh.vertices]), part.object_names
-        near = s.mesh.closest(part.mesh.triangles.mean(axis=1))
-        same = (s.group[near.face] == part.group) & (near.distance <= s.position_error_m)
-        lies_on = np.append(lies_on, np.where(same, s.cell[near.face], -1))
+        tiles, cells = part.tiles, cells.beside(part.cells)
+        tile = tiles.middles(tiles.cell)
+        middle = tiles.centre[tile]
+        near = s.mesh.closest(middle)
+        same = s.group[near.face] == part.group[tiles.face[tile]]
+        same &= near.distance <= s.position_error_m
+        lies_on = np.append(lies_on, np.where(same, s.cells.at(near.face, middle), -1))
     used, corners = np.unique(corners, return_inverse=True)
     mesh, new = Mesh(vertices[used], corners.reshape(-1, 3)), len(names) - s.groups
     plane, own["patch"] = _renumbered(own["patch"])
-    own["element"] = _renumbered(own["element"])[1]
-    first = np.unique(own["cell"], return_index=True)[1]
-    own["cell"] = _renumbered(own["cell"])[1]
     made = Surface(
-        mesh=mesh, **own, **{name: np.concatenate([getattr(s, name), slabs[name]]) for name in ("thickness_m", "dispersion")},
+        mesh=mesh, cells=cells, **own,
+        **{name: np.concatenate([getattr(s, name), slabs[name]]) for name in ("thickness_m", "dispersion")},
         plane_normal=planes[0][plane], plane_offset=planes[1][plane], group_names=names, object_names=things,
         material=np.append(s.material, s.material.max() + 1 + np.arange(new)).astype(np.int32),
         appearance=np.concatenate([s.appearance, np.full((new, s.appearance.shape[1]), np.nan)]),
         patch_group=largest_groups(mesh, own["patch"], own["group"], len(plane)),
         position_error_m=s.position_error_m, two_sided=s.two_sided,
     )  # fmt: skip
-    return made, lies_on[first]
+    return made, lies_on
+
+
+def _lying_on(s: Surface, mesh: Mesh) -> tuple[Mesh, np.ndarray, np.ndarray]:
+    """``mesh`` with those faces cut that lie on several groups of ``s``; the group that each face lies on, -1 for none; and
+    the face that it is a piece of."""
+    none, count = np.full(len(mesh.faces), -1), len(s.mesh.faces)
+    cells = Cells.of(mesh, none, none, np.zeros((0, 3)), element_width(s.mesh) / CELLS_ALONG, CELLS_ALONG)
+    tiles, at = cells.tiles(mesh), _first_at_place(s, mesh)[count:]
+    near = s.mesh.closest(tiles.centre)
+    along = np.abs((s.mesh.face_normals[near.face] * mesh.face_normals[tiles.face]).sum(axis=1))
+    lies = (near.distance <= s.position_error_m) & (along > PARALLEL)
+    group, first = np.where(lies, s.group[near.face], -1), np.searchsorted(tiles.face, np.arange(len(none)))
+    several = np.minimum.reduceat(group, first) < np.maximum.reduceat(group, first)
+    several &= at >= count
+    whole, part = np.flatnonzero(~several), np.flatnonzero(several[tiles.face])
+    found = np.where(at < count, np.append(s.group, -1)[np.minimum(at, count)], group[first])
+    fan = tiles.fan.faces.reshape(-1, 5, 3)[part].reshape(-1, 3)
+    cut = joined([(mesh.vertices, mesh.faces[whole]), (tiles.fan.vertices, fan)])
+    label, parent = (
+        np.concatenate([own[whole], np.repeat(more[part], 5)])
+        for own, more in ((found, group), (np.arange(len(none)), tiles.face))
+    )
+    large = cut.areas > 0
+    return Mesh(cut.vertices, cut.faces[large]), label[large], parent[large]
 
 
 def _first_at_place(s: Surface, mesh: Mesh) -> np.ndarray:
@@ -158,5 +180,5 @@ def _cut(
         if one.any():
             label[k] = alike[np.argmin(np.where(one, apart, np.inf))]
     found: dict[str, Any] = {name: getattr(p, name) for name in _OF_FACES}
-    found |= {"patch": label[p.patch], "element": p.element + len(s.element_area), "cell": p.cell + s.cells}
+    found["patch"] = label[p.patch]
     return p, found, (np.concatenate([s.plane_normal, normal]), np.concatenate([s.plane_offset, offset]))

@@ -16,6 +16,7 @@ from scipy.sparse import csr_matrix
 from warprrf.geometry.mesh import vectors_across
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.tracing.model import Effects, Model, Parameters
+from warprrf.rf.tracing.rays import Hits
 from warprrf.rf.tracing.records import Materials, Records
 from warprrf.rf.tracing.tracer import SPECULAR, Rays, Tracer, View
 
@@ -99,7 +100,7 @@ def path_gains(view: View, model: Model) -> PathGains:
     for name, records in tables.items():
         power = records.powers(materials)
         row = records.residual_row
-        found[name] = power * (gains[row, view.cell[records.ray]] if row >= 0 else model.parameters.gain)
+        found[name] = power * (gains[row, view.cell(records.ray)] if row >= 0 else model.parameters.gain)
     found[SPECULAR] = np.where(view.kept_paths(model.effects), found[SPECULAR], 0.0)
     return PathGains(view, found, tables, model.parameters)
 
@@ -137,14 +138,13 @@ class Interreflection:
 
     def __init__(self, tracer: Tracer, most: int) -> None:
         surface, grid = tracer.surface, tracer.grid
-        middle = surface.middles(surface.element)
-        point, normal = surface.mesh.triangles[middle].mean(axis=1), surface.side_normal[middle]
+        tiles, element = surface.tiles, surface.cells.element
+        middle = tiles.middles(element[tiles.cell])
+        point, normal = tiles.centre[middle], surface.side_normal[tiles.face[middle]]
         known = np.arange(len(point))
         if surface.two_sided:
             point, normal = np.tile(point, (2, 1)), np.concatenate([normal, -normal])
-            face = grid.hit(tracer.transmitter).face
-            ray = np.flatnonzero(face >= 0)
-            known = np.union1d(known, surface.side_met(face[ray], grid.directions[ray]))
+            known = np.union1d(known, _sides_met(tracer, grid.hit(tracer.transmitter))[1])
         lift_m = 0.02  # rays start so far off the surface
         shift = np.random.default_rng(0).random((2, len(surface.element_area)))
         scale = np.float32(np.pi / ELEMENT_RAYS * (4.0 * np.pi / tracer.wavelength_m) ** 2)
@@ -153,8 +153,7 @@ class Interreflection:
         while len(new):
             directions = _hemispheres(normal[new], shift[:, new % shift.shape[1]])
             hits = grid.hit_along(point[new] + lift_m * normal[new], directions, np.ones(len(directions)))
-            hit = np.flatnonzero(hits.face >= 0)
-            side, met = np.repeat(new, ELEMENT_RAYS), surface.side_met(hits.face[hit], directions[hit])
+            side, (hit, met) = np.repeat(new, ELEMENT_RAYS), _sides_met(tracer, hits)
             rays = Rays(hits, side)
             lit = tracer.lit(rays, most)
             if most:
@@ -193,6 +192,12 @@ def irradiance(tracer: Tracer, p: Parameters, effects: Effects) -> np.ndarray | 
     for _ in range(2, effects.scatterings):
         got = first + light.between @ (share * got)
     return np.asarray(got)
+
+
+def _sides_met(tracer: Tracer, hits: Hits) -> tuple[np.ndarray, np.ndarray]:
+    """Which rays hit something, and the sides of elements that they do."""
+    ray = np.flatnonzero(hits.face >= 0)
+    return ray, tracer.surface.side_met(tracer.cell(hits, ray), hits.face[ray], hits.rays(ray)[1])
 
 
 def _hemispheres(normal: np.ndarray, shift: np.ndarray) -> np.ndarray:

@@ -28,10 +28,11 @@ from warprrf.rf.em.fresnel import SurfaceTable
 from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, is_name_alone, itu_name, itu_permittivity
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.slabs import Walls
+from warprrf.rf.tracing.cells import Cells, Tiles
 from warprrf.rf.tracing.groups import SHAPES, Colours, colour_groups, shape_groups
-from warprrf.rows import distinct_rows, sums_of
 
 ELEMENT_M = 0.5  # width of an element in a room
+CELLS_ALONG = 3  # cells along an element
 ELEMENTS = 30_000
 """Larger scenes have wider elements, so that there are about so many: light between them takes up to 50 kB each. The
 least width holds up to 7500 m^2 of surfaces (a hall's), the largest of 25 m up to 19 km^2 (a town's)."""
@@ -49,8 +50,6 @@ ARRAYS = {
     "material": index_to("G", "G"),
     "appearance": Expected("G K", nan=True),
     "patch_group": index_to("G", "P"),
-    "element": index_to("F", "F"),
-    "cell": index_to("F", "F"),
     "thickness_m": Expected("G", 0.0, np.inf, nan=True),
     "dispersion": Expected("G 4", nan=True),
     "face_object": index_to("O", "F", -1),
@@ -63,7 +62,7 @@ class Surface:
     """A mesh with what the radio field needs to know of each face.
 
     Attributes:
-        mesh: the mesh, long edges split.
+        mesh: the mesh, without faces that lie on others.
         normal: unit normals that scattering uses: of the patch, or smoothed, shape ``(F, 3)``.
         patch: planar patch of each face, -1 for none, shape ``(F,)`` int32.
         plane_normal, plane_offset: planes of the patches, ``normal . x = offset`` [m], shapes ``(P, 3)``, ``(P,)``.
@@ -73,8 +72,7 @@ class Surface:
             and log luminance as photos show them, else place and extents, shape ``(G, 4)`` or ``(G, 6)``; NaN where names
             tell it.
         patch_group: group of each patch, shape ``(P,)`` int32.
-        element: surface element of each face, shape ``(F,)`` int32.
-        cell: cell of each face, shape ``(F,)`` int32.
+        cells: the cells that its points belong to, X in all.
         thickness_m: thickness of what each group is a slab of [m], shape ``(G,)``; NaN where nobody knows.
         dispersion: a, b, c and d of each group's relative permittivity a f^b and conductivity c f^d [S/m], f in GHz, shape
             ``(G, 4)``; NaN where ITU-R P.2040-4 tells by the name, or nobody knows.
@@ -98,8 +96,7 @@ class Surface:
     material: np.ndarray
     appearance: np.ndarray
     patch_group: np.ndarray
-    element: np.ndarray
-    cell: np.ndarray
+    cells: Cells = field(repr=False)
     thickness_m: np.ndarray
     dispersion: np.ndarray
     group_names: tuple[str, ...]
@@ -115,6 +112,8 @@ class Surface:
         sizes = {"F": len(self.mesh.faces), "G": len(self.group_names), "O": len(self.object_names)}
         check_arrays(vars(self), ARRAYS, **sizes)
         check_number("position_error_m", self.position_error_m, 0.0, 10.0)
+        if len(self.cells.axis) != sizes["F"]:
+            raise ValueError(f"cells: got those of {len(self.cells.axis)} faces, expected {sizes['F']}")
 
     @cached_property
     def front_normal(self) -> np.ndarray:
@@ -132,31 +131,20 @@ class Surface:
         return normal
 
     @cached_property
-    def cell_element(self) -> np.ndarray:
-        """Element of each cell, shape ``(X,)`` int32."""
-        found = np.zeros(int(self.cell.max()) + 1, np.int32)
-        found[self.cell] = self.element
-        return found
+    def tiles(self) -> Tiles:
+        """Its faces cut into pieces of single cells."""
+        return self.cells.tiles(self.mesh)
 
     @cached_property
     def element_area(self) -> np.ndarray:
         """Area of each element [m^2], shape ``(E,)``."""
-        return np.maximum(np.bincount(self.element, self.mesh.areas), 1e-12)
-
-    def middles(self, piece: np.ndarray) -> np.ndarray:
-        """Of each piece of the surface, ``piece`` (F,) of each face, the face nearest to its middle."""
-        centre = self.mesh.triangles.mean(axis=1)
-        area = np.maximum(np.bincount(piece, self.mesh.areas), 1e-12)
-        middle = sums_of(self.mesh.areas[:, None] * centre, piece) / area[:, None]
-        gap = np.linalg.norm(centre - middle[piece], axis=1)
-        order = np.lexsort((gap, piece))
-        return order[np.searchsorted(piece[order], np.arange(len(area)))]
+        return np.maximum(np.bincount(self.cells.element[self.tiles.cell], self.tiles.area), 1e-12)
 
     @cached_property
     def element_group(self) -> np.ndarray:
         """Group of each element, shape ``(E,)`` int32."""
         found = np.zeros(len(self.element_area), np.int32)
-        found[self.element] = self.group
+        found[self.cells.element[self.tiles.cell]] = self.group[self.tiles.face]
         return found
 
     @property
@@ -164,13 +152,14 @@ class Surface:
         """Number of elements' sides: two each, or that of a reconstructed surface which photos saw."""
         return (1 + self.two_sided) * len(self.element_area)
 
-    def side_met(self, face: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Side of an element that a ray of ``direction`` (N, 3) meets at ``face`` (N,): second sides stand after all the
-        first ones, shape ``(N,)``."""
+    def side_met(self, cell: np.ndarray, face: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Side of an element that a ray of ``direction`` (N, 3) meets at ``cell`` and ``face``, (N,) each: second sides stand after
+        all the first ones, shape ``(N,)``."""
+        element = self.cells.element[cell]
         if not self.two_sided:
-            return self.element[face]
+            return element
         behind = np.einsum("ni,ni->n", self.side_normal[face], direction) > 0
-        return self.element[face] + behind * len(self.element_area)
+        return element + behind * len(self.element_area)
 
     @property
     def groups(self) -> int:
@@ -181,11 +170,6 @@ class Surface:
     def by_shape(self) -> bool:
         """Whether only shapes tell its groups apart."""
         return self.appearance.shape[1] == SHAPES
-
-    @property
-    def cells(self) -> int:
-        """Number of cells."""
-        return len(self.cell_element)
 
     def faces_of(self, name: str) -> np.ndarray:
         """Faces of the object called ``name``, else of the group that is, shape ``(F,)`` bool."""
@@ -232,24 +216,26 @@ class Surface:
             least_m2 = 0.2 * min(element_m, ELEMENT_M) ** 2
             patch, planes = _mirrors(_apart(patches, alike[group]), least_m2)
         sides = patches.two_sided
-        mesh, parent = split_long(mesh, np.flatnonzero(patches.once), longest_edge(element_m))
+        parent = np.flatnonzero(patches.once)
+        mesh = Mesh(mesh.vertices, mesh.faces[parent])
         group, patch = group[parent].astype(np.int32), patch[parent].astype(np.int32)
+        cells = Cells.of(mesh, group, patch, planes[0], element_m / CELLS_ALONG, CELLS_ALONG)
         return cls(
             mesh=mesh, normal=np.asarray(normal[parent]), patch=patch, plane_normal=planes[0], plane_offset=planes[1],
             group=group, material=alike, appearance=appearance, patch_group=largest_groups(mesh, patch, group, len(planes[1])),
             **_slabs(geometry, material, len(names)), group_names=tuple(names), position_error_m=error_m,
-            two_sided=sides, **_elements(mesh, patch, group, element_m), **objects_of(geometry, parent),
+            two_sided=sides, cells=cells, **objects_of(geometry, parent),
         )  # fmt: skip
 
     @classmethod
     def of_materials(cls, patches: PlanarPatches, material: np.ndarray, names: Sequence[str]) -> Surface:
         """That of faces of known materials (F,) on exact patches, all one element: nothing of it is learned."""
         mesh, groups = patches.mesh, len(names)
-        none, faces = np.zeros(len(mesh.faces), np.int32), patches.group
+        one, faces = Cells.of_faces(np.zeros(len(mesh.faces)), np.zeros(1)), patches.group
         return cls(
             mesh=mesh, normal=mesh.face_normals, patch=patches.face_patch, plane_normal=patches.normal,
             plane_offset=patches.offset, group=material, material=np.arange(groups, dtype=np.int32),
-            appearance=np.full((groups, 4), np.nan), patch_group=faces, element=none, cell=none,
+            appearance=np.full((groups, 4), np.nan), patch_group=faces, cells=one,
             **_slabs(mesh, None, groups), group_names=tuple(names), position_error_m=TRUE_ERROR_M, two_sided=True,
         )  # fmt: skip
 
@@ -308,7 +294,7 @@ class Surface:
 
     @cached_property
     def patches(self) -> PlanarPatches:
-        """Its patches, of the split mesh."""
+        """Its patches."""
         found = PlanarPatches.from_planes(
             self.mesh, self.patch, self.plane_normal, self.plane_offset, tolerance_m=self.position_error_m, two_sided=self.two_sided
         )  # fmt: skip
@@ -395,16 +381,6 @@ def objects_of(geometry: GeometryLike, parent: np.ndarray) -> dict[str, Any]:
     return {"face_object": np.asarray(known, np.int32)[parent], "object_names": names}
 
 
-def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray, width_m: float) -> dict[str, Any]:
-    """Elements and cells of faces, by the names of :class:`Surface`: pieces of one group and patch on a lattice of
-    ``width_m``."""
-    centre, along = mesh.triangles.mean(axis=1), 3  # cells along an element
-    cells = np.floor(along * (centre - mesh.bounds[0]) / width_m).astype(np.int64)
-    element = distinct_rows(np.column_stack([group, patch, cells // along]))[1].astype(np.int32)
-    cell = distinct_rows(np.column_stack([element, cells]))[1].astype(np.int32)
-    return {"element": element, "cell": cell}
-
-
 def largest_groups(mesh: Mesh, patch: np.ndarray, group: np.ndarray, patches: int) -> np.ndarray:
     """The group that has most of each patch's area, shape ``(P,)`` int32."""
     area = np.zeros((patches, int(group.max(initial=0)) + 1))
@@ -426,12 +402,6 @@ def element_width(mesh: Mesh) -> float:
             "Mesh(1e-3 * vertices, faces), else the part of it that was measured"
         )
     return width_m
-
-
-def longest_edge(element_m: float) -> float:
-    """Longest edge of a face [m]: longer ones are split, so that cells can be small. In streets and towns, whose elements are
-    wider, it is twice as many of them: shorter edges doubled the memory of a fit to a town."""
-    return (0.6 if element_m <= ELEMENT_M else 1.2) * element_m
 
 
 def _mirrors(patches: PlanarPatches, least_m2: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
@@ -456,35 +426,6 @@ def _mirrors(patches: PlanarPatches, least_m2: float) -> tuple[np.ndarray, tuple
     order[large] = piece.reshape(-1)
     own = large[first]
     return order[patches.face_patch].astype(np.int32), (patches.normal[own], patches.offset[own])
-
-
-def split_long(mesh: Mesh, chosen: np.ndarray, most_m: float) -> tuple[Mesh, np.ndarray]:
-    """Faces ``chosen`` of ``mesh``, halved across their longest edge until none is longer than ``most_m``, and each
-    face's parent.
-
-    Both faces at an edge are split at its midpoint or not at all, because the edge's length alone decides: no cracks.
-    """
-    vertices, faces = mesh.vertices, mesh.faces[chosen].astype(np.int64)
-    parent = chosen
-    done_faces, done_parent = [], []
-    for _ in range(64):
-        edge = np.linalg.norm(vertices[np.roll(faces, -1, axis=1)] - vertices[faces], axis=2)
-        longest = edge.argmax(axis=1)
-        long = edge.max(axis=1) > most_m
-        done_faces.append(faces[~long])
-        done_parent.append(parent[~long])
-        if not long.any():
-            break
-        f, first = faces[long], longest[long]
-        pick = np.arange(len(f))
-        a, b, c = f[pick, first], f[pick, (first + 1) % 3], f[pick, (first + 2) % 3]
-        ends = np.sort(np.column_stack([a, b]), axis=1)
-        unique, index = np.unique(ends, axis=0, return_inverse=True)
-        middle = len(vertices) + index.reshape(-1)
-        vertices = np.concatenate([vertices, 0.5 * (vertices[unique[:, 0]] + vertices[unique[:, 1]])])
-        faces = np.concatenate([np.column_stack([a, middle, c]), np.column_stack([middle, b, c])])
-        parent = np.concatenate([parent[long], parent[long]])
-    return Mesh(vertices, np.concatenate(done_faces)), np.concatenate(done_parent)
 
 
 def _on_patches(patches: PlanarPatches, normal: np.ndarray) -> np.ndarray:

@@ -111,10 +111,9 @@ class View:
         make = partial(unit_beams, self.paths.arrival, grid.shape, sigma, device=grid.device)
         return self._beams.get("beams", make) if self.keeps else make()
 
-    @property
-    def cell(self) -> np.ndarray:
-        """Surface cell that each ray meets, shape ``(R K,)``; any where it meets nothing."""
-        return self.tracer.surface.cell.take(self.hits.face, mode="wrap")
+    def cell(self, ray: np.ndarray) -> np.ndarray:
+        """Surface cell that each ray of index ``ray`` (N,) meets, shape ``(N,)``; all must meet something."""
+        return self.tracer.cell(self.hits, ray)
 
     @property
     def outward(self) -> np.ndarray:
@@ -365,7 +364,7 @@ class Tracer:
         times = self.grid.per_pixel / len(places)
         chosen = np.flatnonzero((rays.hits.face >= 0) & np.isin(rays.ray % self.grid.per_pixel, places))
         m = self.mirrored(most)
-        row, image = m.pairs(rays.hits.face[chosen])
+        row, image = m.pairs(self.cell(rays.hits, chosen), rays.hits.face[chosen])
         before = m.before.take(image) if most else None
         return self.lit_by_images(rays, chosen[row], m.patch[image], before, times)[1]
 
@@ -392,7 +391,7 @@ class Tracer:
         hits, s = rays.hits, self.surface
         row = np.flatnonzero(hits.face >= 0)
         _, direction, solid_angle = hits.rays(row)
-        side = s.side_met(hits.face[row], direction)
+        side = s.side_met(self.cell(hits, row), hits.face[row], direction)
         friis = (self.wavelength_m / (4.0 * np.pi)) ** 2
         power = friis * solid_angle * self.grid.transmittance(hits.range_m[row])
         own = Interactions.alike(side[:, None], np.zeros((len(row), 1, 3)), SOURCE)
@@ -459,6 +458,10 @@ class Tracer:
         found = grid.hit_along(start, onward, solid_angle * left)
         return Rays(found, rays.ray[ray], Interactions.of_mirrors(s.group[face], cosine))
 
+    def cell(self, hits: Hits, ray: np.ndarray) -> np.ndarray:
+        """Surface cell that rays of index ``ray`` (N,) hit, shape ``(N,)``."""
+        return self.surface.cells.at(hits.face[ray], hits.points(ray))
+
     def adopted(self, view: View) -> View:
         """What :func:`view_of` found, as a view of this tracer."""
         own: dict[str, Any] = {"directions": self.grid.directions, "solid_angle": self.grid.solid_angle}
@@ -494,11 +497,11 @@ class MirroredLight:
 
     def __init__(self, tracer: Tracer, walls: Walls | None = None) -> None:
         s, grid = tracer.surface, tracer.grid
-        largest = np.abs(s.front_normal).argmax(axis=1)
-        way = 2 * largest + (np.take_along_axis(s.front_normal, largest[:, None], axis=1)[:, 0] < 0)
-        self._piece = np.unique(6 * s.cell + way, return_inverse=True)[1]
-        middle = s.middles(self._piece)
-        centre = s.mesh.triangles[middle].mean(axis=1)
+        largest, tiles = np.abs(s.front_normal).argmax(axis=1), s.tiles
+        self._way = 2 * largest + (np.take_along_axis(s.front_normal, largest[:, None], axis=1)[:, 0] < 0)
+        self._pieces, own = np.unique(6 * tiles.cell + self._way[tiles.face], return_inverse=True)
+        tile, area = tiles.middles(own), np.bincount(own, tiles.area)
+        centre, middle = tiles.centre[tile], tiles.face[tile]
         ways = tracer.images.candidates(centre, 1)
         # Light must come from in front of the piece, of either side if it has two, and not from its own patch.
         face = middle[ways.row]
@@ -524,14 +527,15 @@ class MirroredLight:
         length = np.linalg.norm(way, axis=1)
         toward = way / np.maximum(length, 1e-12)[:, None]
         cos_in = np.maximum((toward * normal).sum(axis=1), 0.0)
-        face = middle[piece]
-        share = np.bincount(self._piece, s.mesh.areas)[piece] / s.element_area[s.element[face]]
+        face, cell = middle[piece], tiles.cell[tile[piece]]
+        share = area[piece] / s.element_area[s.cells.element[cell]]
         power = share * cos_in / np.maximum(length, NEAREST_M) ** 2 * grid.transmittance(length)
-        self.onto = replace(paths, power=power, ray=s.side_met(face, -normal))
+        self.onto = replace(paths, power=power, ray=s.side_met(cell, face, -normal))
 
-    def pairs(self, face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of ``face`` (N,) and images that light them, one for each pair."""
-        first, end = self._first[self._piece[face]], self._first[self._piece[face] + 1]
+    def pairs(self, cell: np.ndarray, face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of places of cells and faces, ``(N,)`` each, and images that light them, one for each pair."""
+        piece = np.searchsorted(self._pieces, 6 * cell + self._way[face])
+        first, end = self._first[piece], self._first[piece + 1]
         count = end - first
         within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-        return np.repeat(np.arange(len(face)), count), np.repeat(first, count) + within
+        return np.repeat(np.arange(len(piece)), count), np.repeat(first, count) + within

@@ -115,12 +115,13 @@ def test_a_moved_thing_keeps_its_material_and_a_moved_scene_says_the_same(field)
     assert np.array_equal(moved.parameters.log_weight, field.parameters.log_weight)
     by_hand = known_field(effects=moved.effects)
     surface = type(field.surface).of(with_block_at(shift))
-    by_hand = replace(by_hand, surface=surface, residual=np.zeros((2, surface.cells)))
+    by_hand = replace(by_hand, surface=surface, residual=np.zeros((2, len(surface.cells))))
     plain = replace(moved, residual=np.zeros_like(moved.residual))
     assert np.allclose(gains(plain, BLOCKED), gains(by_hand, BLOCKED), rtol=1e-4, atol=1e-3 * field.floor)
     named = field.with_objects({"block/top <1>": Mesh(BLOCK[0] + shift, BLOCK[1])})
     assert np.allclose(gains(named, BLOCKED), gains(moved, BLOCKED), rtol=1e-4, atol=1e-3 * field.floor)
-    walls = moved.residual[:, np.unique(moved.surface.cell[moved.surface.group == 0])]
+    tiles = moved.surface.tiles
+    walls = moved.residual[:, np.unique(tiles.cell[moved.surface.group[tiles.face] == 0])]
     assert (walls != 0).all()  # what was learned of the walls stays
 
 
@@ -224,7 +225,7 @@ def test_a_scene_of_named_objects_moves_one_of_them():
     )  # fmt: skip
     surface = type(known_field().surface).of(scene)
     field = known_field(
-        surface=surface, material=surface.material, residual=np.zeros((2, surface.cells)),
+        surface=surface, material=surface.material, residual=np.zeros((2, len(surface.cells))),
         parameters=known_field().parameters.take(np.array([0, 1])),
     )  # fmt: skip
     moved = field.with_objects({"first": Mesh(low[0] + [0, 1.5, 0], low[1])})
@@ -251,7 +252,7 @@ def test_a_person_across_a_link_shadows_as_a_screen_of_p526_does(x):
     surface = type(known_field().surface).of(walls)
     ends, carrier = np.array([[0.5, 2.0, 1.2], [4.5, 2.0, 1.2]]), 60e9
     field = known_field(
-        surface=surface, material=surface.material, residual=np.zeros((2, surface.cells)), effects=EDGES, transmitter=ends[0],
+        surface=surface, material=surface.material, residual=np.zeros((2, len(surface.cells))), effects=EDGES, transmitter=ends[0],
         frequency_hz=carrier,
     )  # fmt: skip
     free = field.paths(ends[1]).power.sum()

@@ -50,17 +50,17 @@ def test_planted_gains_come_back(field):
     found_again = []
     for seed in (3, 4, 5):
         rng = np.random.default_rng(seed)
-        smooth = rng.normal(0.0, 0.3, (2, len(field.surface.element_area)))[:, field.surface.cell_element]
+        smooth = rng.normal(0.0, 0.3, (2, len(field.surface.element_area)))[:, field.surface.cells.element]
         shares = planted_shares(field, smooth)
         found = fit_residual(shares, field.surface, noise_db=0.1)
-        assert found.shape == (2, field.surface.cells)
+        assert found.shape == (2, len(field.surface.cells))
         known, gaps = replace(field, residual=found), []
         for receiver, share in zip(RECEIVERS, shares, strict=True):
             image = known.spectrum(receiver).path_gain.ravel() / field.floor
             gaps.append(NEPER * np.log1p(image) - share.observed.target.db)
         assert np.sqrt(np.mean(np.square(gaps))) < 0.1
-        power = sum(np.asarray(s.power.sum(axis=0)).ravel()[: field.surface.cells] for s in shares)
-        element = field.surface.cell_element
+        power = sum(np.asarray(s.power.sum(axis=0)).ravel()[: len(field.surface.cells)] for s in shares)
+        element = field.surface.cells.element
         bright = power > np.quantile(power, 0.75)
         found_again.append(np.corrcoef(found[0][bright], smooth[0][bright])[0, 1])
         # alike elements need no cells of their own
@@ -84,23 +84,24 @@ def test_nothing_seen_is_nothing_learned(field):
     assert np.abs(fit_residual(shares, field.surface)).max() < 1e-4
     surface = field.surface
     shown = np.isin(
-        np.arange(surface.cells), np.unique(surface.cell_element, return_index=True)[1], invert=True
+        np.arange(len(surface.cells)), np.unique(surface.cells.element, return_index=True)[1], invert=True
     )
     # No ceiling, and else all cells but one.
-    middle = surface.mesh.triangles[surface.middles(surface.element)].mean(axis=1)
-    shown &= middle[surface.cell_element][:, 2] < 2.9
+    tiles = surface.tiles
+    middle = tiles.centre[tiles.middles(surface.cells.element[tiles.cell])]
+    shown &= middle[surface.cells.element][:, 2] < 2.9
     hide = sparse.diags_array(np.tile(shown.astype(np.float32), 2))
     twice = planted_shares(field, np.full_like(field.residual, np.log(2.0)))
     doubled = [replace(s, power=s.power @ hide) for s in twice]
     found = fit_residual(doubled, surface)
-    dark = np.bincount(surface.cell_element, shown)[surface.cell_element] == 0
+    dark = np.bincount(surface.cells.element, shown)[surface.cells.element] == 0
     assert dark.any() and np.array_equal(found[:, dark], np.zeros((2, dark.sum())))
     # a cell that nobody saw, of an element that somebody did, has the element's
     assert (found[0][~shown & ~dark] > 0).mean() > 0.8
 
 
 def test_gains_multiply_their_own_light_alone(field):
-    view, cells = field.view(RECEIVERS[0]), field.surface.cells
+    view, cells = field.view(RECEIVERS[0]), len(field.surface.cells)
     bare = field.path_gains(view).tables
     for row, own in enumerate((["S"], ["MS", "E"])):
         gained = replace(field, residual=np.log(2.0) * (np.arange(2) == row)[:, None] * np.ones(cells))

@@ -113,7 +113,7 @@ class BistaticField(RadioField):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        sizes = {"G": self.surface.groups, "L": len(self.parameters.lobes), "X": self.surface.cells}
+        sizes = {"G": self.surface.groups, "L": len(self.parameters.lobes), "X": len(self.surface.cells)}
         check_arrays(vars(self.parameters), PARAMETER_ARRAYS, **sizes)
         check_arrays(vars(self), _ARRAYS, **sizes)
         materials = int(self.material.max()) + 1
@@ -257,7 +257,7 @@ class BistaticField(RadioField):
                 log_through=surface.slabs(ds.frequency_hz)[2],
             ),
             material=surface.material,
-            residual=np.zeros((2, surface.cells)),
+            residual=np.zeros((2, len(surface.cells))),
             sub_pixels=sub_pixels,
             air=ds.air,
             device=device,

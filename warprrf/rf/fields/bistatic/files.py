@@ -10,6 +10,8 @@ import numpy as np
 from warprrf.checks import check_type
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
+from warprrf.rf.tracing.cells import ARRAYS as CELL_ARRAYS
+from warprrf.rf.tracing.cells import Cells
 from warprrf.rf.tracing.model import ARRAYS as PARAMETER_ARRAYS
 from warprrf.rf.tracing.model import Effects, Parameters
 from warprrf.rf.tracing.surface import ARRAYS as SURFACE_ARRAYS
@@ -23,6 +25,7 @@ def taken_apart(parts: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str,
     s, p = parts["surface"], parts["parameters"]
     tensors = {"mesh/vertices": s.mesh.vertices, "mesh/faces": s.mesh.faces}
     tensors |= {f"surface/{name}": np.asarray(getattr(s, name)) for name in SURFACE_ARRAYS}
+    tensors |= {f"cells/{name}": getattr(s.cells, name) for name in CELL_ARRAYS}
     tensors |= {f"parameters/{name}": getattr(p, name) for name in PARAMETER_ARRAYS}
     tensors |= {name: parts[name] for name in ("residual", "material")}
     if parts["errors"] is not None:
@@ -57,6 +60,8 @@ def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict
     parameters |= {name: header[name] for name in _SINGLE}
     held: dict[str, Any] = {"surface/face_object": None, **tensors}  # older files know no objects
     arrays = {name: held[f"surface/{name}"] for name in SURFACE_ARRAYS}
+    cells = _old_cells(tensors) if "surface/cell" in tensors else None  # of files whose faces were split
+    cells = cells or Cells(**{name: tensors[f"cells/{name}"] for name in CELL_ARRAYS})
     return {
         "surface": Surface(
             mesh=Mesh(tensors["mesh/vertices"], tensors["mesh/faces"]),
@@ -64,6 +69,7 @@ def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict
             object_names=tuple(objects),
             position_error_m=header["position_error_m"],
             two_sided=two_sided,
+            cells=cells,
             **arrays,
         ),
         "effects": Effects(**header["effects"]),
@@ -73,3 +79,11 @@ def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict
         "residual": tensors["residual"],
         "errors": ErrorModel(**errors) if errors else None,
     }
+
+
+def _old_cells(tensors: dict[str, np.ndarray]) -> Cells:
+    """Those of files that name the cell and the element of each face."""
+    cell, element = tensors["surface/cell"], tensors["surface/element"]
+    of_cell = np.zeros(int(cell.max(initial=-1)) + 1, np.int32)
+    of_cell[cell] = element
+    return Cells.of_faces(cell, of_cell)

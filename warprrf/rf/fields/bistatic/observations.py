@@ -595,7 +595,7 @@ def _shares(o: Observation) -> tuple[np.ndarray, np.ndarray]:
     """Of each reading before any measurement: the share of line of sight, and the sum of the squared shares of line of sight
     and mirror paths, shape ``(N,)`` each."""
     surface = o.view.tracer.surface
-    none = np.zeros((2, surface.cells))
+    none = np.zeros((2, len(surface.cells)))
     model = Model(SETS["single"], Parameters.prior(surface.groups), none, o.place.transmitter)
     materials = materials_of(o.view.tracer, model.parameters, model.effects)
     single = o.view.records[SPECULAR].powers(materials)[:, None] * o.path

@@ -133,7 +133,7 @@ def needed(effects: Effects, surface: Surface, places: Sequence[Place], device: 
         receivers = np.unique([place.receiver for place in own], axis=0)
         sight = tracer.paths(receivers, replace(SIMPLE, mirrors=0))
         blocked = evenly(np.setdiff1d(np.arange(len(receivers)), sight.receiver), MOST_BLOCKED)
-        p, none = assumed(surface, first.frequency_hz), np.zeros((2, surface.cells))
+        p, none = assumed(surface, first.frequency_hz), np.zeros((2, len(surface.cells)))
         model = Model(SIMPLE, p, none, tracer.transmitter)
         before = total(tracer, receivers[blocked], model, {})
         for name, on in RARE.items():

@@ -53,7 +53,7 @@ def shares_of(o: Observation, model: Model) -> Shares:
     unit = o.floor
     if o.chain != -1:
         unit = o.floor / o.gain(model.parameters, np.maximum(read(gains, o.measured), 0.0) / o.floor)
-    (bins, count), cells = o.measured.bins(view), view.tracer.surface.cells
+    (bins, count), cells = o.measured.bins(view), len(view.tracer.surface.cells)
     # Gains of light sent on are learned under one transmitter alone.
     learned = 1 + np.array_equal(view.tracer.transmitter, model.transmitter)
     rows, columns, powers = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0, np.float32)]
@@ -64,7 +64,7 @@ def shares_of(o: Observation, model: Model) -> Shares:
         k = np.flatnonzero((power > 0) & (bins[records.ray] >= 0))
         ray = records.ray[k]
         rows.append(bins[ray])
-        columns.append(cells * records.residual_row + view.cell[ray])
+        columns.append(cells * records.residual_row + view.cell(ray))
         powers.append((power[k] / unit).astype(np.float32))
     places = np.concatenate(rows), np.concatenate(columns)
     own = csr_matrix((np.concatenate(powers), places), shape=(count, 2 * cells))
@@ -117,8 +117,8 @@ def fit_residual(
 
     # Unknowns have unit variance a priori: elements and cells of single bounces, then of light that is sent on.
     deviations = ((0.5, 0.5), (1.0, 2.0))  # of elements and of cells of each from a gain of 1 [nepers]
-    cell = np.arange(surface.cells)
-    member = csr_matrix((np.ones(len(cell)), (cell, surface.cell_element)))
+    cell = np.arange(len(surface.cells))
+    member = csr_matrix((np.ones(len(cell)), (cell, surface.cells.element)))
     gains = block_diag(
         [hstack([element * member, own * identity(len(cell))]) for element, own in deviations], format="csr"
     )

@@ -82,7 +82,7 @@ class Sensitivity:
         view = self.tracer.view(place, self.model.effects)
         found = path_gains(view, self.model)
         s, count = self.tracer.surface, SHAPE[0] * SHAPE[1]
-        elements, element = len(s.element_area), s.element.take(view.hits.face, mode="wrap")
+        elements = len(s.element_area)
         pixel = np.ravel_multi_index(pixel_of(view.paths.arrival, SHAPE), SHAPE)
         mirror = view.records[SPECULAR].index[:, 0]
         own = mirror >= 0
@@ -91,7 +91,7 @@ class Sensitivity:
         for name, power in found.tables.items():
             ray, gain = found.records[name].ray, found.records[name].residual_row
             if gain >= 0:
-                parts.append((ray, elements * gain + element[ray], power))
+                parts.append((ray, elements * gain + s.cells.element[view.cell(ray)], power))
             elif name != SPECULAR:
                 rest.append((ray, power))  # what mirrors show is taken for known, as line of sight is
         row, unknown, power = (np.concatenate(column) for column in zip(*parts, strict=True))

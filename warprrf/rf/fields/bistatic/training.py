@@ -313,7 +313,7 @@ class Training:
     def model(self, choice: Solution, *, residual: bool = False) -> Model:
         """That of groups, without a residual yet."""
         effects = replace(choice.effects, residual=residual)
-        none = np.zeros((2, self.surface.cells))
+        none = np.zeros((2, len(self.surface.cells)))
         return Model(effects, choice.parameters.take(choice.material), none, self.transmitter)
 
     def refined(self, choice: Solution, places: Iterable[int], steps: int, rounds: int = 1) -> Solution:
