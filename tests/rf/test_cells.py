@@ -13,7 +13,7 @@ import warprrf as wr
 from warprrf import tensor_files
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.tracing.cells import ARRAYS, Cells
-from warprrf.rf.tracing.surface import CELLS_ALONG, Surface
+from warprrf.rf.tracing.surface import Surface
 
 UP = np.array([[0.0, 0.0, 1.0]])
 
@@ -21,7 +21,7 @@ UP = np.array([[0.0, 0.0, 1.0]])
 def cells_of(mesh, width_m, patch=0):
     """Those of ``mesh``, all of one group and one horizontal patch, or of none."""
     one = np.zeros(len(mesh.faces), np.int32)
-    return Cells.of(mesh, one, one + patch, UP, width_m, CELLS_ALONG)
+    return Cells.of(mesh, one, one + patch, UP, 3 * width_m)
 
 
 def places_on(mesh, count, seed=0):
@@ -64,21 +64,21 @@ def test_cells_do_not_depend_on_how_a_floor_is_cut():
     )
     other = Mesh(*subdivide(*subdivide(floor.vertices, np.array([[0, 1, 3], [1, 2, 3]]))))
     face, point = places_on(floor, 3000)
-    one, two = cells_of(floor, 0.25), cells_of(other, 0.25)
+    one, two = cells_of(floor, 0.125), cells_of(other, 0.125)
     a, b = one.at(face, point), two.at(other.closest(point).face, point)
     pairs = np.unique(np.column_stack([a, b]), axis=0)
-    assert len(one) == len(two) == len(pairs) == len(np.unique(a)) == 13 * 10
-    square = np.floor(point[:, :2] / 0.25).astype(int)
+    assert len(one) == len(two) == len(pairs) == len(np.unique(a)) == 25 * 19
+    square = np.floor(point[:, :2] / 0.125).astype(int)
     assert len(np.unique(np.column_stack([square, a[:, None]]), axis=0)) == len(one)
-    assert len(np.unique(one.element)) == 5 * 4
+    assert len(np.unique(one.element)) == 9 * 7
 
 
 def test_a_long_thin_strip_askew_has_cells_along_it_alone():
     along, across = np.array([100.0, 80.0, 0.0]), np.array([-0.004, 0.005, 0.0])
     strip = Mesh(np.array([0 * along, along, along + across, across]), np.array([[0, 1, 2], [0, 2, 3]]))
-    cells = cells_of(strip, 0.2)
-    assert 900 < len(cells) < 1100
-    assert len(cells.cell) < 2200
+    cells = cells_of(strip, 0.1)
+    assert 1800 < len(cells) < 2100
+    assert len(cells.cell) < 4200
     face, point = places_on(strip, 500)
     assert len(np.unique(cells.at(face, point))) > 300
 
@@ -86,7 +86,7 @@ def test_a_long_thin_strip_askew_has_cells_along_it_alone():
 def test_places_beside_a_face_are_of_its_nearest_square():
     """Rounding moves what a ray hits off the face by a little."""
     floor = Mesh(np.array([[0.0, 0, 0], [3, 0, 0], [3, 3, 0]]), np.array([[0, 1, 2]]))
-    cells = cells_of(floor, 0.5)
+    cells = cells_of(floor, 0.15)
     off = np.array([[3.0 + 1e-7, 1.0, 1e-7], [1.2, -1e-7, 0.0], [3.1, 3.1, 0.0]])
     inside = np.array([[2.9, 1.0, 0.0], [1.2, 0.1, 0.0], [2.99, 2.9, 0.0]])
     none = np.zeros(3, int)
@@ -100,9 +100,9 @@ def test_faces_of_no_patch_lie_in_layers():
         np.concatenate([square, square + [0, 0, 0.05], square + [0, 0, 2]]), np.arange(9).reshape(3, 3)
     )
     middle = mesh.triangles.mean(axis=1)
-    low, beside, high = cells_of(mesh, 1.0, patch=-1).at(np.arange(3), middle)
+    low, beside, high = cells_of(mesh, 0.16, patch=-1).at(np.arange(3), middle)
     assert low == beside != high
-    assert len(set(cells_of(mesh, 1.0).at(np.arange(3), middle).tolist())) == 1
+    assert len(set(cells_of(mesh, 0.16).at(np.arange(3), middle).tolist())) == 1
 
 
 def test_some_faces_and_the_rest_are_all(turned):

@@ -17,6 +17,7 @@ from warprrf.checks import LARGEST_M, Expected, check_arrays, index_to, lengths
 from warprrf.geometry.mesh import Mesh
 from warprrf.rows import distinct_rows, sums_of
 
+ELEMENT_M = 0.5  # width of an element in a room; larger scenes have wider ones
 _ACROSS = np.array([[1, 2], [0, 2], [0, 1]])  # the two other axes
 _TOUCHING = 1e-9  # of a square's width: so near its border is not beyond it
 ARRAYS = {
@@ -122,10 +123,14 @@ class Cells:
 
     @classmethod
     def of(
-        cls, mesh: Mesh, group: np.ndarray, patch: np.ndarray, normal: np.ndarray, width_m: float, along: int
+        cls, mesh: Mesh, group: np.ndarray, patch: np.ndarray, normal: np.ndarray, element_m: float
     ) -> Cells:
-        """Those of faces of groups and patches, ``(F,)`` each, the patches' normals being ``normal`` (P, 3): ``width_m`` wide, and
-        elements of ``along`` cells a side."""
+        """Those of faces of groups and patches, ``(F,)`` each, the patches' normals being ``normal`` (P, 3): elements are
+        ``element_m`` wide."""
+        along = (
+            3 if element_m <= ELEMENT_M else 2
+        )  # cells of an element; three a side double the memory of a fit to a town
+        width_m = element_m / along
         own, toward, low = patch >= 0, mesh.face_normals.copy(), mesh.bounds[0]
         toward[own] = normal[patch[own]]
         axis = np.abs(toward).argmax(axis=1).astype(np.int8)

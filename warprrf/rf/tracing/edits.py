@@ -15,7 +15,6 @@ from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh, joined
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.rf.tracing.cells import Cells
 from warprrf.rf.tracing.surface import (
-    CELLS_ALONG,
     Surface,
     element_width,
     largest_groups,
@@ -122,7 +121,7 @@ def _lying_on(s: Surface, mesh: Mesh) -> tuple[Mesh, np.ndarray, np.ndarray]:
     """``mesh`` with those faces cut that lie on several groups of ``s``; the group that each face lies on, -1 for none; and
     the face that it is a piece of."""
     none, count = np.full(len(mesh.faces), -1), len(s.mesh.faces)
-    cells = Cells.of(mesh, none, none, np.zeros((0, 3)), element_width(s.mesh) / CELLS_ALONG, CELLS_ALONG)
+    cells = Cells.of(mesh, none, none, np.zeros((0, 3)), element_width(s.mesh))
     tiles, at = cells.tiles(mesh), _first_at_place(s, mesh)[count:]
     near = s.mesh.closest(tiles.centre)
     along = np.abs((s.mesh.face_normals[near.face] * mesh.face_normals[tiles.face]).sum(axis=1))

@@ -212,10 +212,9 @@ class Model:
         """That of the same surfaces at ``ratio`` times the carrier."""
         return replace(self, parameters=self.parameters.at_ratio(ratio))
 
-    def cell_gains(self, transmitter: np.ndarray) -> np.ndarray:
-        """Gains of cells under ``transmitter`` (3,), times the common gain, shape ``(2, X)``."""
-        known = np.array([[True], [np.array_equal(transmitter, self.transmitter)]]) & self.effects.residual
-        return np.asarray(self.parameters.gain * np.exp(known * self.residual))
+    def learned_rows(self, transmitter: np.ndarray) -> int:
+        """How many rows of the residual are known under ``transmitter`` (3,): gains of light sent on under the own one alone."""
+        return 1 + np.array_equal(transmitter, self.transmitter)
 
 
 class Layout:

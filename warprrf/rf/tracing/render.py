@@ -95,12 +95,12 @@ def path_gains(view: View, model: Model) -> PathGains:
     """What the receivers of ``view`` get under a model of groups, residual and common gain included."""
     t, found = view.tracer, {}
     materials = materials_of(t, model.parameters, model.effects)
-    gains = model.cell_gains(t.transmitter)
+    learned = model.learned_rows(t.transmitter) if model.effects.residual else 0
     tables = view.traced(model.effects)
     for name, records in tables.items():
-        power = records.powers(materials)
-        row = records.residual_row
-        found[name] = power * (gains[row, view.cell(records.ray)] if row >= 0 else model.parameters.gain)
+        found[name] = model.parameters.gain * records.powers(materials)
+        if 0 <= records.residual_row < learned:
+            found[name] *= np.exp(model.residual[records.residual_row, view.cell(records.ray)])
     found[SPECULAR] = np.where(view.kept_paths(model.effects), found[SPECULAR], 0.0)
     return PathGains(view, found, tables, model.parameters)
 

@@ -28,11 +28,9 @@ from warprrf.rf.em.fresnel import SurfaceTable
 from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, is_name_alone, itu_name, itu_permittivity
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.slabs import Walls
-from warprrf.rf.tracing.cells import Cells, Tiles
+from warprrf.rf.tracing.cells import ELEMENT_M, Cells, Tiles
 from warprrf.rf.tracing.groups import SHAPES, Colours, colour_groups, shape_groups
 
-ELEMENT_M = 0.5  # width of an element in a room
-CELLS_ALONG = 3  # cells along an element
 ELEMENTS = 30_000
 """Larger scenes have wider elements, so that there are about so many: light between them takes up to 50 kB each. The
 least width holds up to 7500 m^2 of surfaces (a hall's), the largest of 25 m up to 19 km^2 (a town's)."""
@@ -219,7 +217,7 @@ class Surface:
         parent = np.flatnonzero(patches.once)
         mesh = Mesh(mesh.vertices, mesh.faces[parent])
         group, patch = group[parent].astype(np.int32), patch[parent].astype(np.int32)
-        cells = Cells.of(mesh, group, patch, planes[0], element_m / CELLS_ALONG, CELLS_ALONG)
+        cells = Cells.of(mesh, group, patch, planes[0], element_m)
         return cls(
             mesh=mesh, normal=np.asarray(normal[parent]), patch=patch, plane_normal=planes[0], plane_offset=planes[1],
             group=group, material=alike, appearance=appearance, patch_group=largest_groups(mesh, patch, group, len(planes[1])),

@@ -54,8 +54,7 @@ def shares_of(o: Observation, model: Model) -> Shares:
     if o.chain != -1:
         unit = o.floor / o.gain(model.parameters, np.maximum(read(gains, o.measured), 0.0) / o.floor)
     (bins, count), cells = o.measured.bins(view), len(view.tracer.surface.cells)
-    # Gains of light sent on are learned under one transmitter alone.
-    learned = 1 + np.array_equal(view.tracer.transmitter, model.transmitter)
+    learned = model.learned_rows(view.tracer.transmitter)
     rows, columns, powers = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0, np.float32)]
     for name, power in gains.tables.items():
         records = gains.records[name]
