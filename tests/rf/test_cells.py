@@ -63,7 +63,7 @@ def test_cells_do_not_depend_on_how_a_floor_is_cut():
         np.array([[0.0, 0, 0], [3.1, 0, 0], [3.1, 2.3, 0], [0, 2.3, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
     )
     other = Mesh(*subdivide(*subdivide(floor.vertices, np.array([[0, 1, 3], [1, 2, 3]]))))
-    face, point = places_on(floor, 3000)
+    face, point = places_on(floor, 10_000)
     one, two = cells_of(floor, 0.125), cells_of(other, 0.125)
     a, b = one.at(face, point), two.at(other.closest(point).face, point)
     pairs = np.unique(np.column_stack([a, b]), axis=0)

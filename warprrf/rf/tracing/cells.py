@@ -127,9 +127,8 @@ class Cells:
     ) -> Cells:
         """Those of faces of groups and patches, ``(F,)`` each, the patches' normals being ``normal`` (P, 3): elements are
         ``element_m`` wide."""
-        along = (
-            3 if element_m <= ELEMENT_M else 2
-        )  # cells of an element; three a side double the memory of a fit to a town
+        # Cells of an element's side: three double the memory of a fit to a town.
+        along = 3 if element_m <= ELEMENT_M else 2
         width_m = element_m / along
         own, toward, low = patch >= 0, mesh.face_normals.copy(), mesh.bounds[0]
         toward[own] = normal[patch[own]]
