@@ -367,7 +367,9 @@ def _match(colmap: ModuleType, folder: Path, names: list[str], seed: int, attemp
         chosen = list(itertools.combinations(names, 2))
         if len(chosen) > MAX_EXHAUSTIVE_PAIRS:
             chosen = _promising_pairs(database, names, attempt.progress)
-    matching = colmap.FeatureMatchingOptions(use_gpu=False)
+    # 1: pycolmap is built with an OpenBLAS that does not lock its buffers. Two threads that match at once may take the same one
+    # and spoil each other's distances; a few pairs then get other matches, in one run of many.
+    matching = colmap.FeatureMatchingOptions(use_gpu=False, num_threads=1)
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     match_batch = 400
