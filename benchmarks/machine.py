@@ -40,7 +40,7 @@ VERSIONS = {
     "metrics": 1,
     "exact": 2,
     "sionna": 1,
-    "bistatic": 6,
+    "bistatic": 7,
     "harmonic": 1,
     "lookups": 1,
     "networks": 1,
