@@ -66,13 +66,17 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("photos")
     for name in VIEWS:
         photo = Image.open(LOBBY / "photos" / name)
-        photo.resize((photo.width // 2, photo.height // 2), Image.Resampling.LANCZOS).save(folder / name, quality=95)
+        photo.resize((photo.width // 2, photo.height // 2), Image.Resampling.LANCZOS).save(
+            folder / name, quality=95
+        )
 
     def make(workspace, photos=VIEWS, **options):
         told = []
         given = {"known_positions": surveyed(), "held_out": VIEWS[4:5], "config": SMALL, "device": "cpu"}
         photos = [folder / n for n in photos]
-        rec = reconstruct(photos, workspace=workspace, progress=lambda *row: told.append(row), **given | options)
+        rec = reconstruct(
+            photos, workspace=workspace, progress=lambda *row: told.append(row), **given | options
+        )
         return rec, told
 
     return make
@@ -125,7 +129,9 @@ def test_a_killed_run_continues_to_the_same_result(whole, made, monkeypatch):
     np.testing.assert_array_equal(resumed.mesh.vertices, rec.mesh.vertices)
 
 
-def test_a_workspace_that_was_moved_is_continued_though_its_folder_is_named(whole, made, tmp_path, monkeypatch):
+def test_a_workspace_that_was_moved_is_continued_though_its_folder_is_named(
+    whole, made, tmp_path, monkeypatch
+):
     moved, posed = tmp_path / "moved", from_photos.sfm.structure_from_motion
     shutil.copytree(whole[0], moved)
 
