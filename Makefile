@@ -25,8 +25,9 @@ BIN := $(abspath $(VENV))/bin
 RUN := $(BIN)/python
 # Python compiles what is imported when it is: a small part of what is installed.
 INSTALL := $(RUN) -m pip install -q --no-compile
-# Two workers have a core each: threads of BLAS would wait for one another.
-PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(RUN) -m pytest -n 2 --dist loadfile
+# Two workers have a core each: threads of BLAS would wait for one another. A worker takes a whole file, the longest first
+# (tests/conftest.py), so that both end together.
+PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(RUN) -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 ARGS ?=
 
 # Compiled kernels are kept in the checkout, so that they survive from one command to the next.
@@ -34,6 +35,8 @@ export WARP_CACHE_PATH ?= $(CURDIR)/.cache/warp
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PYTHONHASHSEED ?= 0
 export PYTHON
+# What is imported is compiled once: where a container says otherwise, each of a hundred processes would do it again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help lobby test long quick lint docs gpu data notebooks clean setup setup-test
 

@@ -1,5 +1,7 @@
 """Fixtures of more than one folder."""
 
+import fcntl
+import os
 import sys
 from contextlib import contextmanager, nullcontext
 from functools import partialmethod
@@ -16,6 +18,22 @@ HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "helpers"), str(HERE), str(HERE.parent)]
 
 from second_device import second_device
+
+LONGEST = (
+    "viewer/test_viewer.py", "fuzz/test_fuzz.py", "test_concurrency.py", "test_cluster.py", "test_notebooks.py",
+    "geometry/test_reconstruction.py", "geometry/photos/surface/test_completion.py", "rf/fields/bistatic/test_locate.py",
+    "rf/test_against_mitsuba.py", "rf/relevance/test_relevance.py", "test_office.py", "rf/interop/test_sionna_engine.py",
+    "rf/fields/test_batches.py", "rf/fields/bistatic/test_shapes.py", "test_verbs_on_cuda.py", "test_output.py",
+    "test_cuda_kernels.py", "test_package.py", "benchmarks/test_baselines.py", "rf/fields/bistatic/test_field.py",
+    "rf/fields/bistatic/test_readings.py", "geometry/photos/posed/test_sfm.py", "benchmarks/test_evaluation.py",
+    "benchmarks/test_filmed.py", "benchmarks/test_pipeline.py", "test_invariances.py", "benchmarks/test_fits.py",
+)  # fmt: skip
+"""Files of twenty seconds and more. Workers take whole files, these first, so that none is left alone with one at the end."""
+
+
+def pytest_collection_modifyitems(items):
+    place = {HERE / name: k for k, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path, len(LONGEST)))
 
 
 def pytest_addoption(parser):
@@ -90,7 +108,11 @@ def lobby_scene():
 
 @pytest.fixture(scope="session")
 def place(tmp_path_factory):
-    """A small room, and files of all kinds that the library makes of it."""
+    """A small room, and files of all kinds that the library makes of it: one for all workers, which only read it."""
     from fuzz.place import Place
 
-    return Place(tmp_path_factory.mktemp("fuzz") / "place").make()
+    folder = tmp_path_factory.getbasetemp()
+    folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+    with (folder / "place.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # one makes it, the other waits
+        return Place(folder / "place").make()

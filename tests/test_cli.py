@@ -10,6 +10,7 @@ import pytest
 from golden import make
 from places import ROOT
 from rays_by_definition import gaussians
+from small_room import small_room
 
 import warprrf as wr
 from warprrf import cli
@@ -306,12 +307,13 @@ def test_help_of_fit_names_every_option_of_its_models(capsys):
 
 
 def test_the_walk_through_is_what_the_library_gives_for_the_same_files(tmp_path):
+    small_room(tmp_path)
     for words in (
-        "sample {scene} -o {tmp}/r.csv -n 16 --height 1 2",
-        "simulate {scene} -o {tmp}/s.nc --receivers {tmp}/r.csv --transmitter 3.2 2.6 3.2 --shape 16 32",
-        "fit {scene} {tmp}/s.nc -o {tmp}/f.safetensors --train 10 --quick",
+        "sample {tmp}/scene.xml -o {tmp}/r.csv -n 16 --height 1 2",
+        "simulate {tmp}/scene.xml -o {tmp}/s.nc --receivers {tmp}/r.csv --transmitter 0.8 0.9 2.2 --shape 16 32",
+        "fit {tmp}/scene.xml {tmp}/s.nc -o {tmp}/f.safetensors --train 10 --quick",
         "evaluate {tmp}/f.safetensors {tmp}/s.nc -o {tmp}/figures.json",
-        "map {tmp}/f.safetensors -o {tmp}/m.nc --cell 4 --bounds 1 1 13 9 --power-dbm 7",
+        "map {tmp}/f.safetensors -o {tmp}/m.nc --cell 1.5 --bounds 0.2 0.2 4.7 3.2 --power-dbm 7",
     ):
         run(words, tmp_path)
     figures = json.loads((tmp_path / "figures.json").read_text())
@@ -326,6 +328,6 @@ def test_the_walk_through_is_what_the_library_gives_for_the_same_files(tmp_path)
     nearest = wr.evaluate(test, wr.lookups.nearest(train))["psnr_db"]
     assert figures["nearest"]["psnr_db"] == pytest.approx(nearest, rel=1e-9)
     assert figures["bistatic"]["psnr_db"] > nearest > figures["constant"]["psnr_db"]
-    found, expected = RadioMap.load(tmp_path / "m.nc"), field.radio_map(1.5, 4, bounds=[1, 1, 13, 9])
+    found, expected = RadioMap.load(tmp_path / "m.nc"), field.radio_map(1.5, 1.5, bounds=[0.2, 0.2, 4.7, 3.2])
     np.testing.assert_allclose(found.total_path_gain, expected.total_path_gain, rtol=1e-6)
     np.testing.assert_allclose(found.best_beam_snr_db, expected.best_beam_snr_db - 13.0, atol=1e-6)

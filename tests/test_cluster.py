@@ -46,7 +46,7 @@ def test_every_verb_gives_the_bits_of_one_process(client, tmp_path):
     for verb in (
         partial(wr.simulate, scene, receivers=PLACES[:3], **how), partial(field.spectra, PLACES),
         partial(field.paths, PLACES), partial(field.cfr, PLACES, F, **link),
-        partial(field.radio_map, 1.2, 0.5), lambda client=None: seen(scene, ds, client=client),
+        partial(field.radio_map, 1.2, 1.0), lambda client=None: seen(scene, ds, client=client),
     ):  # fmt: skip
         same(verb(client=client), verb())
     workspace = {"receivers": PLACES[:3], "workspace": tmp_path, **how}

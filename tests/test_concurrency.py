@@ -56,8 +56,8 @@ def at_once(*uses):
 
 
 def asked(field):
-    paths = field.paths(RX)
-    return [*(field.spectrum(rx).path_gain for rx in RX), paths.gain, paths.tau]
+    paths = field.paths(RX[:2])
+    return [*(field.spectrum(rx).path_gain for rx in RX[:2]), paths.gain, paths.tau]
 
 
 def refused(field):
@@ -138,7 +138,7 @@ def fitted():
 
 def saved():
     field = wr.RadioField.load(FILE)
-    for k in range(5):
+    for k in range(3):
         field.save(FOLDER + "/again.safetensors")
         same(asked(wr.RadioField.load(FOLDER + "/again.safetensors"))[:1], asked(field)[:1])
     return 1.0

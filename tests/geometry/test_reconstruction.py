@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fuzz.answers import differs, leaves
+from PIL import Image
 from places import LOBBY
 from radio_scenes import box_mesh
 from scipy.spatial.transform import Rotation
@@ -35,6 +36,7 @@ SMALL = ReconstructionConfig(
     gaussians=2500,
     refine=RefineConfig(iterations=12, downscale=4, max_gaussians=3000, checkpoint_every=4),
     surface=SurfaceConfig(depth_pixels=20_000, voxel_m=0.1),
+    completion=False,
 )
 
 
@@ -58,13 +60,26 @@ def test_cells_that_no_photo_sees_get_no_discs():
     assert front.occupied.any() and not back.occupied.any()
 
 
-def made(workspace, photos=VIEWS, **options):
-    """A reconstruction of photos of the lobby, and what its progress told."""
-    told = []
-    given = {"known_positions": surveyed(), "held_out": VIEWS[4:5], "config": SMALL, "device": "cpu"}
-    photos = [LOBBY / "photos" / n for n in photos]
-    rec = reconstruct(photos, workspace=workspace, progress=lambda *row: told.append(row), **given | options)
-    return rec, told
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Makes a reconstruction of photos of the lobby at half their size; returns it with what its progress told."""
+    folder = tmp_path_factory.mktemp("photos")
+    for name in VIEWS:
+        photo = Image.open(LOBBY / "photos" / name)
+        photo.resize((photo.width // 2, photo.height // 2), Image.Resampling.LANCZOS).save(
+            folder / name, quality=95
+        )
+
+    def make(workspace, photos=VIEWS, **options):
+        told = []
+        given = {"known_positions": surveyed(), "held_out": VIEWS[4:5], "config": SMALL, "device": "cpu"}
+        photos = [folder / n for n in photos]
+        rec = reconstruct(
+            photos, workspace=workspace, progress=lambda *row: told.append(row), **given | options
+        )
+        return rec, told
+
+    return make
 
 
 def steps(told):
@@ -72,7 +87,7 @@ def steps(told):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+def whole(made, tmp_path_factory):
     workspace = tmp_path_factory.mktemp("whole")
     rec, told = made(workspace)
     posed = ["features", "matching", "mapping", "undistorting"]
@@ -95,7 +110,7 @@ def test_ten_photos_become_gaussians_mesh_and_patches(whole, lobby_scene):
         assert np.median(np.abs(corners @ rec.patches.normal[k] - rec.patches.offset[k])) < 1e-6
 
 
-def test_a_killed_run_continues_to_the_same_result(whole, monkeypatch):
+def test_a_killed_run_continues_to_the_same_result(whole, made, monkeypatch):
     workspace, rec = whole
     for name in ("refined", "depth", "surface"):
         (workspace / f"{name}.safetensors").unlink()
@@ -114,7 +129,9 @@ def test_a_killed_run_continues_to_the_same_result(whole, monkeypatch):
     np.testing.assert_array_equal(resumed.mesh.vertices, rec.mesh.vertices)
 
 
-def test_a_workspace_that_was_moved_is_continued_though_its_folder_is_named(whole, tmp_path, monkeypatch):
+def test_a_workspace_that_was_moved_is_continued_though_its_folder_is_named(
+    whole, made, tmp_path, monkeypatch
+):
     moved, posed = tmp_path / "moved", from_photos.sfm.structure_from_motion
     shutil.copytree(whole[0], moved)
 
@@ -129,15 +146,19 @@ def test_a_workspace_that_was_moved_is_continued_though_its_folder_is_named(whol
     assert steps(told) == set() and rec.causes == {"far.jpg": f"poses={moved}/sfm/model-2 gives that"}
 
 
-def test_a_changed_setting_is_not_served_from_the_old_run(whole):
-    assert steps(made(whole[0], config=replace(SMALL, completion=False))[1]) == {"surface"}
-    less = replace(SMALL, stereo=False, completion=False)
+def test_a_changed_setting_is_not_served_from_the_old_run(whole, made, lobby_scene):
+    completed, told = made(whole[0], config=replace(SMALL, completion=True))
+    assert steps(told) == {"surface"}
+    centres = completed.mesh.triangles.mean(axis=1)
+    assert np.median(lobby_scene.mesh.distance(centres)) < 0.03
+    assert completed.patches.area.sum() > 0.5 * completed.mesh.areas.sum()
+    less = replace(SMALL, stereo=False)
     other, told = made(whole[0], held_out=VIEWS[4:6], iterations=2, config=less)
     assert steps(told) == {"planes", "refine", "depth", "surface"}  # the photos' poses stay
     assert other.held_out == tuple(VIEWS[4:6])
 
 
-def test_bad_names_are_refused_before_any_work(tmp_path):
+def test_bad_names_are_refused_before_any_work(made, tmp_path):
     for told, wrong in (
         (r"held_out: no such photo: nobody\.jpg", {"held_out": ["nobody.jpg"]}),
         ("got both", {"scale": (VIEWS[0], VIEWS[1], 1.0)}),

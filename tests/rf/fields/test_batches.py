@@ -66,7 +66,7 @@ def answers(field, folder=None, **how):
 @pytest.mark.parametrize("model", MODELS)
 def test_a_row_is_what_its_link_gets_alone_without_a_receiver_axis(model, tmp_path):
     field, other = fitted(model), TX if model == "rf3dgs" else OTHER  # which knows its own transmitter alone
-    own, stored = np.array([TX, other, TX, other, other, TX]), {}
+    places, own, stored = PLACES[:4], np.array([TX, other, TX, other]), {}
     verbs: dict[str, Any] = {
         "spectrum": lambda *at: field.spectrum(*at).path_gain, "links": lambda *at: field.links(*at).total_path_gain,
         "array": lambda *at: field.array_spectrum(at[0], wr.PlanarArray(2, 2), [[1.0, 0, 0]], at[1]),
@@ -78,7 +78,7 @@ def test_a_row_is_what_its_link_gets_alone_without_a_receiver_axis(model, tmp_pa
     for name, ask in verbs.items():
         if name == "array" and model != "bistatic":
             continue
-        rows, alone, shared = ask(PLACES, own), ask(PLACES[1], other), ask(PLACES[1], own)
+        rows, alone, shared = ask(places, own), ask(PLACES[1], other), ask(PLACES[1], own)
         for row in (rows[1], shared[1], shared[3]):  # those of paths are padded
             row = row[: len(alone)] if alone.ndim else row
             np.testing.assert_allclose(row, alone, rtol=1e-5, atol=1e-6 * np.abs(alone).max(), err_msg=name)
@@ -89,14 +89,14 @@ def test_a_row_is_what_its_link_gets_alone_without_a_receiver_axis(model, tmp_pa
     np.testing.assert_allclose(
         stored["spectra"], stored["spectrum"], rtol=1e-6, atol=1e-6 * stored["spectrum"].max()
     )
-    assert (field.paths(PLACES, own, 5).transmitter == own).all()
-    for cfr, *link in zip(stored["cfr"], PLACES, own, strict=True):
+    assert (field.paths(places, own, 5).transmitter == own).all()
+    for cfr, *link in zip(stored["cfr"], places, own, strict=True):
         np.testing.assert_allclose(
             cfr, field.paths(*link).cfr(F, **ARRAYS), rtol=1e-5, atol=1e-6 * np.abs(cfr).max()
         )
     assert cfr.dtype == np.complex64 and cfr.shape == (3, 2, 5)
     with pytest.raises(ValueError, match=r"transmitter: got shape \(2, 3\)"):
-        field.spectra(PLACES, own[:2])
+        field.spectra(places, own[:2])
     with pytest.raises(ValueError, match=r"receivers\[1\].*outside"):
         field.spectra([PLACES[0], PLACES[0] + 50.0])
 
