@@ -67,12 +67,13 @@ class Tiles:
         share /= share.sum(axis=1, keepdims=True)
         return np.einsum("tk,tki->ti", share, self.fan.triangles.mean(axis=1).reshape(-1, 5, 3))
 
-    def middles(self, piece: np.ndarray) -> np.ndarray:
-        """Of each piece of the surface, ``piece`` (T,) of each tile, the tile nearest to its middle."""
+    def middles(self, piece: np.ndarray, preferred: np.ndarray | None = None) -> np.ndarray:
+        """Of each piece of the surface, ``piece`` (T,) of each tile, the tile nearest to its middle; one of those ``preferred``
+        (T,), if it has any."""
         whole = np.maximum(np.bincount(piece, self.area), 1e-12)
         middle = sums_of(self.area[:, None] * self.centre, piece) / whole[:, None]
         gap = np.linalg.norm(self.centre - middle[piece], axis=1)
-        order = np.lexsort((gap, piece))
+        order = np.lexsort((gap, np.zeros(len(gap), bool) if preferred is None else ~preferred, piece))
         return order[np.searchsorted(piece[order], np.arange(len(whole)))]
 
 
@@ -153,12 +154,16 @@ class Cells:
 
     def at(self, face: np.ndarray, point: np.ndarray) -> np.ndarray:
         """Cell of each ``point`` (N, 3) on ``face`` (N,), shape ``(N,)``."""
+        return self.cell[self.square_at(face, point)]
+
+    def square_at(self, face: np.ndarray, point: np.ndarray) -> np.ndarray:
+        """Square, and so tile, of each ``point`` (N, 3) on ``face`` (N,), shape ``(N,)``."""
         u, v = np.take_along_axis(point, _ACROSS[self.axis[face]], axis=1).T
         width_m = self.width_m[face]
         row = np.clip((u - self.first_row_m[face]) / width_m, 0, self.rows[face] - 1).astype(np.int64)
         row += self._row[face]
         square = np.clip((v - self.first_square_m[row]) / width_m, 0, self.squares[row] - 1).astype(np.int64)
-        return self.cell[self._square[row] + square]
+        return np.asarray(self._square[row] + square)
 
     def tiles(self, mesh: Mesh) -> Tiles:
         """What lies of the faces of ``mesh``, whose cells they are, in each square."""

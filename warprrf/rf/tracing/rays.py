@@ -17,6 +17,7 @@ from warprrf import device as _device
 from warprrf.cache import cached_property
 from warprrf.device import DeviceLike
 from warprrf.geometry import rays as mesh_rays
+from warprrf.geometry.mesh import vectors_across
 from warprrf.kernels.radio import illumination
 from warprrf.rf.spectra.spectrum import sub_pixel_directions
 from warprrf.rf.tracing.surface import Surface
@@ -82,6 +83,13 @@ class Light:
         return np.flatnonzero(bright)
 
 
+def sequence(count: int, each: int) -> np.ndarray:
+    """Numbers that fill the unit cube, ``each`` for each of ``count``, shape ``(3, count, each)``."""
+    steps = np.multiply.outer([0.8191725133961645, 0.6710436067037893, 0.5497004779019703], np.arange(each))
+    shift = np.random.default_rng(0).random((3, count, 1))
+    return np.mod(steps[:, None] + shift, 1.0)  # the R3 sequence (Roberts 2018), shifted
+
+
 class RayGrid:
     """Rays that fill the sphere around a receiver, and other rays, on one surface.
 
@@ -145,6 +153,24 @@ class RayGrid:
             origins, directions, np.asarray(solid_angle, self.dtype), np.asarray(hit.face, np.int32),
             np.maximum(hit.t, least_m, out=hit.t),
         )  # fmt: skip
+
+    def hit_from(self, tile: np.ndarray, point: np.ndarray, u: np.ndarray, v: np.ndarray) -> Hits:
+        """What rays hit that start at places (N, 3) on sides of tiles (N,), each with a direction of its own: their density is
+        proportional to the cosine where ``u`` and ``v`` (N,) fill the unit square."""
+        s = self.surface
+        behind, tile = np.divmod(tile, len(s.tiles.face))
+        normal = s.side_normal[s.tiles.face[tile]] * (1.0 - 2.0 * behind)[:, None]
+        radius, turn = np.sqrt(u), 2.0 * np.pi * v
+        across, over = vectors_across(normal)
+        directions = (radius * np.cos(turn))[:, None] * across + (radius * np.sin(turn))[:, None] * over
+        directions += np.sqrt(1.0 - u)[:, None] * normal
+        return self.hit_along(point + s.position_error_m * normal, directions, np.ones(len(tile)))
+
+    def tiles_met(self, hits: Hits) -> tuple[np.ndarray, np.ndarray]:
+        """Which rays hit something, and the sides of tiles that they do."""
+        s, ray = self.surface, np.flatnonzero(hits.face >= 0)
+        tile = s.cells.square_at(hits.face[ray], hits.points(ray))
+        return ray, tile + s.is_behind(hits.face[ray], hits.rays(ray)[1]) * len(s.tiles.face)
 
     def _backend(self, count: int) -> str:
         """Embree is worth being loaded for a grid of rays, whether it is in use yet or not."""

@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from warprrf.geometry.mesh import vectors_across
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.tracing.model import Effects, Model, Parameters
-from warprrf.rf.tracing.rays import Hits
+from warprrf.rf.tracing.rays import sequence
 from warprrf.rf.tracing.records import Materials, Records
 from warprrf.rf.tracing.tracer import SPECULAR, Rays, Tracer, View
 
@@ -132,44 +131,36 @@ class Interreflection:
         lit: what the rays of sides see of first scatterings, by sequence: of surfaces that the transmitter lights, ``"S"``, of
             those that it lights through slabs, ``"TS"``, and of lit ones that are seen through slabs, ``"ST"``. Records whose
             ray is the side, of irradiance where the transmitter gives cos(theta_i) / d1^2 [1/m^2].
-        between: irradiance of sides (rows) by radiance of sides (columns), shape ``(E, E)``: those of first sides, and of
-            second ones that light can reach; solids' inner ones are left dark.
+        between: irradiance of sides (rows) by radiance of sides (columns), shape ``(E, E)``: of what light can reach of them;
+            solids' inner ones are left dark.
+        open_share: of each side's area what light can reach, shape ``(E,)``.
     """
 
     def __init__(self, tracer: Tracer, most: int) -> None:
-        surface, grid = tracer.surface, tracer.grid
-        tiles, element = surface.tiles, surface.cells.element
-        middle = tiles.middles(element[tiles.cell])
-        point, normal = tiles.centre[middle], surface.side_normal[tiles.face[middle]]
-        known = np.arange(len(point))
-        if surface.two_sided:
-            point, normal = np.tile(point, (2, 1)), np.concatenate([normal, -normal])
-            known = np.union1d(known, _sides_met(tracer, grid.hit(tracer.transmitter))[1])
-        lift_m = 0.02  # rays start so far off the surface
-        shift = np.random.default_rng(0).random((2, len(surface.element_area)))
+        surface, grid, sides = tracer.surface, tracer.grid, tracer.surface.element_sides
+        point = tracer.reached(most)
+        tile = np.flatnonzero(~np.isnan(point[:, 0]))
+        side, area = surface.tile_side[tile], np.tile(surface.tiles.area, 1 + surface.two_sided)[tile]
+        open_m2 = np.bincount(side, area, sides)
+        self.open_share = open_m2 / np.tile(surface.element_area, 1 + surface.two_sided)
+        # Rays start everywhere on what is open of a side, strata of its area in their order.
+        order, known = np.argsort(side, kind="stable"), np.flatnonzero(open_m2)
+        upto = np.cumsum(area[order])
+        place, *turn = sequence(len(known), ELEMENT_RAYS)
+        below = (np.cumsum(open_m2) - open_m2)[known, None] + place * open_m2[known, None]
+        first, last = (np.searchsorted(side[order], known, end)[:, None] for end in ("left", "right"))
+        chosen = np.clip(np.searchsorted(upto, below), first, last - 1)
+        start = tile[order[chosen]].ravel()
+        hits = grid.hit_from(start, point[start], *(x.ravel() for x in turn))
+        rays = Rays(hits, np.repeat(known, ELEMENT_RAYS))
+        self.lit = tracer.lit(rays, most)
+        if most:
+            self.lit["ST"] = tracer.lit(tracer.behind(rays, most), 0)["S"]
         scale = np.float32(np.pi / ELEMENT_RAYS * (4.0 * np.pi / tracer.wavelength_m) ** 2)
-        tables: dict[str, list[Records]] = {}
-        rows, columns, values, new = [], [], [], known
-        while len(new):
-            directions = _hemispheres(normal[new], shift[:, new % shift.shape[1]])
-            hits = grid.hit_along(point[new] + lift_m * normal[new], directions, np.ones(len(directions)))
-            side, (hit, met) = np.repeat(new, ELEMENT_RAYS), _sides_met(tracer, hits)
-            rays = Rays(hits, side)
-            lit = tracer.lit(rays, most)
-            if most:
-                lit["ST"] = tracer.lit(tracer.behind(rays, most), 0)["S"]
-            for name, found in lit.items():
-                tables.setdefault(name, []).append(replace(found, power=scale * found.power))
-            rows.append(side[hit])
-            columns.append(met)
-            values.append(
-                np.pi / ELEMENT_RAYS * np.broadcast_to(grid.transmittance(hits.range_m[hit]), len(hit))
-            )
-            new = np.setdiff1d(met, known)
-            known = np.union1d(known, new)
-        self.lit = {name: Records.joined(parts) for name, parts in tables.items()}
-        pairs = tuple(map(np.concatenate, (rows, columns)))
-        self.between = csr_matrix((np.concatenate(values), pairs), shape=(surface.element_sides,) * 2)
+        self.lit = {name: replace(found, power=scale * found.power) for name, found in self.lit.items()}
+        hit, met = grid.tiles_met(hits)
+        left = np.pi / ELEMENT_RAYS * np.broadcast_to(grid.transmittance(hits.range_m[hit]), len(hit))
+        self.between = csr_matrix((left, (rays.ray[hit], surface.tile_side[met])), shape=(sides, sides))
 
 
 def irradiance(tracer: Tracer, p: Parameters, effects: Effects) -> np.ndarray | None:
@@ -185,27 +176,9 @@ def irradiance(tracer: Tracer, p: Parameters, effects: Effects) -> np.ndarray | 
     got = sum(np.bincount(r.ray, r.powers(materials), minlength=sides) for r in tables)
     if effects.mirror_scatter:
         for onto in (tracer.mirrored(slabs).onto for slabs in {0, most}):
-            got = got + light.between @ (
-                share * np.bincount(onto.ray, onto.powers(materials), minlength=sides)
-            )
+            lit = np.bincount(onto.ray, onto.powers(materials), minlength=sides)
+            got = got + light.between @ (share * lit / np.maximum(light.open_share, 1e-9))
     first = got
     for _ in range(2, effects.scatterings):
         got = first + light.between @ (share * got)
     return np.asarray(got)
-
-
-def _sides_met(tracer: Tracer, hits: Hits) -> tuple[np.ndarray, np.ndarray]:
-    """Which rays hit something, and the sides of elements that they do."""
-    ray = np.flatnonzero(hits.face >= 0)
-    return ray, tracer.surface.side_met(tracer.cell(hits, ray), hits.face[ray], hits.rays(ray)[1])
-
-
-def _hemispheres(normal: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """``ELEMENT_RAYS`` directions for each normal (T, 3), density proportional to the cosine, shape ``(T * ELEMENT_RAYS, 3)``."""
-    k = np.arange(ELEMENT_RAYS)
-    u = np.mod(k * 0.7548776662466927 + shift[0, :, None], 1.0)  # R2 sequence (Roberts 2018), shifted
-    v = np.mod(k * 0.5698402909980532 + shift[1, :, None], 1.0)
-    radius, turn = np.sqrt(u), 2.0 * np.pi * v
-    a, b = vectors_across(normal)
-    local = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.sqrt(1.0 - u)], axis=2)
-    return (local @ np.stack([a, b, normal], axis=1)).reshape(-1, 3)

@@ -153,11 +153,20 @@ class Surface:
     def side_met(self, cell: np.ndarray, face: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Side of an element that a ray of ``direction`` (N, 3) meets at ``cell`` and ``face``, (N,) each: second sides stand after
         all the first ones, shape ``(N,)``."""
-        element = self.cells.element[cell]
+        return self.cells.element[cell] + self.is_behind(face, direction) * len(self.element_area)
+
+    def is_behind(self, face: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Whether rays of ``direction`` (N, 3) meet the second side of ``face`` (N,), shape ``(N,)`` bool."""
         if not self.two_sided:
-            return element
-        behind = np.einsum("ni,ni->n", self.side_normal[face], direction) > 0
-        return element + behind * len(self.element_area)
+            return np.zeros(len(face), bool)
+        return np.asarray(np.einsum("ni,ni->n", self.side_normal[face], direction) > 0)
+
+    @cached_property
+    def tile_side(self) -> np.ndarray:
+        """Side of an element that each side of a tile is of: first sides, then second ones, shape ``((1 + two_sided) T,)``."""
+        element = self.cells.element[self.cells.cell]
+        sides = range(1 + self.two_sided)
+        return np.concatenate([element + side * len(self.element_area) for side in sides])
 
     @property
     def groups(self) -> int:

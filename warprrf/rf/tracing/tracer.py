@@ -32,7 +32,7 @@ from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.paths.slabs import Slabs, Walls
 from warprrf.rf.spectra.spectrum import unit_beams
 from warprrf.rf.tracing.model import Effects
-from warprrf.rf.tracing.rays import NEAREST_M, Hits, RayGrid
+from warprrf.rf.tracing.rays import NEAREST_M, Hits, RayGrid, sequence
 from warprrf.rf.tracing.records import Interactions, Records
 from warprrf.rf.tracing.surface import Surface
 
@@ -445,6 +445,41 @@ class Tracer:
         found = Hits(origins[row], directions[row], solid_angle[row], face.astype(np.int32), range_m)
         return Rays(found, rays.ray[ray[row]], after)
 
+    def reached(self, most: int) -> np.ndarray:
+        """Where light from the transmitter reaches each side of a tile, over any number of bounces [m]: first sides, then second
+        ones, shape ``((1 + two_sided) T, 3)``; NaN where it does not. With ``most`` also through so many slabs between two
+        bounces, to sides of elements that it reaches no tile of in the air."""
+        return self.kept.get(("reached", most), lambda: self.of_transmitter._reached(most))
+
+    def _reached(self, most: int) -> np.ndarray:
+        s, few = self.surface, 4  # rays of each tile
+        point, hits = np.full((len(s.tile_side), 3), np.nan), self.grid.hit(self.transmitter)
+        while True:
+            found = [hits]
+            if most:
+                found.append(self.behind(Rays(hits, np.arange(len(hits.face))), most).hits)
+            met = [self.grid.tiles_met(one) for one in found]
+            place = np.concatenate([one.points(ray) for one, (ray, _) in zip(found, met, strict=True)])
+            tile = np.concatenate([own for _, own in met])
+            # Of what is met for the first time the place nearest to a tile's middle.
+            first = np.lexsort(
+                (np.linalg.norm(place - s.tiles.centre[tile % len(s.tiles.face)], axis=1), tile)
+            )
+            first = first[np.unique(tile[first], return_index=True)[1]]
+            first = first[np.isnan(point[tile[first], 0])]
+            if len(first) == 0:
+                break
+            point[tile[first]] = place[first]
+            again = np.repeat(first, few)
+            hits = self.grid.hit_from(
+                tile[again], place[again], *sequence(len(first), few)[1:].reshape(2, -1)
+            )
+        if most:
+            air = self.reached(0)
+            own = np.isin(s.tile_side, s.tile_side[~np.isnan(air[:, 0])])
+            point[own] = air[own]
+        return point
+
     def turned(self, rays: Rays) -> Rays:
         """``rays`` turned at the mirrors that they hit, and what they hit there."""
         s, grid, hits = self.surface, self.grid, rays.hits
@@ -500,8 +535,13 @@ class MirroredLight:
         largest, tiles = np.abs(s.front_normal).argmax(axis=1), s.tiles
         self._way = 2 * largest + (np.take_along_axis(s.front_normal, largest[:, None], axis=1)[:, 0] < 0)
         self._pieces, own = np.unique(6 * tiles.cell + self._way[tiles.face], return_inverse=True)
-        tile, area = tiles.middles(own), np.bincount(own, tiles.area)
-        centre, middle = tiles.centre[tile], tiles.face[tile]
+        # A tile that lies in part under something is asked about where it is open.
+        sides = tracer.reached(0).reshape(-1, len(own), 3)
+        place = np.where(np.isnan(sides[0]), sides[-1], sides[0])
+        open_ = ~np.isnan(place[:, 0])
+        place[~open_] = tiles.centre[~open_]
+        tile, area = tiles.middles(own, open_), np.bincount(own, tiles.area)
+        centre, middle = place[tile], tiles.face[tile]
         ways = tracer.images.candidates(centre, 1)
         # Light must come from in front of the piece, of either side if it has two, and not from its own patch.
         face = middle[ways.row]

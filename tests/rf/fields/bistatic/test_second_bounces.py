@@ -19,7 +19,7 @@ from warprrf.rf.fields.bistatic.observations import columns_of
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.spectrum import to_db
 from warprrf.rf.tracing.model import SETS, Effects, Parameters
-from warprrf.rf.tracing.render import materials_of
+from warprrf.rf.tracing.render import Interreflection, materials_of
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import Rays, Tracer
 
@@ -39,7 +39,7 @@ def test_facets_too_small_for_mirrors_leave_line_of_sight_alone():
 def test_a_mirror_lights_the_sides_of_a_thin_board_that_face_it():
     """All of the board lies in one cell of one group; what faces another way is lit apart."""
     mirror = np.array([[0.0, -2, -2], [0, 2, -2], [0, 2, 2], [0, -2, 2]]), np.array([[0, 1, 2], [0, 2, 3]])
-    low = np.array([3.04, 0.2, 0.2])  # off the cells' borders
+    low = np.array([3.04, 0.0, 0.0])  # off the cells' borders
     board = box_mesh(low, low + [0.02, 0.1, 0.1])
     mesh, _ = joined(mirror, board)
     surface = Surface.of(RadioScene(mesh, np.zeros(len(mesh.faces), int), [SlabMaterial()]), element_m=0.9)
@@ -192,3 +192,27 @@ def test_columns_of_materials_predict_what_those_of_their_groups_do(problem):
         light = rng.uniform(0, 5, (2, columns.single.shape[-1])).astype(np.float32)
         groups = replace(columns, senders=np.array([0, 2]), further=light)
         assert np.allclose(groups.power(p.take(owner)), groups.by_materials(owner).power(p), rtol=1e-5)
+
+
+def test_light_reaches_what_is_open_and_from_there_elements_are_lit():
+    """A box stands on a part of the floor, and hides some: no light is said to reach its inside or the floor under it, and what
+    the rest of such an element gets is what its places get, not less for what is hidden."""
+    low, high = np.array([2.1, 1.6, 0.0]), np.array([2.85, 2.3, 0.9])
+    mesh, _ = joined(box_mesh(np.zeros(3), np.array([5.0, 4.0, 3.0])), box_mesh(low, high))
+    scene = RadioScene(mesh, np.zeros(len(mesh.faces), int), [SlabMaterial("walls", 3.0, 0.0, np.inf, 1.0)])
+    surface = Surface.of(scene)
+    tracer = Tracer.of(surface, np.array([1.0, 0.8, 2.0]), F, SHAPE, 1)
+    place, tiles = tracer.reached(0), surface.tiles
+    there = ~np.isnan(place[:, 0])
+    assert there.sum() > 0.9 * len(tiles.face)
+    inside = (place[there] > low + 1e-3).all(axis=1) & (place[there] < high - 1e-3).all(axis=1)
+    under = (np.abs(place[there][:, 2]) < 1e-6) & (place[there][:, :2] > low[:2] + 1e-3).all(axis=1)
+    under &= (place[there][:, :2] < high[:2] - 1e-3).all(axis=1)
+    assert not inside.any() and not under.any()
+    open_share = Interreflection(tracer, 0).open_share
+    hidden = np.unique(surface.tile_side[~there])
+    partly = [side for side in hidden if 0.0 < open_share[side] < 0.9]
+    assert len(partly) > 4
+    # Whatever surrounds it sends the same: each place gets all of it.
+    even = Interreflection(tracer, 0).between @ np.ones(surface.element_sides)
+    np.testing.assert_allclose(even[open_share > 0], np.pi, rtol=1e-6)
