@@ -133,7 +133,6 @@ class Interreflection:
             ray is the side, of irradiance where the transmitter gives cos(theta_i) / d1^2 [1/m^2].
         between: irradiance of sides (rows) by radiance of sides (columns), shape ``(E, E)``: of what light can reach of them;
             solids' inner ones are left dark.
-        open_share: of each side's area what light can reach, shape ``(E,)``.
     """
 
     def __init__(self, tracer: Tracer, most: int) -> None:
@@ -142,7 +141,6 @@ class Interreflection:
         tile = np.flatnonzero(~np.isnan(point[:, 0]))
         side, area = surface.tile_side[tile], np.tile(surface.tiles.area, 1 + surface.two_sided)[tile]
         open_m2 = np.bincount(side, area, sides)
-        self.open_share = open_m2 / np.tile(surface.element_area, 1 + surface.two_sided)
         # Rays start everywhere on what is open of a side, strata of its area in their order.
         order, known = np.argsort(side, kind="stable"), np.flatnonzero(open_m2)
         upto = np.cumsum(area[order])
@@ -176,8 +174,9 @@ def irradiance(tracer: Tracer, p: Parameters, effects: Effects) -> np.ndarray | 
     got = sum(np.bincount(r.ray, r.powers(materials), minlength=sides) for r in tables)
     if effects.mirror_scatter:
         for onto in (tracer.mirrored(slabs).onto for slabs in {0, most}):
-            lit = np.bincount(onto.ray, onto.powers(materials), minlength=sides)
-            got = got + light.between @ (share * lit / np.maximum(light.open_share, 1e-9))
+            got = got + light.between @ (
+                share * np.bincount(onto.ray, onto.powers(materials), minlength=sides)
+            )
     first = got
     for _ in range(2, effects.scatterings):
         got = first + light.between @ (share * got)

@@ -245,9 +245,7 @@ class Tracer:
 
     def mirrored(self, most: int = 0) -> MirroredLight:
         """Images of the transmitter that light faces; with ``most`` those that do so through slabs alone, up to that many."""
-        return self.kept.get(
-            ("mirrored", most), lambda: MirroredLight(self, self.walls(most) if most else None)
-        )
+        return self.kept.get(("mirrored", most), lambda: MirroredLight(self, most))
 
     @property
     def images(self) -> MirrorImages:
@@ -521,7 +519,7 @@ class MirroredLight:
 
     Args:
         tracer: of the transmitter.
-        walls: if any, the images are those whose light comes through some of these, before or behind the mirror.
+        most: if not 0, the images are those whose light comes through some slabs, before or behind the mirror, up to that many.
 
     Attributes:
         patch: of each pair of a piece and an image that lights it the mirror, shape ``(N,)``.
@@ -530,17 +528,18 @@ class MirroredLight:
             cos(theta_i) / d1^2 [1/m^2].
     """
 
-    def __init__(self, tracer: Tracer, walls: Walls | None = None) -> None:
-        s, grid = tracer.surface, tracer.grid
+    def __init__(self, tracer: Tracer, most: int = 0) -> None:
+        s, grid, walls = tracer.surface, tracer.grid, tracer.walls(most) if most else None
         largest, tiles = np.abs(s.front_normal).argmax(axis=1), s.tiles
         self._way = 2 * largest + (np.take_along_axis(s.front_normal, largest[:, None], axis=1)[:, 0] < 0)
         self._pieces, own = np.unique(6 * tiles.cell + self._way[tiles.face], return_inverse=True)
-        # A tile that lies in part under something is asked about where it is open.
-        sides = tracer.reached(0).reshape(-1, len(own), 3)
-        place = np.where(np.isnan(sides[0]), sides[-1], sides[0])
-        open_ = ~np.isnan(place[:, 0])
-        place[~open_] = tiles.centre[~open_]
-        tile, area = tiles.middles(own, open_), np.bincount(own, tiles.area)
+        # A tile that lies in part under something is asked about where it is open, and what is hidden counts for nothing.
+        sides = tracer.reached(most).reshape(-1, len(own), 3)
+        place, is_open = np.where(np.isnan(sides[0]), sides[-1], sides[0]), ~np.isnan(sides[:, :, 0])
+        hidden = ~is_open.any(axis=0)
+        place[hidden] = tiles.centre[hidden]
+        tile, open_m2 = tiles.middles(own, ~hidden), tiles.area * is_open
+        area = np.stack([np.bincount(own, one) for one in open_m2])
         centre, middle = place[tile], tiles.face[tile]
         ways = tracer.images.candidates(centre, 1)
         # Light must come from in front of the piece, of either side if it has two, and not from its own patch.
@@ -568,9 +567,10 @@ class MirroredLight:
         toward = way / np.maximum(length, 1e-12)[:, None]
         cos_in = np.maximum((toward * normal).sum(axis=1), 0.0)
         face, cell = middle[piece], tiles.cell[tile[piece]]
-        share = area[piece] / s.element_area[s.cells.element[cell]]
+        ray, behind = s.side_met(cell, face, -normal), s.is_behind(face, -normal).astype(int)
+        share = area[behind, piece] / np.maximum(np.bincount(s.tile_side, open_m2.ravel())[ray], 1e-12)
         power = share * cos_in / np.maximum(length, NEAREST_M) ** 2 * grid.transmittance(length)
-        self.onto = replace(paths, power=power, ray=s.side_met(cell, face, -normal))
+        self.onto = replace(paths, power=power, ray=ray)
 
     def pairs(self, cell: np.ndarray, face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows of places of cells and faces, ``(N,)`` each, and images that light them, one for each pair."""

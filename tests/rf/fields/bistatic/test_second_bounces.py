@@ -209,7 +209,8 @@ def test_light_reaches_what_is_open_and_from_there_elements_are_lit():
     under = (np.abs(place[there][:, 2]) < 1e-6) & (place[there][:, :2] > low[:2] + 1e-3).all(axis=1)
     under &= (place[there][:, :2] < high[:2] - 1e-3).all(axis=1)
     assert not inside.any() and not under.any()
-    open_share = Interreflection(tracer, 0).open_share
+    open_m2 = np.bincount(surface.tile_side, np.tile(tiles.area, 2) * there)
+    open_share = open_m2 / np.tile(surface.element_area, 2)
     hidden = np.unique(surface.tile_side[~there])
     partly = [side for side in hidden if 0.0 < open_share[side] < 0.9]
     assert len(partly) > 4
