@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from furnished import RECEIVERS, SHAPE, SIGMA, TX, F, spectra
 from radio_scenes import box_mesh
+from trimesh.remesh import subdivide_to_size
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -16,7 +17,6 @@ from warprrf.rf.maps.radio_map import QUANTITIES, RadioMap, is_free
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_solid_angles
 from warprrf.rf.tracing.model import Effects
-from warprrf.rf.tracing.surface import Surface
 
 WAVELENGTH = SPEED_OF_LIGHT / F
 EVERYTHING = Effects(mirrors=2, scatterings=2, residual=False)
@@ -152,7 +152,7 @@ def test_a_harmonic_field_has_maps_too(scene):
 
 def test_solids_are_no_cells_even_of_a_torn_mesh(scene):
     rng = np.random.default_rng(0)
-    surface = Surface.of(scene).mesh  # faces of a twentieth of a metre and more
+    surface = Mesh(*subdivide_to_size(scene.mesh.vertices, scene.mesh.faces, 0.2))
     torn = Mesh(surface.vertices, surface.faces[rng.random(len(surface.faces)) > 0.1])
     assert not torn.is_closed
     points = rng.uniform([-0.5, -0.5, 0.05], [5.5, 4.5, 2.95], (2000, 3))

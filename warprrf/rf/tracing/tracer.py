@@ -557,6 +557,8 @@ class MirroredLight:
             chosen, off = np.flatnonzero(free), off.take(free)
         else:
             chosen, off = rays.through(walls, off, free)
+            order = np.argsort(off.row, kind="stable")  # before and behind the mirror together
+            chosen, off = chosen[order], off.take(order)
         piece, patch, normal = off.row, off.patch[:, 0], normal[chosen]
         ways = off.over(-1, centre[piece])
         paths = tracer.specular(described(ways, 1, walls))
