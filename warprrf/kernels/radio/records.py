@@ -318,6 +318,26 @@ def build(real: type) -> Any:
         out[i] = power_of(t, m, weight, excess, mirror, through, i)
 
     @wp.kernel(module="unique", enable_backward=False)
+    def record_field(
+        offset: int,
+        t: Table,
+        m: Materials,
+        sent: wp.array(dtype=vec2),
+        heard: wp.array(dtype=vec2),
+        out: wp.array(dtype=real),
+        slope: wp.array2d(dtype=real),
+    ):
+        """Field that each record of mirrors and slabs makes of ``sent``, in (TE, TM) of the first, along ``heard``, in those of the
+        last; and its derivative to ln(epsilon_r - 1) of each interaction."""
+        i = offset + wp.tid()
+        size = wp.sqrt(t.power[i] * shares(t, m, m.mirror, m.through, i))
+        last = t.index.shape[1]
+        out[i] = size * wp.dot(heard[i], smooth(t, m, m.excess, i, 0, last) * sent[i])
+        for k in range(last):
+            if t.index[i, k] >= 0:
+                slope[i, k] = size * wp.dot(heard[i], raised(t, m, m.excess, i, 0, last, k) * sent[i])
+
+    @wp.kernel(module="unique", enable_backward=False)
     def bin_slopes(
         offset: int,
         first: wp.array(dtype=wp.int32),
@@ -412,5 +432,6 @@ def build(real: type) -> Any:
                     out[b, base + j * wp.static(MOMENTS) + c] += value * part
 
     return SimpleNamespace(
-        Materials=Materials, Table=Table, record_power=record_power, bin_slopes=bin_slopes, bin_components=bin_components
+        Materials=Materials, Table=Table, record_power=record_power, record_field=record_field, bin_slopes=bin_slopes,
+        bin_components=bin_components,
     )  # fmt: skip

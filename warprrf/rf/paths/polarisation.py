@@ -14,7 +14,6 @@ from __future__ import annotations
 import numpy as np
 
 from warprrf.geometry.mesh import vectors_across
-from warprrf.rf.em.fresnel import EXCESS
 from warprrf.rf.spectra.spectrum import transverse_basis
 
 
@@ -67,63 +66,3 @@ def _frames(stops: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarr
         own = across[:, k] / np.maximum(sine[:, k], least)
         across[:, k] = np.where(sine[:, k] > least, own, other)
     return along, across
-
-
-def _rotations(turn: np.ndarray) -> np.ndarray:
-    c, s = np.cos(turn), np.sin(turn)
-    return np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)
-
-
-def chain_amplitude(
-    log_excess: np.ndarray,
-    cosine: np.ndarray,
-    turn: np.ndarray,
-    reflects: np.ndarray,
-    ends: tuple[np.ndarray, np.ndarray],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Amplitude between two polarised antennas over chains of half-spaces of real permittivity: it is real too.
-
-    Source: ITU-R P.2040-4, eqs. (37a) and (37b).
-
-    Args:
-        log_excess: ln(epsilon_r - 1) of each mirror of each chain, shape ``(L, k)``.
-        cosine: of incidence, shape ``(L, k)``.
-        turn: as :func:`turns` gives them, shape ``(L, k)``.
-        reflects: which mirrors there are, shape ``(L, k)``; the others let everything pass.
-        ends: fields of the antennas, as :func:`vertical_ends` gives them.
-
-    Returns:
-        The amplitude, shape ``(L,)``, and its derivatives to ``log_excess``, shape ``(L, k)``.
-    """
-    amplitude, rise = _half_space(log_excess, cosine)
-    amplitude = np.where(reflects[..., None], amplitude, 1.0)
-    rise = np.where(reflects[..., None], rise, 0.0)
-    rotation = _rotations(np.where(reflects, turn, 0.0))
-    count, mirrors = (
-        cosine.shape
-    )  # Jones matrices in (TE, TM), (L, 2, 2), and their derivatives, (k, L, 2, 2)
-    whole = np.broadcast_to(np.eye(2), (count, 2, 2))
-    slopes = np.zeros((mirrors, count, 2, 2))
-    for k in range(mirrors):
-        turned = rotation[:, k] @ whole
-        whole = amplitude[:, k, :, None] * turned
-        slopes[:k] = amplitude[:, k, :, None] * (rotation[:, k] @ slopes[:k])
-        slopes[k] = rise[:, k, :, None] * turned
-    transmitted, received = ends
-    return (
-        np.einsum("li,lij,lj->l", received, whole, transmitted),
-        np.einsum("li,klij,lj->lk", received, slopes, transmitted),
-    )
-
-
-def _half_space(log_excess: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Amplitudes (TE, TM) that a half-space reflects, shape ``(..., 2)``, and their derivatives to ``log_excess``."""
-    excess = np.clip(np.exp(log_excess), *EXCESS)
-    cos = np.clip(cosine, 0.0, 1.0)
-    root = np.maximum(np.sqrt(excess + cos**2), 1e-12)
-    dense = (1.0 + excess) * cos
-    te, tm = (cos - root) / (cos + root), (dense - root) / (dense + root)
-    bend = 0.5 * excess / root  # of the root to ln(excess)
-    rise_te = -2.0 * cos * bend / (cos + root) ** 2
-    rise_tm = 2.0 * (excess * cos * root - dense * bend) / (dense + root) ** 2
-    return np.stack([te, tm], axis=-1), np.stack([rise_te, rise_tm], axis=-1)

@@ -164,6 +164,28 @@ class Records:
         )
         return np.asarray(out.numpy(), np.float64)
 
+    def fields(
+        self, materials: Materials, sent: np.ndarray, heard: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Field between two polarised antennas over mirrors and slabs under ``materials``, shape ``(N,)``, and its derivatives to
+        ln(epsilon_r - 1) of each interaction, shape ``(N, K)``. Those to the logarithms of the shares that it mirrors or lets
+        through are half of the field.
+
+        It is real: half-spaces have no phase but their sign, and of slabs the sizes count; what they delay is in the path's length.
+
+        Args:
+            materials: of the surfaces.
+            sent, heard: fields of the antennas in the (TE, TM) of the first interaction and of the last, shape ``(N, 2)`` each.
+        """
+        if len(self) == 0:
+            return np.zeros(0), np.zeros(self.index.shape)
+        real, where = REALS[self.power.dtype], materials.device
+        ends = (wp.array(own, dtype=wp.types.vector(2, real), device=where) for own in (sent, heard))
+        out, slope = (wp.zeros(shape, dtype=real, device=where) for shape in (len(self), self.index.shape))
+        table, m, launch = self._table(materials)
+        launch(kernels.build(real).record_field, len(self), [table, m, *ends, out, slope])
+        return out.numpy(), slope.numpy()
+
     def add_slopes(self, materials: Materials, bins: Bins, place: np.ndarray, slopes: np.ndarray) -> None:
         """Add to ``slopes`` (B, C) the derivatives of the powers summed in ``bins`` to logarithms of parameters; those of
         material m stand from column ``place[m]`` on: lobe weights, epsilon_r - 1, mirrored share, share let through."""

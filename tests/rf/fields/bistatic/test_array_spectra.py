@@ -5,18 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from furnished import RECEIVERS, TX, furnished
-from radio_scenes import SlabMaterial, as_fits_predict, observation
+from radio_scenes import SlabMaterial, as_fits_predict, joined, observation
 
 from warprrf.rf.channel.array_spectra import UP, ArraySpectra, hemisphere
 from warprrf.rf.channel.arrays import PlanarArray
+from warprrf.rf.em.materials import Material
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.measured import ArrayImage, read
 from warprrf.rf.paths.trace import trace_paths
+from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import directions_from_angles
 from warprrf.rf.tracing.model import SETS, Effects
+from warprrf.rf.tracing.render import materials_of
 from warprrf.rf.tracing.tracer import SPECULAR
 
 F = 28e9  # of whose zones mirrors hold the whole, so that exact paths are the truth
@@ -70,6 +73,25 @@ def test_mirrors_and_line_of_sight_add_up_as_complex_paths_do(scene, field):
     assert compared >= 1
 
 
+@pytest.mark.parametrize("swapped", [False, True])
+def test_a_pane_of_nearly_air_changes_nothing(swapped):
+    """A path over the floor and the pane, whose planes of incidence differ, is that over the floor."""
+    floor = np.array([[-6, -6, 0], [6, -6, 0], [6, 6, 0], [-6, 6, 0.0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    pane = np.array([[1, -6, 0.001], [1, 6, 0.001], [1, 6, 6], [1, -6, 6]]), np.array([[0, 1, 2], [0, 2, 3]])
+    concrete = Material.custom("concrete", relative_permittivity=5.0, conductivity=0.1)
+    air = Material.custom("air", relative_permittivity=1.0001, conductivity=0.0, thickness_m=0.01)
+    effects = Effects(mirrors=1, scatterings=0, transmissions=1, diffractions=0)
+    ends = np.array([[-2.0, 0.0, 1.5], [2.0, 2.4, 1.2]])[:: -1 if swapped else 1]
+    nothing = SpectrumDataset.empty(transmitter=ends[0], frequency_hz=F, shape=(24, 48))
+    found = []
+    for parts, of in ([floor], [concrete]), ([floor, pane], [concrete, air]):
+        mesh, part = joined(*parts)
+        one = BistaticField.prior(Scene(mesh, of, part), nothing, effects=effects)
+        assert len(one.view(ends[1]).paths) == 2
+        found.append(one.array_spectrum(ends[1], ARRAY, DIRECTIONS))
+    np.testing.assert_allclose(found[1], found[0], rtol=0.01, atol=0.001 * found[0].max())
+
+
 def test_one_path_alone_peaks_at_its_path_gain(field):
     alone = replace(field, effects=Effects(mirrors=0, scatterings=0, transmissions=0, diffractions=0))
     place = RECEIVERS[1]
@@ -99,7 +121,8 @@ def test_paths_of_unknown_length_add_in_power(field):
     alone = replace(field, effects=replace(SINGLE, scatterings=0))
     view = alone.view(place)
     together = ArrayImage.of(view, ARRAY, DIRECTIONS.reshape(-1, 3), 0.0).together
-    amplitude = together.amplitudes(view.records[SPECULAR], alone.parameters)[0]
+    materials = materials_of(view.tracer, alone.parameters, alone.effects)
+    amplitude = view.records[SPECULAR].fields(materials, together.sent, together.heard)[0]
     each = sum(np.abs(a * row) ** 2 for a, row in zip(amplitude, together.field, strict=True))
     found = alone.array_spectrum(place, ARRAY, DIRECTIONS, length_std_m=1.0).ravel()
     np.testing.assert_allclose(found, each, rtol=1e-4)

@@ -6,7 +6,7 @@ import pytest
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined
 
 import warprrf as wr
-from warprrf.rf.em.materials import assumed_permittivity
+from warprrf.rf.em.materials import assumed_permittivity, itu_material
 from warprrf.rf.fields.bistatic.suggest import Unknowns
 
 CARRIER_HZ = 300e9
@@ -108,3 +108,22 @@ def test_variances_are_those_of_the_joint_posterior():
     posterior = np.linalg.inv(np.linalg.inv(prior) + np.diag(precision))
     assert unknowns.variance(precision) == pytest.approx(np.diag(posterior))
     assert (unknowns.variance(precision + rng.random(5)) < unknowns.variance(precision)).all()
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_what_passes_a_slab_tells_nothing_of_how_the_slab_mirrors(swapped):
+    """Line of sight through a pane is due to no mirror; the floor's mirror is the floor's, before or behind the pane."""
+    floor = np.array([[-6, -6, 0], [6, -6, 0], [6, 6, 0], [-6, 6, 0.0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    pane = np.array([[1, -6, 0.001], [1, 6, 0.001], [1, 6, 6], [1, -6, 6]]), np.array([[0, 1, 2], [0, 2, 3]])
+    mesh, part = joined(floor, pane)
+    scene = wr.Scene(mesh, [itu_material("concrete"), itu_material("glass", thickness_m=0.01)], part)
+    ends = np.array([[-2.0, 0.0, 1.5], [2.0, 0.4, 1.2]])[:: -1 if swapped else 1]
+    effects = wr.Effects(mirrors=1, transmissions=1, diffractions=0)
+    nothing = wr.SpectrumDataset.empty(transmitter=ends[0], frequency_hz=28e9, shape=(24, 48))
+    field = wr.RadioField.fit(scene, nothing, effects=effects)
+    sensitivity, _ = field._sensitivity()
+    paths = sensitivity.tracer.view(ends[1], effects).paths
+    assert (paths.slab >= 0).any(axis=1).all() and sorted(paths.order) == [0, 1]
+    table, _ = sensitivity.powers(ends[1])
+    by_mirror = np.asarray(table.sum(axis=0)).ravel()[-field.surface.groups :]
+    assert np.flatnonzero(by_mirror).tolist() == [field.surface.group[0]]

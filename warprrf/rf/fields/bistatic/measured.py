@@ -13,15 +13,14 @@ from typing import Protocol
 
 import numpy as np
 
-from warprrf.kernels.radio.records import MIRROR, SLAB
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.paths.polarisation import chain_amplitude, vertical_ends
+from warprrf.rf.paths.polarisation import vertical_ends
 from warprrf.rf.paths.ways import stops_of
 from warprrf.rf.spectra.beam import BeamOperator
-from warprrf.rf.tracing.model import Effects, Layout, Parameters
+from warprrf.rf.tracing.model import Effects, Layout
 from warprrf.rf.tracing.rays import RayGrid
-from warprrf.rf.tracing.records import Bins, Materials, Records
+from warprrf.rf.tracing.records import Bins, Materials
 from warprrf.rf.tracing.render import PathGains
 from warprrf.rf.tracing.tracer import SPECULAR, View
 from warprrf.rows import Rows
@@ -63,8 +62,9 @@ def read(gains: PathGains, measurement: Measurement) -> np.ndarray:
     if together is None:
         direct = gains.specular.astype(np.float32) @ measurement.of_paths(view)
     else:
-        p, specular = gains.parameters, view.records[SPECULAR]
-        amplitude = together.amplitudes(specular, p)[0]
+        p, tracer = gains.parameters, view.tracer
+        materials = Materials(p, tracer.slabs, device=tracer.grid.device)
+        amplitude = view.records[SPECULAR].fields(materials, together.sent, together.heard)[0]
         direct = p.gain * together.received(np.where(gains.specular > 0, amplitude, 0.0))
     return np.asarray(measurement.of_bins(table)[:, 0] + direct)
 
@@ -279,8 +279,7 @@ class Superposition(Rows):
     """How L line-of-sight and mirror paths add up in N readings of an array, between vertical antennas.
 
     Attributes:
-        field: amplitude of each reading for a path of amplitude 1, phase of its length included, and what slabs let through
-            before any measurement, shape ``(L, N)``.
+        field: amplitude of each reading for a path of amplitude 1, phase of its length included, shape ``(L, N)``.
         power: what adds in power beside, because lengths are not known so well, shape ``(L, N)`` float32.
         sent, heard: fields of the antennas at both ends of each path, shape ``(L, 2)``; see :func:`vertical_ends`.
     """
@@ -289,28 +288,6 @@ class Superposition(Rows):
     power: np.ndarray
     sent: np.ndarray
     heard: np.ndarray
-
-    def amplitudes(
-        self, specular: Records, p: Parameters, material: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Of each path ``(L,)``, real because half-spaces have no phase but their sign, and its derivatives to
-        ``log_excess`` of each mirror met ``(L, K)``; those to ``log_mirror`` and ``log_through`` are half of it. The common gain
-        apart.
-
-        Args:
-            specular: the paths.
-            p: parameters of materials.
-            material: of each group; by default groups are rows of ``p``.
-        """
-        reflects, own = (specular.index >= 0) & (specular.kind == MIRROR), np.maximum(specular.index, 0)
-        own = own if material is None else material[own]
-        share = np.where(
-            reflects, p.log_mirror[own], np.where(specular.kind == SLAB, p.log_through[own], 0.0)
-        )
-        size = np.sqrt(specular.power) * np.exp(0.5 * share.sum(axis=1))
-        cosine, turn = specular.angle[..., 0], specular.angle[..., 1]
-        polarised, slope = chain_amplitude(p.log_excess[own], cosine, turn, reflects, (self.sent, self.heard))
-        return size * polarised, size[:, None] * slope
 
     def received(self, amplitude: np.ndarray) -> np.ndarray:
         """Readings of paths of ``amplitude`` (L,), shape ``(N,)``."""
@@ -362,7 +339,6 @@ class ArrayImage(ByPixels):
         wavelength = view.tracer.wavelength_m
         kept = np.exp(-0.5 * (2.0 * np.pi * length_std_m / wavelength) ** 2)
         phase = np.exp(-2j * np.pi * np.mod(paths.delay_m / wavelength, 1.0))
-        heard *= _passage(view)[:, None]
         together = Superposition(
             (kept * phase[:, None] * heard).astype(np.complex64),
             ((1.0 - kept**2) * np.abs(heard) ** 2).astype(np.float32),
@@ -402,12 +378,3 @@ def _vertical(view: View) -> tuple[np.ndarray, np.ndarray]:
         stops = stops_of(view.tracer.transmitter, paths.point[own, :count], ends)
         sent[own], received[own] = vertical_ends(stops, paths.normal[own, :count])
     return sent, received
-
-
-def _passage(view: View) -> np.ndarray:
-    """Amplitude that the slabs on each path let through before any measurement, shape ``(L,)``."""
-    tracer, specular = view.tracer, view.records[SPECULAR]
-    index = np.where(specular.kind == SLAB, specular.index, -1)
-    alone = replace(specular, index=index, power=np.ones(len(specular)))
-    prior = replace(Parameters.prior(tracer.surface.groups), log_mirror=np.zeros(tracer.surface.groups))
-    return np.sqrt(alone.powers(Materials(prior, tracer.slabs, device=tracer.grid.device)))

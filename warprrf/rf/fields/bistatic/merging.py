@@ -17,7 +17,6 @@ from warprrf.rf.fields.bistatic.gauss_newton import Batch, Problem
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, Observation, huber
 from warprrf.rf.tracing.model import Effects, Parameters
 from warprrf.rf.tracing.records import Materials
-from warprrf.rf.tracing.tracer import SPECULAR
 
 
 def merge(
@@ -151,13 +150,7 @@ def _mirror_changes(batch: Batch, materials: Materials, unit_of: np.ndarray) -> 
 
 def _heard(o: Observation, effects: Effects, materials: Materials, changes: np.ndarray) -> np.ndarray:
     """The same of one observation where phases count: of all paths, where groups ``changes`` (G,) become each material."""
-    kept, p = o.view.kept_paths(effects), materials.parameters
-    specular, together = o.view.records[SPECULAR].take(np.flatnonzero(kept)), o.together.take(kept)
-    group = np.maximum(specular.index, 0)
-    now = np.where(specular.index >= 0, materials.material[group], -1).astype(np.int32)
-    own = (specular.index >= 0) & changes[group]
-    heard = [
-        together.received(together.amplitudes(replace(specular, index=index), p)[0]) / o.floor
-        for index in (now, *(np.where(own, material, now) for material in range(len(p.log_excess))))
-    ]
+    p, now = materials.parameters, materials.material
+    trials = (now, *(np.where(changes, material, now) for material in range(len(p.log_excess))))
+    heard = [o.heard(effects, materials.by_materials(p, trial)) for trial in trials]
     return np.asarray(heard[1:], np.float32) - np.float32(heard[0])

@@ -308,9 +308,9 @@ class Observation:
         return np.asarray(rise.T @ (self.together.slopes(amplitude) / self.floor).astype(np.float32))
 
     def _amplitudes(self, effects: Effects, materials: Materials) -> tuple[np.ndarray, np.ndarray]:
-        """Of line of sight and mirrors, and their slopes, see :meth:`Superposition.amplitudes`; 0 where one does not count."""
+        """Of line of sight and mirrors, and their slopes, see :meth:`Records.fields`; 0 where one does not count."""
         specular, kept = self.view.records[SPECULAR], self.view.kept_paths(effects)
-        amplitude, slope = self.together.amplitudes(specular, materials.parameters, materials.material)
+        amplitude, slope = specular.fields(materials, self.together.sent, self.together.heard)
         return amplitude * kept, slope * kept[:, None]
 
     @cached_property

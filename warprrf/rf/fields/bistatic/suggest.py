@@ -15,11 +15,13 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from warprrf.device import Progress, with_progress
+from warprrf.kernels.radio.records import MIRROR
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, READING_ERROR_DB
 from warprrf.rf.spectra.antenna import Antenna, turned_gain
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_of
 from warprrf.rf.tracing.model import Model
+from warprrf.rf.tracing.records import Records
 from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.tracer import SPECULAR, Tracer
 
@@ -84,7 +86,7 @@ class Sensitivity:
         s, count = self.tracer.surface, SHAPE[0] * SHAPE[1]
         elements = len(s.element_area)
         pixel = np.ravel_multi_index(pixel_of(view.paths.arrival, SHAPE), SHAPE)
-        mirror = view.records[SPECULAR].index[:, 0]
+        mirror = first_mirror(view.records[SPECULAR])
         own = mirror >= 0
         parts = [(pixel[own], 2 * elements + mirror[own], found.specular[own])]
         rest = [(pixel[~own], found.specular[~own])]
@@ -125,6 +127,13 @@ class Sensitivity:
         for place in with_progress(places, "suggest", progress):
             known += np.asarray(self.of(place, turned)[1].sum(axis=0)).ravel()
         return known
+
+
+def first_mirror(table: Records) -> np.ndarray:
+    """Group of the first mirror of each record, whatever slabs it passes before, -1 for none, shape ``(N,)``."""
+    is_mirror = (table.kind == MIRROR) & (table.index >= 0)
+    first = np.take_along_axis(table.index, is_mirror.argmax(axis=1)[:, None], axis=1)[:, 0]
+    return np.where(is_mirror.any(axis=1), first, -1)
 
 
 def suggest(
