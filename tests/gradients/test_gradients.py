@@ -267,11 +267,11 @@ class PathRecords(WholePath):
         for name in self.SEQUENCES:
             columns = 3 if name == "M" else len(name)
             kinds = {"M": records.MIRROR, "S": records.SCATTER, "E": records.SOURCE, "T": records.SLAB}
-            kind = np.array([[kinds[letter] for letter in (columns * name)[:columns]]], np.int32)
+            kind = np.tile(np.int8([kinds[letter] for letter in (columns * name)[:columns]]), (9, 1))
             index = rng.integers(0, 4, (9, columns)).astype(np.int32)
             index[:, 1:][rng.random((9, columns - 1)) < 0.3] = -1 if name == "M" else 0
             angle = rng.uniform(0.05, 1.0, (9, columns, 3))
-            one = Records(rng.uniform(0.5, 2.0, 9), np.arange(9), index, angle, kind, half_width=0.01)
+            one = Records(index, angle, kind, rng.uniform(0.5, 2.0, 9), np.arange(9), half_width=0.01)
             self.launches.append(
                 (kernel, *one._table(materials)[:2], wp.array(rng.normal(size=9), dtype=wp.float64))
             )

@@ -245,7 +245,7 @@ class ExactEngine:
             lit["MTS"] = ways.through(walls)[1]
         for name, ways in lit.items():
             mirrors = described(ways, 1, walls)
-            before, patch = tracer.specular(mirrors).interactions, ways.patch[:, 0]
+            before, patch = tracer.specular(mirrors), ways.patch[:, 0]
             k, records = tracer.lit_by_images(rays.seen, ray[ways.row], patch, before, every)
             yield self._paths(
                 rays, records, mirrors.length_m[k], mirrors.point[k, 0] - tracer.transmitter, name
@@ -287,7 +287,7 @@ class ExactEngine:
         hits, met, own = onward.hits, onward.after, rays.ray[onward.ray]
         if met is not None:
             width, power = self._tracer.grid.half_width, hits.solid_angle
-            records = Records(power, own, met.index, met.angle, met.kind, half_width=width)
+            records = Records(met.index, met.angle, met.kind, power, own, half_width=width)
             hits = replace(hits, solid_angle=records.powers(self.materials))
         return _Beams(hits, own, length_m[onward.ray], name + rays.sequence, rays.times)
 

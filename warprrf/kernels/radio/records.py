@@ -64,13 +64,13 @@ def build(real: type) -> Any:
     @wp.struct
     class Table:
         """Records of one sequence: power without interactions; group of each interaction, side of an element where it
-        sends, -1 for none; angles; kinds, one row for each or one for all; column of the rough one; half the cosine's
+        sends, -1 for none; angles; kinds; column of the rough one; half the cosine's
         stretch that a ray stands for."""
 
         power: wp.array(dtype=real)
         index: wp.array2d(dtype=wp.int32)
         angle: wp.array2d(dtype=vec3)
-        kind: wp.array2d(dtype=wp.int32)
+        kind: wp.array2d(dtype=wp.int8)
         rough: int
         half_width: real
 
@@ -79,7 +79,7 @@ def build(real: type) -> Any:
         """Kind of interaction k of record i; 0 past the last."""
         found = int(0)
         if k < t.kind.shape[1]:
-            found = t.kind[wp.min(i, t.kind.shape[0] - 1), k]
+            found = int(t.kind[i, k])
         return found
 
     @wp.func

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import warp as wp
@@ -23,16 +23,18 @@ from warprrf.kernels.radio import records as kernels
 from warprrf.rf.em.fresnel import COSINES, SurfaceTable, fresnel_curves, lobe_norm, reciprocal_factor
 from warprrf.rf.tracing.model import Parameters
 from warprrf.rf.tracing.rays import REALS
+from warprrf.rows import Rows
 
 
 @dataclass(frozen=True)
-class Interactions:
+class Interactions(Rows):
     """Interactions, K in a row.
 
     Attributes:
-        index: group of each, from the transmitter on, -1 for none, shape ``(N, K)``.
+        index: group that each meets, or side of the element that sends, from the transmitter on, -1 for none, shape ``(N, K)``.
         angle: its angles, see :mod:`warprrf.kernels.radio.records`, shape ``(N, K, 3)``.
-        kind: as of :class:`Records`, shape ``(N, K)`` or ``(1, K)``.
+        kind: ``MIRROR``, ``SCATTER``, ``SLAB``, ``SOURCE`` of the kernels or 0, shape ``(N, K)`` int8. What is rough is in the same
+            column of all rows.
     """
 
     index: np.ndarray
@@ -42,7 +44,7 @@ class Interactions:
     @classmethod
     def alike(cls, index: np.ndarray, angle: np.ndarray, kind: int) -> Interactions:
         """Those of one ``kind`` all."""
-        return cls(index, angle, np.full((1, index.shape[1]), kind, np.int32))
+        return cls(index, angle, np.full(index.shape, kind, np.int8))
 
     @classmethod
     def of_mirrors(cls, group: np.ndarray, cosine: np.ndarray) -> Interactions:
@@ -53,47 +55,38 @@ class Interactions:
     @classmethod
     def in_a_row(cls, legs: Sequence[Interactions]) -> Interactions:
         """Those of each of ``legs`` after those of the one before."""
-        # Of no record kinds do not matter.
-        kinds = [leg.kind if len(leg.kind) else np.zeros_like(leg.kind, shape=(1, 1)) for leg in legs]
-        most = max(map(len, kinds))
-        wide = [np.broadcast_to(k, (most, leg.index.shape[1])) for k, leg in zip(kinds, legs, strict=True)]
-        index, angle = (
-            np.concatenate(own, axis=1) for own in ([leg.index for leg in legs], [leg.angle for leg in legs])
-        )
-        return cls(index, angle, np.concatenate(wide, axis=1))
+        columns = ([leg.index for leg in legs], [leg.angle for leg in legs], [leg.kind for leg in legs])
+        return cls(*(np.concatenate(own, axis=1) for own in columns))
 
-    def take(self, rows: np.ndarray) -> Interactions:
-        """Those of ``rows``."""
-        kind = self.kind if len(self.kind) == 1 else self.kind[rows]
-        return Interactions(self.index[rows], self.angle[rows], kind)
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """The rows of all ``parts``; shorter ones meet nothing at their end."""
+        most = max(part.index.shape[1] for part in parts)
+        return super().joined([part.widened(most) for part in parts])
+
+    def widened(self, count: int) -> Self:
+        """Each row as ``count`` interactions."""
+        more = (0, 0), (0, count - self.index.shape[1])
+        index, kind = np.pad(self.index, more, constant_values=-1), np.pad(self.kind, more)
+        return replace(self, index=index, angle=np.pad(self.angle, (*more, (0, 0))), kind=kind)
 
 
 @dataclass(frozen=True, eq=False)
-class Records:
+class Records(Interactions):
     """Paths of one sequence: N records of K interactions from the transmitter to the receiver.
 
     Attributes:
         power: path gain without interactions, shape ``(N,)``; its precision is that of what is computed of it.
         ray: ray of the receiver's grid that sees it, or row of a specular path, or side of an element that is lit, ``(N,)``.
-        index: group that each interaction meets, or side of the element that sends, -1 for none, shape ``(N, K)`` int32.
-        angle: its angles, see :mod:`warprrf.kernels.radio.records`, shape ``(N, K, 3)``.
-        kind: of its interactions: ``MIRROR``, ``SCATTER``, ``SLAB``, ``SOURCE`` of the kernels or 0, shape ``(N, K)`` int32, or
-            ``(1, K)`` where all records have the same.
         residual_row: which row of the residual holds the gain of the cell that its ray sees, -1 for none.
         half_width: half of the cosine's stretch that a ray stands for.
     """
 
     power: np.ndarray
     ray: np.ndarray
-    index: np.ndarray
-    angle: np.ndarray
-    kind: np.ndarray
     residual_row: int = -1
     half_width: float = 0.0
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(1))
-
-    def __len__(self) -> int:
-        return len(self.power)
 
     @property
     def rough(self) -> int:
@@ -102,43 +95,13 @@ class Records:
         return int(found[0]) if len(found) else self.index.shape[1]
 
     @property
-    def interactions(self) -> Interactions:
-        """Those of each record."""
-        return Interactions(self.index, self.angle, self.kind)
-
-    @property
     def is_sent(self) -> bool:
         """Whether elements send."""
         return bool((self.kind[:1] == kernels.SOURCE).any())
 
-    @classmethod
-    def joined(cls, tables: Sequence[Records]) -> Records:
-        """Tables of one sequence one after another, each with kinds of its own; shorter records meet nothing at their end."""
-        most = max(table.index.shape[1] for table in tables)
-
-        def column(name: str, nothing: int) -> np.ndarray:
-            arrays = [getattr(table, name) for table in tables]
-            if name == "kind":
-                arrays = [np.broadcast_to(own, t.index.shape) for own, t in zip(arrays, tables, strict=True)]
-            more = [[(0, 0), (0, most - a.shape[1]), (0, 0)][: a.ndim] for a in arrays]
-            return np.concatenate(
-                [np.pad(a, pad, constant_values=nothing) for a, pad in zip(arrays, more, strict=True)]
-            )
-
-        power, ray = (np.concatenate([getattr(table, name) for table in tables]) for name in ("power", "ray"))
-        return replace(
-            tables[0], power=power, ray=ray, index=column("index", -1), angle=column("angle", 0), kind=column("kind", 0)
-        )  # fmt: skip
-
-    def take(self, rows: np.ndarray) -> Records:
-        """The records ``rows``."""
-        kind = self.kind if len(self.kind) == 1 else self.kind[rows]
-        own = {name: getattr(self, name)[rows] for name in ("power", "ray", "index", "angle")}
-        return replace(self, kind=kind, **own)
-
     def rough_groups(self, side_group: np.ndarray) -> np.ndarray:
         """Group that scatters or sends in each, shape ``(N,)``; ``side_group`` (E,) is that of each side of an element."""
-        own = self.index[:, self.rough]
+        own = self.index[:, self.rough] if len(self) else np.zeros(0, np.int32)
         return side_group[own] if self.is_sent else own
 
     def groups(self, side_group: np.ndarray) -> np.ndarray:
@@ -203,7 +166,7 @@ class Records:
         """What groups scatter into each bin at unit weight: the groups that do, shape ``(A,)``, and sums by lobe and
         component of :class:`warprrf.rf.em.fresnel.FresnelCurves`, shape ``(B, A, L, 3)``."""
         own = bins.order[bins.first[0] : bins.first[-1]]
-        groups = np.unique(self.index[own, self.rough])
+        groups = np.unique(self.rough_groups(np.zeros(0, int))[own])
         place = np.zeros(int(self.index.max(initial=0)) + 1, np.int32)
         place[groups] = np.arange(len(groups))
         lobes = len(materials.parameters.lobes)
@@ -230,7 +193,7 @@ class Records:
             table.power = wp.array(self.power, dtype=real, device=where, copy=False)
             table.index = wp.array(self.index, dtype=wp.int32, device=where, copy=False)
             table.angle = wp.array(self.angle, dtype=wp.types.vector(3, real), device=where, copy=False)
-            table.kind = wp.array(self.kind, dtype=wp.int32, device=where)
+            table.kind = wp.array(self.kind, dtype=wp.int8, device=where, copy=False)
             table.rough, table.half_width = self.rough, self.half_width
             return table
 

@@ -50,7 +50,7 @@ class PathGains:
         index, none = np.arange(rays.shape[1]), np.zeros((rays.shape[1], 0), np.int32)
         for k, power in enumerate(rays):
             view, direct = self.view.of(k), self.specular[self.view.paths.receiver == k]
-            every = Records(power, index, none, np.zeros((*none.shape, 3)), none[:1])
+            every = Records(none, np.zeros((*none.shape, 3)), none, power, index)
             records = view.records | {"rays": every}
             found.append(PathGains(view, {SPECULAR: direct, "rays": power}, records, self.parameters))
         return found

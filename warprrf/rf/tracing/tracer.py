@@ -337,7 +337,7 @@ class Tracer:
         power = friis * self.grid.transmittance(p.length_m)
         kind = MIRROR * mirrors + SLAB * slabs
         row = np.arange(len(p), dtype=np.int32)
-        return Records(power, row, group.astype(np.int32), angle, kind.astype(np.int32))
+        return Records(group.astype(np.int32), angle, kind.astype(np.int8), power, row)
 
     def lit(self, rays: Rays, most: int) -> dict[str, Records]:
         """What rays see of surfaces that the transmitter lights, ``"S"``, and, if ``most`` is not 0, through slabs, up to that
@@ -416,8 +416,8 @@ class Tracer:
         dtype, behind = self.grid.dtype, [] if rays.after is None else [rays.after.take(row)]
         every = Interactions.in_a_row([*met, *behind])
         return Records(
-            np.asarray(power, dtype), rays.ray[row].astype(np.int32), every.index.astype(np.int32),
-            every.angle.astype(dtype), every.kind, -1 if behind else residual_row, self.grid.half_width,
+            every.index.astype(np.int32), every.angle.astype(dtype), every.kind, np.asarray(power, dtype),
+            rays.ray[row].astype(np.int32), -1 if behind else residual_row, self.grid.half_width,
         )  # fmt: skip
 
     def _through(self, slabs: Slabs, way: np.ndarray) -> Interactions:
@@ -562,7 +562,7 @@ class MirroredLight:
         piece, patch, normal = off.row, off.patch[:, 0], normal[chosen]
         ways = off.over(-1, centre[piece])
         paths = tracer.specular(described(ways, 1, walls))
-        self.before, self.patch = paths.interactions, patch
+        self.before, self.patch = paths, patch
         self._first = np.searchsorted(piece, np.arange(len(middle) + 1))
         way = s.images(tracer.transmitter)[patch] - centre[piece]
         length = np.linalg.norm(way, axis=1)

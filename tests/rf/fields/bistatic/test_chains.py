@@ -38,8 +38,8 @@ def reflected(excess, cosine, turn):
     none = np.zeros(excess.size)
     p = Parameters(none[:, None], np.log(np.where(excess > 0, excess, 1.0)).ravel(), none, (0,))
     angle = np.stack([cosine, turn, 0.0 * turn], axis=2)
-    kind = np.full((1, excess.shape[1]), MIRROR, np.int32)
-    records = Records(np.ones(len(excess)), np.arange(len(excess)), index, angle, kind)
+    kind = np.full(index.shape, MIRROR, np.int8)
+    records = Records(index, angle, kind, np.ones(len(excess)), np.arange(len(excess)))
     return records.powers(Materials(p, (none + 0j, none)))
 
 
@@ -55,7 +55,7 @@ def test_a_mirror_met_head_on_has_no_plane_of_incidence():
 def test_every_interaction_of_a_long_record_counts(rough):
     """Eight slabs on either side of a surface that scatters, or sixteen and a mirror, met head on; and slopes to their shares."""
     let_through, other = 0.9, 0.8  # shares of the slabs' material and of what stands in their middle
-    kind = np.full((1, 17), SLAB, np.int32)
+    kind = np.full((1, 17), SLAB, np.int8)
     kind[0, 8] = SCATTER if rough else MIRROR
     index = (np.arange(17) == 8).astype(np.int32)[None]
     p = Parameters(
@@ -65,7 +65,7 @@ def test_every_interaction_of_a_long_record_counts(rough):
         (0,),
         log_through=np.log([let_through, 0.5]),
     )
-    records = Records(np.ones(1), np.zeros(1, np.int32), index, np.tile([1.0, 0.0, 0.0], (1, 17, 1)), kind)
+    records = Records(index, np.tile([1.0, 0.0, 0.0], (1, 17, 1)), kind, np.ones(1), np.zeros(1, np.int32))
     materials = Materials(p, (np.zeros(2, complex), np.zeros(2)))
     one = let_through * (1.0 - 0.2**2) ** 2  # of a face, epsilon_r is 2.25
     share = other / 9.0 / (np.pi if rough else 1.0)
