@@ -18,10 +18,16 @@ class BeamOperator:
 
     The grid's columns are shifts of each other, so that a Fourier transform over azimuth leaves one small matrix over
     the rows for each frequency. Sums are kept.
+
+    Args:
+        shape: rows and columns of the images.
+        sigma: width of the beam [rad].
+        device: where it is computed.
     """
 
     def __init__(self, shape: tuple[int, int], sigma: float, *, device: DeviceLike = None) -> None:
         rows, columns = self.shape = shape
+        self.sigma_rad = sigma
         even_sub_pixels = 4  # square root of the directions that stand for a whole pixel's even power
         directions = sub_pixel_directions(shape, even_sub_pixels)[0].reshape(rows, columns, -1, 3)[:, 0]
         even = np.full(directions.shape[1], 1.0 / directions.shape[1])

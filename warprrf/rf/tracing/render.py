@@ -105,18 +105,14 @@ def path_gains(view: View, model: Model) -> PathGains:
 
 
 def spectra_of(gains: PathGains, beam: BeamOperator) -> np.ndarray:
-    """Spectra (R, H, W) of the receivers: path gains through the receivers' beam.
-
-    Raises:
-        ValueError: for a view that was traced without a beam.
-    """
+    """Spectra (R, H, W) of the receivers: path gains through the receivers' beam."""
     view = gains.view
     count, shape = len(view.receivers), view.tracer.grid.shape
     pixels = np.einsum("...k->...", gains.by_ray().reshape(count, *shape, -1))
     found = np.moveaxis(beam(np.ascontiguousarray(np.moveaxis(pixels, 0, -1))), -1, 0)
-    specular = gains.specular.astype(np.float32)
+    specular, beams = gains.specular.astype(np.float32), view.beams(beam.sigma_rad)
     for image, own in zip(found, (view.paths.receiver == k for k in range(count)), strict=True):
-        image += np.tensordot(specular[own], view.beams[own], axes=1)
+        image += np.tensordot(specular[own], beams[own], axes=1)
     return np.maximum(found, 0.0)
 
 

@@ -101,15 +101,11 @@ class View:
     keeps: bool = True
     _beams: Cache = field(init=False, repr=False, default_factory=lambda: Cache(1))
 
-    @property
-    def beams(self) -> np.ndarray:
-        """Unit beam of each path over the pixels, shape ``(L, H, W)`` float32; ValueError where the tracer has no beam."""
-        sigma = self.tracer.beam_sigma_rad
-        if sigma is None:
-            raise ValueError("view: it was traced without a receiver's beam, expected one of a spectrum")
+    def beams(self, sigma_rad: float) -> np.ndarray:
+        """Unit beam of a receiver's width for each path over the pixels, shape ``(L, H, W)`` float32."""
         grid = self.tracer.grid
-        make = partial(unit_beams, self.paths.arrival, grid.shape, sigma, device=grid.device)
-        return self._beams.get("beams", make) if self.keeps else make()
+        make = partial(unit_beams, self.paths.arrival, grid.shape, sigma_rad, device=grid.device)
+        return self._beams.get(sigma_rad, make) if self.keeps else make()
 
     def cell(self, ray: np.ndarray) -> np.ndarray:
         """Surface cell that each ray of index ``ray`` (N,) meets, shape ``(N,)``; all must meet something."""
@@ -179,7 +175,6 @@ class Tracer:
         transmitter: position (3,) [m].
         frequency_hz: carrier.
         grid: rays of a receiver.
-        beam_sigma_rad: width of the receiver's beam; None where no beams are asked for.
         walls: what may be passed, where that is known; else the surface tells.
 
     Attributes:
@@ -194,10 +189,9 @@ class Tracer:
         transmitter: np.ndarray,
         frequency_hz: float,
         grid: RayGrid,
-        beam_sigma_rad: float | None = None,
         walls: Walls | None = None,
     ) -> None:
-        self.surface, self.grid, self.beam_sigma_rad, self._walls = surface, grid, beam_sigma_rad, walls
+        self.surface, self.grid, self._walls = surface, grid, walls
         self.transmitter = np.array(transmitter, np.float64)
         self.frequency_hz = frequency_hz
         self.wavelength_m = SPEED_OF_LIGHT / frequency_hz
@@ -214,26 +208,24 @@ class Tracer:
         shape: tuple[int, int],
         sub_pixels: int,
         *,
-        beam_sigma_rad: float | None = None,
         loss_per_m: float = 0.0,
         device: DeviceLike = None,
     ) -> Tracer:
         """That of a grid of ``shape`` with ``sub_pixels`` squared rays a pixel; the last few are kept."""
         place = np.asarray(transmitter, np.float64).tobytes()
         where = str(resolve(device))
-        key = surface, place, frequency_hz, shape, sub_pixels, beam_sigma_rad, loss_per_m, where
+        key = surface, place, frequency_hz, shape, sub_pixels, loss_per_m, where
 
         def make() -> Tracer:
             grid = RayGrid(surface, shape, sub_pixels, loss_per_m=loss_per_m, device=device)
-            return cls(surface, transmitter, frequency_hz, grid, beam_sigma_rad)
+            return cls(surface, transmitter, frequency_hz, grid)
 
         return _TRACED.get(key, make)
 
     def on_grid(self, shape: tuple[int, int], sub_pixels: int) -> Tracer:
-        """The same for receivers with other rays and no beams; what belongs to the transmitter is shared."""
+        """The same for receivers with other rays; what belongs to the transmitter is shared."""
         other, g = copy(self), self.grid
         other.grid = RayGrid(self.surface, shape, sub_pixels, loss_per_m=g.loss_per_m, device=g.device)
-        other.beam_sigma_rad = None
         return other
 
     @property

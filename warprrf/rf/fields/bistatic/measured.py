@@ -135,7 +135,7 @@ class SpectrumPixels(ByPixels):
 
     def of_paths(self, view: View) -> np.ndarray:
         """Each path's beam."""
-        beams = view.beams.reshape(len(view.paths), int(np.prod(self.beam.shape)))
+        beams = view.beams(self.beam.sigma_rad).reshape(len(view.paths), int(np.prod(self.beam.shape)))
         return beams if self.pixels is None else beams[:, self.pixels]
 
     def part(self, index: np.ndarray) -> SpectrumPixels:

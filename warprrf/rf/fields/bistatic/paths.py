@@ -85,7 +85,7 @@ def strongest(gains: PathGains, image: np.ndarray, beam_sigma_rad: float) -> tup
     outward = np.where(dark[..., None], 1.0, point - transmitter)
     length = np.where(dark, np.nan, np.linalg.norm(outward, axis=-1) + range_m)
     if len(power):
-        beams = power[:, None, None] * view.beams
+        beams = power[:, None, None] * view.beams(beam_sigma_rad)
         which = beams.argmax(axis=0)
         diffuse = np.maximum(image - beams.sum(axis=0), 0.0)
         of_a_ray = 1.0 / 200.0  # of what scattering brings to a pixel, at 64 rays a pixel and a beam of 3

@@ -97,7 +97,7 @@ def trace(
         loss_per_m = 0.0 if first.air is None else first.air.loss_per_m(first.frequency_hz)
         make = partial(
             Tracer.of, surface, first.transmitter, first.frequency_hz, first.shape, sub_pixels,
-            beam_sigma_rad=first.beam_sigma_rad, loss_per_m=loss_per_m, device=str(resolve(device)),
+            loss_per_m=loss_per_m, device=str(resolve(device)),
         )  # fmt: skip
         tracer = make()
         receivers = np.stack([places[k].receiver for k in own])
