@@ -1,6 +1,9 @@
 """Power of path records and its logarithmic slopes, interaction by interaction.
 
-The same coefficients with their phases, of single paths, are in :mod:`warprrf.rf.em.fresnel`.
+The same coefficients with their phases, of single paths, are in :mod:`warprrf.rf.em.fresnel`. ``record_power`` gives values, on
+Warp's tape too; ``bin_slopes`` are the derivatives that a fit takes of line of sight and mirrors, and error bars of everything. A
+fit's derivatives of scattered light are those of sums by ``bin_components``, see
+:class:`~warprrf.rf.fields.bistatic.observations.Columns`.
 
 A record is a power that geometry fixes and a few interactions from the transmitter to the receiver. Mirrors and slabs
 multiply Jones matrices in (TE, TM), real: half-spaces have no phase but their sign (ITU-R P.2040-4, eqs. (37a),

@@ -179,7 +179,7 @@ class FullModel:
         gains = field.path_gains(view)
         if gas:
             single, tables = view.single_bounce_m(), {}
-            for name, power in gains.tables.items():
+            for name, power in gains.powers.items():
                 length = view.paths.length_m if name == "specular" else single[gains.records[name].ray]
                 tables[name] = power * 10.0 ** (-0.1 * self.gas_db_per_m * length)
             gains = replace(gains, tables=tables)

@@ -28,20 +28,20 @@ class PathGains:
 
     Attributes:
         view: what they see.
-        tables: of each record, by sequence; see :class:`View`.
-        records: by sequence.
+        powers: of each record, by sequence, shape ``(N,)`` each.
+        records: by sequence; see :class:`View`.
         parameters: under which they are.
     """
 
     view: View
-    tables: dict[str, np.ndarray]
+    powers: dict[str, np.ndarray]
     records: dict[str, Records]
     parameters: Parameters
 
     @property
     def specular(self) -> np.ndarray:
         """Of each line of sight and mirror path, shape ``(L,)``."""
-        return self.tables[SPECULAR]
+        return self.powers[SPECULAR]
 
     @property
     def apart(self) -> list[PathGains]:
@@ -58,8 +58,8 @@ class PathGains:
     def by_ray(self, names: Iterable[str] | None = None) -> np.ndarray:
         """Of everything but those, or of the sequences ``names``, by the ray that sees it, shape ``(R K,)``."""
         count, records = len(self.view.hits.face), self.records
-        chosen = [n for n in (self.tables if names is None else names) if n != SPECULAR and n in self.tables]
-        return sum((np.bincount(records[n].ray, self.tables[n], count) for n in chosen), np.zeros(count))
+        chosen = [n for n in (self.powers if names is None else names) if n != SPECULAR and n in self.powers]
+        return sum((np.bincount(records[n].ray, self.powers[n], count) for n in chosen), np.zeros(count))
 
     @property
     def total(self) -> np.ndarray:

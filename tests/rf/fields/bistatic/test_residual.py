@@ -102,10 +102,10 @@ def test_nothing_seen_is_nothing_learned(field):
 
 def test_gains_multiply_their_own_light_alone(field):
     view, cells = field.view(RECEIVERS[0]), len(field.surface.cells)
-    bare = field.path_gains(view).tables
+    bare = field.path_gains(view).powers
     for row, own in enumerate((["S"], ["MS", "E"])):
         gained = replace(field, residual=np.log(2.0) * (np.arange(2) == row)[:, None] * np.ones(cells))
-        for name, power in gained.path_gains(view).tables.items():
+        for name, power in gained.path_gains(view).powers.items():
             np.testing.assert_allclose(power, (1 + (name in own)) * bare[name], rtol=1e-12)
         assert all(bare[name].sum() > 0 for name in own)
 
@@ -117,7 +117,7 @@ def test_another_transmitters_light_falls_elsewhere(field):
     rng = np.random.default_rng(5)
     own = replace(field, residual=rng.normal(size=field.residual.shape))
     view = own.view(RECEIVERS[0], there)
-    ours, bare = own.path_gains(view).tables, field.path_gains(view).tables
+    ours, bare = own.path_gains(view).powers, field.path_gains(view).powers
     for name in ("MS", "E"):
         np.testing.assert_array_equal(ours[name], bare[name])
     assert not np.allclose(ours["S"], bare["S"], atol=0.0)

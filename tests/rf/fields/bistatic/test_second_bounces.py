@@ -114,7 +114,7 @@ def test_columns_are_the_sums_of_their_records(scene, reciprocal):
     def image(by_ray):
         return beam(by_ray.reshape(*SHAPE, -1).sum(axis=-1, keepdims=True)).ravel() / field.floor
 
-    further = image(gains.by_ray([name for name in gains.tables if name not in ("specular", "S")]))
+    further = image(gains.by_ray([name for name in gains.powers if name not in ("specular", "S")]))
     np.testing.assert_allclose(columns.power(p) - single, further, rtol=1e-3, atol=1e-6 * single.max())
     curves, records = fresnel_curves(), view.records["S"]
     components = curves.at(curves.coordinates, p.log_excess[:1])[0][0] @ curves.moments  # groups are alike
@@ -125,7 +125,7 @@ def test_columns_are_the_sums_of_their_records(scene, reciprocal):
         axis=1
     )
     assert np.abs(share - 1.0).max() < 0.13
-    weighed = image(np.bincount(records.ray, gains.tables["S"] * share, minlength=len(view.hits.face)))
+    weighed = image(np.bincount(records.ray, gains.powers["S"] * share, minlength=len(view.hits.face)))
     np.testing.assert_allclose(single, weighed, rtol=1e-3, atol=1e-5 * single.max())
 
 

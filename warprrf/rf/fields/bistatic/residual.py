@@ -56,7 +56,7 @@ def shares_of(o: Observation, model: Model) -> Shares:
     (bins, count), cells = o.measured.bins(view), len(view.tracer.surface.cells)
     learned = model.learned_rows(view.tracer.transmitter)
     rows, columns, powers = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0, np.float32)]
-    for name, power in gains.tables.items():
+    for name, power in gains.powers.items():
         records = gains.records[name]
         if name == SPECULAR or not 0 <= records.residual_row < learned:
             continue

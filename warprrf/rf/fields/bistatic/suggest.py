@@ -90,7 +90,7 @@ class Sensitivity:
         own = mirror >= 0
         parts = [(pixel[own], 2 * elements + mirror[own], found.specular[own])]
         rest = [(pixel[~own], found.specular[~own])]
-        for name, power in found.tables.items():
+        for name, power in found.powers.items():
             ray, gain = found.records[name].ray, found.records[name].residual_row
             if gain >= 0:
                 parts.append((ray, elements * gain + s.cells.element[view.cell(ray)], power))
