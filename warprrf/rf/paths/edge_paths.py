@@ -19,6 +19,7 @@ from warprrf.rf.em.diffraction import EdgeRays, Pair, boundary_fields, diffracti
 from warprrf.rf.em.fresnel import SurfaceTable
 from warprrf.rf.paths.images import EdgeLeaves, MirrorImages
 from warprrf.rf.paths.mirror_paths import MirrorPaths, met_at
+from warprrf.rf.paths.polarisation import across_incidence
 from warprrf.rf.paths.slabs import Walls
 from warprrf.rf.paths.ways import Ways, distinct, passed, stops_of
 from warprrf.rf.spectra.spectrum import transverse_basis
@@ -358,9 +359,7 @@ def _at_plane(
     normal: np.ndarray, before: np.ndarray, behind: np.ndarray, te: np.ndarray, tm: np.ndarray
 ) -> np.ndarray:
     """What a mirror or a slab makes of field vectors, shape ``(L, 3, 3)``."""
-    across = np.cross(before, normal)
-    sine = np.linalg.norm(across, axis=1, keepdims=True)
-    across = np.where(sine > 1e-6, across / np.maximum(sine, 1e-6), vectors_across(before)[0])
+    across = across_incidence(before, normal, vectors_across(before)[0])
     inwards, outwards = np.cross(across, before), np.cross(across, behind)
     return np.asarray(
         te[:, None, None] * across[:, :, None] * across[:, None, :]
