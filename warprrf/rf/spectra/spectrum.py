@@ -267,8 +267,7 @@ def spread_paths(
     if len(positive) == 0:
         return SpreadPaths(np.zeros((rows, columns)), np.full((rows, columns), -1, dtype=np.int32))
     d, power = unit_vectors("directions", d[positive]), power[positive]
-    row, column = pixel_of(d, (rows, columns))
-    cell = (row * columns + column).astype(np.int32)
+    cell = np.ravel_multi_index(pixel_of(d, shape), shape).astype(np.int32)
     order = np.argsort(cell, kind="stable")
     starts = np.zeros(rows * columns + 1, dtype=np.int32)
     starts[1:] = np.cumsum(np.bincount(cell, minlength=rows * columns))
@@ -292,9 +291,8 @@ def beam_sums(
     pixels, one there, shape ``(L, 2)``."""
     where = _device.resolve(device)
     grid = _beam_grid(shape, float(sigma), str(where))
-    row, column = pixel_of(directions, shape)
     sums = [wp.zeros(len(directions), dtype=wp.float64, device=where) for _ in range(2)]
-    inputs = [directions, row * shape[1] + column, grid, *sums]
+    inputs = [directions, np.ravel_multi_index(pixel_of(directions, shape), shape), grid, *sums]
     _device.launch(beam_kernels.beam_normaliser, len(directions), inputs, device=where)
     return np.stack([one.numpy() for one in sums], axis=1)
 
@@ -340,13 +338,11 @@ def unit_beams(
 
     The same beams as :func:`spread`, all images at once: for tens of paths, not for thousands.
     """
-    rows, columns = check_shape(shape)
-    where = _device.resolve(device)
-    row, column = pixel_of(directions, (rows, columns))
+    shape, where = check_shape(shape), _device.resolve(device)
     near, total = beam_sums(directions, shape, sigma, device=where).T
-    images = wp.zeros((len(directions), rows, columns), dtype=wp.float32, device=where)
-    grid = _beam_grid((rows, columns), float(sigma), str(where))
-    inputs = [directions, row * columns + column, near, total, grid, images]
+    images = wp.zeros((len(directions), *shape), dtype=wp.float32, device=where)
+    grid = _beam_grid(shape, float(sigma), str(where))
+    inputs = [directions, np.ravel_multi_index(pixel_of(directions, shape), shape), near, total, grid, images]
     _device.launch(beam_kernels.separate_beams, len(directions), inputs, device=where)
     return images.numpy()
 
