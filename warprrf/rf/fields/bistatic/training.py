@@ -332,9 +332,12 @@ class Training:
 
     def loss(self, model: Model, places: Sequence[int] | np.ndarray) -> float:
         """Mean loss of all readings at ``places`` [dB^2]."""
-        predicted = self.predicted(model, places)
-        own = [self.observations[int(k)].losses(x).mean() for k, x in zip(places, predicted, strict=True)]
-        return float(np.mean(own))
+        return self.mean_loss(places, self.predicted(model, places))
+
+    def mean_loss(self, places: Iterable[int], predicted: Iterable[np.ndarray]) -> float:
+        """The same of what is ``predicted`` at each, in units of its floor."""
+        each = zip(places, predicted, strict=True)
+        return float(np.mean([self.observations[k].losses(x).mean() for k, x in each]))
 
     def held_loss(self, choice: Solution) -> float:
         """Mean square error at the places held out, without residual [dB^2]: of all readings where they are few, else of
