@@ -357,7 +357,7 @@ def _cutoff(shape: tuple[int, int], sigma: float) -> float:
 
 @lru_cache(maxsize=8)
 def _beam_grid(shape: tuple[int, int], sigma: float, device: str) -> Any:
-    """The grid, for beams of width ``sigma``, as :class:`~beam_kernels.BeamGrid` on the device."""
+    """The grid, for beams of width ``sigma``, as :class:`~warprrf.kernels.radio.beam.BeamGrid` on the device."""
     rows, columns = shape
     cutoff = _cutoff(shape, sigma)
     zenith = pixel_angles(shape)[0]
