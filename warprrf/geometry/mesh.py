@@ -500,6 +500,12 @@ def vectors_across(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return u, np.cross(direction, u)
 
 
+def headings(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit directions of ways ``(..., 3)`` and their lengths ``(...)``; one without length has no direction: zeros."""
+    length = np.linalg.norm(way, axis=-1)
+    return way / np.maximum(length, 1e-12)[..., None], length
+
+
 class Geometry(Protocol):
     """Anything with a mesh: a Reconstruction, a Scene, planar patches, a fitted field's surface."""
 

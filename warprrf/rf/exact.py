@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 from warprrf import device as _device
 from warprrf.checks import check_array, check_count, check_seed
 from warprrf.device import DeviceLike
-from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
+from warprrf.geometry.mesh import ENDPOINT_CLEARANCE
 from warprrf.kernels.radio.records import MIRROR, SCATTER
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -48,7 +48,7 @@ from warprrf.rf.spectra.spectrum import (
     sub_pixel_directions,
 )
 from warprrf.rf.tracing.model import SETS, Effects
-from warprrf.rf.tracing.rays import Hits, RayGrid
+from warprrf.rf.tracing.rays import Hits, RayGrid, by_cosine
 from warprrf.rf.tracing.records import Interactions, Records, SlabMaterials
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import Rays, Tracer
@@ -268,10 +268,7 @@ class ExactEngine:
         ray, every = self._some(rays, most)
         point, direction, normal = self._met(rays, ray)
         u, v = np.random.default_rng([self.seed, depth, len(rays.sequence)]).random((2, len(ray)))
-        a, b = vectors_across(normal)
-        radius, turn, up = np.sqrt(u), 2.0 * np.pi * v, np.sqrt(1.0 - u)
-        along = np.stack([radius * np.cos(turn), radius * np.sin(turn), up], axis=1)
-        onward = np.einsum("nk,knc->nc", along, np.stack([a, b, normal]))
+        onward, up = by_cosine(normal, u, v), np.sqrt(1.0 - u)
         cos_out = np.clip(-(direction * normal).sum(axis=1), 0.0, 1.0)
         cos_mirror = np.clip(2.0 * up * cos_out + (onward * direction).sum(axis=1), -1.0, 1.0)
         angle = np.column_stack([up, cos_out, cos_mirror])[:, None]

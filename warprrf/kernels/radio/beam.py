@@ -8,6 +8,25 @@ they fall in, so that every pixel gathers its own sum: no atomics, the same resu
 import warp as wp
 
 
+@wp.struct
+class BeamGrid:
+    """Pixels of a grid, and how far a beam reaches on it.
+
+    Attributes:
+        pixels: unit vectors through their centres, by row and column.
+        solid_angles: of a pixel of each row [sr].
+        half_widths: ``[i, m]`` columns either side hold row i's share of paths in row m; -1 where there is none.
+        kappa: of the beam.
+        chord_limit: squared chord at which it ends.
+    """
+
+    pixels: wp.array2d(dtype=wp.vec3d)
+    solid_angles: wp.array(dtype=wp.float64)
+    half_widths: wp.array2d(dtype=wp.int32)
+    kappa: wp.float64
+    chord_limit: wp.float64
+
+
 @wp.func
 def column_start(column: int, half: int, columns: int):
     """First column of a window about ``column``; 0 if the window spans the whole row."""
@@ -32,11 +51,11 @@ def column_at(start: int, step: int, columns: int):
 
 
 @wp.func
-def beam_at(c: wp.float64, shift: wp.float64, kappa: wp.float64, chord_limit: wp.float64):
+def beam_at(c: wp.float64, shift: wp.float64, grid: BeamGrid):
     """Beam at the squared chord ``c`` over that at ``shift``; nothing beyond the limit."""
     value = wp.float64(0.0)
-    if c <= chord_limit:
-        value = wp.exp(wp.float64(0.5) * kappa * (shift - c))
+    if c <= grid.chord_limit:
+        value = wp.exp(wp.float64(0.5) * grid.kappa * (shift - c))
     return value
 
 
@@ -45,34 +64,30 @@ def beam_normaliser(
     offset: int,
     directions: wp.array(dtype=wp.vec3d),
     cells: wp.array(dtype=wp.int32),
-    pixels: wp.array2d(dtype=wp.vec3d),
-    solid_angles: wp.array(dtype=wp.float64),
-    half_widths: wp.array2d(dtype=wp.int32),
-    kappa: wp.float64,
-    chord_limit: wp.float64,
+    grid: BeamGrid,
     nearest: wp.array(dtype=wp.float64),
     total: wp.array(dtype=wp.float64),
 ):
     """For each path: squared chord to its nearest pixel centre, and the beam's sum over pixels relative to there."""
     k = offset + wp.tid()
-    rows = pixels.shape[0]
-    columns = pixels.shape[1]
+    rows = grid.pixels.shape[0]
+    columns = grid.pixels.shape[1]
     d = directions[k]
     cell_row = cells[k] / columns
     cell_column = cells[k] - cell_row * columns
-    c0 = wp.length_sq(d - pixels[cell_row, cell_column])
+    c0 = wp.length_sq(d - grid.pixels[cell_row, cell_column])
     # The pixel whose cell holds the path is the nearest, or near enough to keep the exponentials from underflowing.
     shift = c0
     weight = wp.float64(0.0)
     for row in range(rows):
-        half = half_widths[row, cell_row]
+        half = grid.half_widths[row, cell_row]
         if half >= 0:
             start = column_start(cell_column, half, columns)
             row_weight = wp.float64(0.0)
             for step in range(window_width(half, columns)):
-                c = wp.length_sq(d - pixels[row, column_at(start, step, columns)])
-                row_weight = row_weight + beam_at(c, shift, kappa, chord_limit)
-            weight = weight + row_weight * solid_angles[row]
+                c = wp.length_sq(d - grid.pixels[row, column_at(start, step, columns)])
+                row_weight = row_weight + beam_at(c, shift, grid)
+            weight = weight + row_weight * grid.solid_angles[row]
     nearest[k] = shift
     total[k] = weight
 
@@ -84,28 +99,24 @@ def separate_beams(
     cells: wp.array(dtype=wp.int32),
     nearest: wp.array(dtype=wp.float64),
     total: wp.array(dtype=wp.float64),
-    pixels: wp.array2d(dtype=wp.vec3d),
-    solid_angles: wp.array(dtype=wp.float64),
-    half_widths: wp.array2d(dtype=wp.int32),
-    kappa: wp.float64,
-    chord_limit: wp.float64,
+    grid: BeamGrid,
     images: wp.array3d(dtype=wp.float32),
 ):
     """The beam of each path by itself, whose pixels sum to one."""
     k = offset + wp.tid()
-    rows = pixels.shape[0]
-    columns = pixels.shape[1]
+    rows = grid.pixels.shape[0]
+    columns = grid.pixels.shape[1]
     d = directions[k]
     cell_row = cells[k] / columns
     cell_column = cells[k] - cell_row * columns
     for row in range(rows):
-        half = half_widths[row, cell_row]
+        half = grid.half_widths[row, cell_row]
         if half >= 0:
             start = column_start(cell_column, half, columns)
             for step in range(window_width(half, columns)):
                 column = column_at(start, step, columns)
-                c = wp.length_sq(d - pixels[row, column])
-                value = beam_at(c, nearest[k], kappa, chord_limit) * solid_angles[row]
+                c = wp.length_sq(d - grid.pixels[row, column])
+                value = beam_at(c, nearest[k], grid) * grid.solid_angles[row]
                 images[k, row, column] = wp.float32(value / total[k])
 
 
@@ -116,26 +127,22 @@ def gather_beams(
     powers: wp.array(dtype=wp.float64),
     nearest: wp.array(dtype=wp.float64),
     starts: wp.array(dtype=wp.int32),
-    pixels: wp.array2d(dtype=wp.vec3d),
-    solid_angles: wp.array(dtype=wp.float64),
-    half_widths: wp.array2d(dtype=wp.int32),
-    kappa: wp.float64,
-    chord_limit: wp.float64,
+    grid: BeamGrid,
     image: wp.array2d(dtype=wp.float64),
     strongest: wp.array2d(dtype=wp.int32),
 ):
     """Sum of the beams at each pixel, and which path gives the most there (-1: none)."""
     k = offset + wp.tid()
-    rows = pixels.shape[0]
-    columns = pixels.shape[1]
+    rows = grid.pixels.shape[0]
+    columns = grid.pixels.shape[1]
     row = k / columns
     column = k - row * columns
-    p = pixels[row, column]
+    p = grid.pixels[row, column]
     value = wp.float64(0.0)
     best_value = wp.float64(0.0)
     best = int(-1)
     for cell_row in range(rows):
-        half = half_widths[row, cell_row]
+        half = grid.half_widths[row, cell_row]
         if half >= 0:
             first = column_start(column, half, columns)
             width = window_width(half, columns)
@@ -150,13 +157,13 @@ def gather_beams(
                     base = cell_row * columns
                     for m in range(starts[base + low], starts[base + high]):
                         c = wp.length_sq(directions[m] - p)
-                        if c <= chord_limit:
-                            w = powers[m] * wp.exp(wp.float64(0.5) * kappa * (nearest[m] - c))
+                        if c <= grid.chord_limit:
+                            w = powers[m] * wp.exp(wp.float64(0.5) * grid.kappa * (nearest[m] - c))
                             value = value + w
                             if w > best_value:
                                 best_value = w
                                 best = m
-    image[row, column] = value * solid_angles[row]
+    image[row, column] = value * grid.solid_angles[row]
     strongest[row, column] = best
 
 
@@ -168,12 +175,9 @@ def strongest_rays(
     log_power: wp.array(dtype=wp.float64),
     top: wp.array(dtype=wp.float64),
     highest: wp.float64,
-    pixels: wp.array2d(dtype=wp.vec3d),
-    half_widths: wp.array2d(dtype=wp.int32),
+    grid: BeamGrid,
     first_row: wp.array(dtype=wp.int32),
     least_fall: wp.array3d(dtype=wp.float32),
-    kappa: wp.float64,
-    chord_limit: wp.float64,
     strongest: wp.array(dtype=wp.int32),
 ):
     """Which ray's beam gives a pixel the most (-1: none), for ``per_pixel`` rays in every pixel's cell.
@@ -183,11 +187,11 @@ def strongest_rays(
     Most cells need no closer look.
     """
     k = offset + wp.tid()
-    columns = pixels.shape[1]
+    columns = grid.pixels.shape[1]
     row = k / columns
     column = k - row * columns
-    p = pixels[row, column]
-    half_kappa = wp.float64(0.5) * kappa
+    p = grid.pixels[row, column]
+    half_kappa = wp.float64(0.5) * grid.kappa
     best_value = wp.float64(-1.0e300)
     best = int(-1)
     # The own cell first: it is most often the answer.
@@ -198,8 +202,8 @@ def strongest_rays(
             best_value = value
             best = m
     first = first_row[row]
-    for r in range(wp.min(least_fall.shape[1], pixels.shape[0] - first)):
-        half = wp.min(half_widths[row, first + r], columns / 2)
+    for r in range(wp.min(least_fall.shape[1], grid.pixels.shape[0] - first)):
+        half = wp.min(grid.half_widths[row, first + r], columns / 2)
         base = (first + r) * columns
         for apart in range(half + 1):
             # Farther cells of the row can only give less.
@@ -220,7 +224,7 @@ def strongest_rays(
                         m = n * per_pixel + j
                         c = wp.length_sq(directions[m] - p)
                         value = log_power[m] - half_kappa * c
-                        if c <= chord_limit and value > best_value:
+                        if c <= grid.chord_limit and value > best_value:
                             best_value = value
                             best = m
     strongest[k] = best

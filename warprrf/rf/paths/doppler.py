@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_number
-from warprrf.geometry.mesh import GeometryLike, as_mesh
+from warprrf.geometry.mesh import GeometryLike, as_mesh, headings
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 
@@ -82,8 +82,7 @@ def _pushed(
     """v . (k_i - k_(i-1)) of each path's interaction points [m/s], their sum, shape as ``tau``."""
     there, velocity = np.isfinite(paths.vertices[..., 0]), np.zeros(paths.vertices.shape)
     velocity[there] = _touched(scene, moving, paths.vertices[there])
-    leg = np.diff(paths.vertices, axis=-2)
-    leg = leg / np.maximum(np.linalg.norm(leg, axis=-1, keepdims=True), 1e-12)
+    leg = headings(np.diff(paths.vertices, axis=-2))[0]
     before = np.concatenate([departure[..., None, :], leg], axis=-2)
     after = np.concatenate([leg, onward[..., None, :]], axis=-2)
     after = np.where(np.isfinite(after), after, onward[..., None, :])  # of the last point, and past it

@@ -19,6 +19,7 @@ from warprrf.rf.em.diffraction import EdgeRays, Pair, boundary_fields, diffracti
 from warprrf.rf.em.fresnel import SurfaceTable
 from warprrf.rf.paths.images import EdgeLeaves, MirrorImages
 from warprrf.rf.paths.mirror_paths import MirrorPaths, met_at
+from warprrf.rf.paths.polarisation import across_incidence
 from warprrf.rf.paths.slabs import Walls
 from warprrf.rf.paths.ways import Ways, distinct, passed, stops_of
 from warprrf.rf.spectra.spectrum import transverse_basis
@@ -273,27 +274,24 @@ class EdgeFinder:
         before, behind = (_edge_basis(edges.along, ways.direction[:, j]) for j in range(2))
         field, sign = np.swapaxes(behind, 1, 2) @ bent @ before, bent[:, 0, 0].copy()
         outer, excess = ways.direction.copy(), np.zeros(len(ways.edge))
-        for j in range(2):
-            own = np.flatnonzero(ways.slab[:, j] >= 0)
+        legs = np.tile(np.eye(3, dtype=complex), (2, len(ways.edge), 1, 1))
+        for j in range(2):  # what a mirror or a slab, one at most, makes of the field
+            way, te, tm = ways.direction[:, j], *np.ones((2, len(ways.edge)), complex)
+            slab, mirror = (np.flatnonzero(met[:, j] >= 0) for met in (ways.slab, ways.patch))
+            normal = patches.normal[ways.patch[:, j]]
+            normal[slab] = patches.mesh.face_normals[ways.slab[slab, j]]
+            cosine = (way * normal).sum(axis=1)
+            outer[mirror, j] -= 2.0 * cosine[mirror, None] * normal[mirror]
+            te[mirror], tm[mirror] = self._reflection(ways.patch[mirror, j], np.abs(cosine[mirror]))
             if self.walls is not None and self.table is not None:
-                normal, way = self.walls.mesh.face_normals[ways.slab[own, j]], ways.direction[own, j]
-                cosine = np.abs((way * normal).sum(axis=1))
-                te, tm, excess[own] = self.table.passage(
-                    self.group[ways.slab[own, j]], cosine, self.wavelength_m, ways.thickness_m[own, j]
-                )
-                slab = _at_plane(normal, way, way, te, tm)
-                field[own] = field[own] @ slab if j == 0 else slab @ field[own]
-                sign[own] *= te
-            own = np.flatnonzero(ways.patch[:, j] >= 0)
-            normal, inner = patches.normal[ways.patch[own, j]], ways.direction[own, j]
-            cosine = (inner * normal).sum(axis=1)
-            outer[own, j] = inner - 2.0 * cosine[:, None] * normal
-            te, tm = self._reflection(ways.patch[own, j], np.abs(cosine))
-            sign[own] *= te
-            if j == 0:
-                field[own] = field[own] @ _at_plane(normal, outer[own, 0], inner, te, tm)
-            else:
-                field[own] = _at_plane(normal, inner, outer[own, 1], te, tm) @ field[own]
+                te[slab], tm[slab], excess[slab] = self.table.passage(
+                    self.group[ways.slab[slab, j]], np.abs(cosine[slab]), self.wavelength_m, ways.thickness_m[slab, j]
+                )  # fmt: skip
+            own = np.union1d(slab, mirror)
+            comes, goes = (outer[own, j], way[own])[:: 1 - 2 * j]
+            legs[j, own] = _at_plane(normal[own], comes, goes, te[own], tm[own])
+            sign *= te
+        field = legs[1] @ field @ legs[0]
         departure, arrival, length = outer[:, 0], -outer[:, 1], ways.leg.sum(axis=1)
         matrix = transverse_basis(arrival) @ field @ np.swapaxes(transverse_basis(departure), 1, 2)
         if self.table is None:
@@ -361,9 +359,7 @@ def _at_plane(
     normal: np.ndarray, before: np.ndarray, behind: np.ndarray, te: np.ndarray, tm: np.ndarray
 ) -> np.ndarray:
     """What a mirror or a slab makes of field vectors, shape ``(L, 3, 3)``."""
-    across = np.cross(before, normal)
-    sine = np.linalg.norm(across, axis=1, keepdims=True)
-    across = np.where(sine > 1e-6, across / np.maximum(sine, 1e-6), vectors_across(before)[0])
+    across = across_incidence(before, normal, vectors_across(before)[0])
     inwards, outwards = np.cross(across, before), np.cross(across, behind)
     return np.asarray(
         te[:, None, None] * across[:, :, None] * across[:, None, :]

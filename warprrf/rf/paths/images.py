@@ -372,7 +372,7 @@ def _patches_on_device(patches: PlanarPatches, slack_m: float, where: wp.Device)
         pairs = np.arange(0, len(low_), 2)
         levels.append((np.minimum.reduceat(low_, pairs), np.maximum.reduceat(high_, pairs)))
     tree_low, tree_high = (np.concatenate(a) for a in zip(*levels, strict=True))
-    result = _device.filled(
+    return _device.filled(
         kernels.Patches,
         where,
         normal=patches.normal,
@@ -384,9 +384,8 @@ def _patches_on_device(patches: PlanarPatches, slack_m: float, where: wp.Device)
         node_middle=0.5 * (tree_low + tree_high),
         node_half=0.5 * (tree_high - tree_low),
         level=np.cumsum([0, *(len(a) for a, _ in levels[:-1])]),
+        two_sided=patches.two_sided,
     )
-    result.two_sided = patches.two_sided
-    return result
 
 
 def _along_curve(points: np.ndarray) -> np.ndarray:

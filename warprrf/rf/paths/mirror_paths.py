@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warprrf.device import Progress
-from warprrf.geometry.mesh import Mesh, vectors_across
+from warprrf.geometry.mesh import Mesh, headings, vectors_across
 from warprrf.kernels.radio.records import EDGE, MIRROR, SLAB
 from warprrf.rf.paths.images import MirrorImages
-from warprrf.rf.paths.polarisation import turns
+from warprrf.rf.paths.polarisation import across_incidence, turns
 from warprrf.rf.paths.slabs import Walls
 from warprrf.rf.paths.ways import Ways, distinct, stops_of
 from warprrf.rows import Rows
@@ -234,10 +234,9 @@ class ZoneRays:
     def _direct_share(self, ways: Ways) -> np.ndarray:
         """That of line of sight, by rays over the zone's widest place."""
         count, source, receivers = len(ways), ways.stops[:, 0], ways.stops[:, 1]
-        way = source - receivers
-        length = np.linalg.norm(way, axis=1)
+        toward, length = headings(source - receivers)
         radius = self.radius(0.5 * length, 0.5 * length)
-        u, v = vectors_across(way / np.maximum(length, 1e-12)[:, None])
+        u, v = vectors_across(toward)
         offset = _SAMPLES[:, 0, None] * u[:, None] + _SAMPLES[:, 1, None] * v[:, None]
         middle = (0.5 * (receivers + source))[:, None] + radius[:, None, None] * offset
         start = np.broadcast_to(receivers[:, None], middle.shape).reshape(-1, 3)
@@ -257,18 +256,14 @@ class ZoneRays:
     def _mirror_share(self, ways: Ways) -> np.ndarray:
         """That of mirror paths; a zone cuts a patch's plane in an ellipse, longer by 1 / cos."""
         count, order = ways.patch.shape
-        legs = np.diff(ways.stops, axis=1)
-        lengths = np.linalg.norm(legs, axis=2)
-        along = legs / np.maximum(lengths, 1e-12)[..., None]
+        along, lengths = headings(np.diff(ways.stops, axis=1))
         before = np.cumsum(lengths, axis=1)[:, :-1]
         radius = self.radius(before, lengths.sum(axis=1)[:, None] - before)
         around = np.repeat(ways.point[:, None], len(_SAMPLES), axis=1)
         for k in range(order):
             normal = ways.patches.normal[ways.patch[:, k]]
             cosine = np.abs((along[:, k] * normal).sum(axis=1))
-            across = np.cross(along[:, k], normal)
-            size = np.linalg.norm(across, axis=1, keepdims=True)
-            across = np.where(size > 1e-6, across / np.maximum(size, 1e-12), vectors_across(normal)[0])
+            across = across_incidence(along[:, k], normal, vectors_across(normal)[0])
             further = np.cross(normal, across) / np.maximum(cosine, 0.05)[:, None]
             offset = _SAMPLES[:, 0, None] * across[:, None] + _SAMPLES[:, 1, None] * further[:, None]
             around[:, :, k] += radius[:, k, None, None] * offset
@@ -298,9 +293,7 @@ class ZoneRays:
 
     def clear(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Whether nothing lies between a and b (N, 3), or nothing but walls, but within the position error of either end."""
-        way = b - a
-        length = np.linalg.norm(way, axis=1)
-        toward = way / np.maximum(length, 1e-12)[:, None]
+        toward, length = headings(b - a)
         start = a + self.position_error_m * toward
         hit = self.images.patches.mesh.cast(start, toward, device=self.images.device)
         free = (length <= 2 * self.position_error_m) | (hit.t >= length - 2 * self.position_error_m)
@@ -313,13 +306,11 @@ class ZoneRays:
         """Whether the ray from ``start`` first meets a surface, behind walls perhaps, at ``target``, on the plane of ``patch``."""
         p, reached = self.images.patches, np.ones(len(start), bool)
         if self.walls is not None:
-            back = (start - target) / np.maximum(np.linalg.norm(start - target, axis=1, keepdims=True), 1e-12)
-            before = target + 3.0 * self.position_error_m * back
+            before = target + 3.0 * self.position_error_m * headings(start - target)[0]
             reached[:] = np.isin(np.arange(len(start)), self.walls.between(start, before)[0])
             start = before
-        way = target - start
-        length = np.linalg.norm(way, axis=1)
-        hit = p.mesh.cast(start, way / np.maximum(length, 1e-12)[:, None], device=self.images.device)
+        toward, length = headings(target - start)
+        hit = p.mesh.cast(start, toward, device=self.images.device)
         near = np.abs(hit.t - length) <= 2.0 * self.position_error_m
         met = p.face_patch[np.maximum(hit.face, 0)]
         # A torn seam of the patch passes for it, another patch does not.
@@ -352,9 +343,7 @@ def described(ways: Ways, order: int, walls: Walls | None) -> MirrorPaths:
     for k in np.unique(count):
         own = np.flatnonzero(count == k)
         stops = stops_of(ways.stops[own, 0], point[own, :k], ways.stops[own, -1])
-        legs = np.diff(stops, axis=1)
-        lengths = np.linalg.norm(legs, axis=2)
-        along = legs / np.maximum(lengths, 1e-12)[..., None]
+        along, lengths = headings(np.diff(stops, axis=1))
         length[own], arrival[own] = lengths.sum(axis=1), -along[:, -1]
         cosine[own, :k] = np.abs((along[:, :-1] * normal[own, :k]).sum(axis=2))
         turn[own, :k] = turns(stops, normal[own, :k])

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from warprrf.geometry.mesh import vectors_across
+from warprrf.geometry.mesh import headings, vectors_across
 from warprrf.rf.spectra.spectrum import transverse_basis
 
 
@@ -56,13 +56,17 @@ def _frames(stops: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
     A mirror met head on keeps the plane of the one before.
     """
-    leg = np.diff(stops, axis=1)
-    along = leg / np.maximum(np.linalg.norm(leg, axis=2, keepdims=True), 1e-12)
-    across = np.cross(along[:, :-1], normal)
-    sine = np.linalg.norm(across, axis=2, keepdims=True)
-    least = 1e-6  # sine of incidence below which a mirror has no plane of incidence of its own
+    along, across = headings(np.diff(stops, axis=1))[0], np.zeros(normal.shape)
     for k in range(normal.shape[1]):
         other = across[:, k - 1] if k else vectors_across(along[:, 0])[0]
-        own = across[:, k] / np.maximum(sine[:, k], least)
-        across[:, k] = np.where(sine[:, k] > least, own, other)
+        across[:, k] = across_incidence(along[:, k], normal[:, k], other)
     return along, across
+
+
+def across_incidence(along: np.ndarray, normal: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Unit vectors across the plane of incidence of unit directions ``along`` (L, 3) on what has the unit ``normal`` (L, 3);
+    ``other`` (L, 3) where that is met head on."""
+    across = np.cross(along, normal)
+    sine = np.linalg.norm(across, axis=1, keepdims=True)
+    least = 1e-6  # sine of incidence below which a mirror has no plane of incidence of its own
+    return np.where(sine > least, across / np.maximum(sine, least), other)

@@ -14,7 +14,7 @@ import numpy as np
 
 from warprrf.cache import cached_property
 from warprrf.device import DeviceLike
-from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.mesh import Mesh, headings
 from warprrf.rf.em.fresnel import slab_transmission
 from warprrf.rows import Rows
 
@@ -108,10 +108,8 @@ class Walls:
     def between(self, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, Slabs]:
         """Which of the ways from ``start`` to ``end``, (N, 3) or (3,), arrive, and the slabs that those pass."""
         start, end = (np.ascontiguousarray(a) for a in np.broadcast_arrays(start, end))
-        way = end - start
-        length = np.linalg.norm(way, axis=-1)
+        toward, length = headings(end - start)
         arrived = [(np.zeros(0, int), Slabs.none(0, self.most))]
-        toward = way / np.maximum(length, 1e-12)[..., None]
         for row, face, _, slabs in self._stops(start, toward, length - self.clearance_m):
             there = row[face < 0]
             arrived.append((there, slabs.take(there)))

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from warprrf.device import DeviceLike
-from warprrf.geometry.mesh import ENDPOINT_CLEARANCE
+from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, headings
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.rf.paths.slabs import Slabs, Walls
 from warprrf.rows import Rows
@@ -72,7 +72,7 @@ class Ways(Rows):
         the tolerance is met.
         """
         begin, end = self.legs(self.patches.tolerance_m)
-        toward = (end - begin) / np.maximum(np.linalg.norm(end - begin, axis=2, keepdims=True), 1e-12)
+        toward = headings(end - begin)[0]
         begin[:, 1:] -= ENDPOINT_CLEARANCE * toward[:, 1:]
         end[:, :-1] += ENDPOINT_CLEARANCE * toward[:, :-1]
         free = np.ones(len(self), bool)

@@ -267,8 +267,7 @@ def spread_paths(
     if len(positive) == 0:
         return SpreadPaths(np.zeros((rows, columns)), np.full((rows, columns), -1, dtype=np.int32))
     d, power = unit_vectors("directions", d[positive]), power[positive]
-    row, column = pixel_of(d, (rows, columns))
-    cell = (row * columns + column).astype(np.int32)
+    cell = np.ravel_multi_index(pixel_of(d, shape), shape).astype(np.int32)
     order = np.argsort(cell, kind="stable")
     starts = np.zeros(rows * columns + 1, dtype=np.int32)
     starts[1:] = np.cumsum(np.bincount(cell, minlength=rows * columns))
@@ -279,7 +278,7 @@ def spread_paths(
     near, total = np.ascontiguousarray(known[order].T)
     image = wp.zeros((rows, columns), dtype=wp.float64, device=where)
     best = wp.zeros((rows, columns), dtype=wp.int32, device=where)
-    inputs = [d[order], power[order] / total, near, starts, *grid, image, best]
+    inputs = [d[order], power[order] / total, near, starts, grid, image, best]
     _device.launch(beam_kernels.gather_beams, rows * columns, inputs, device=where)
     index = best.numpy()
     return SpreadPaths(image.numpy(), np.where(index >= 0, positive[order][index], -1).astype(np.int32))
@@ -292,9 +291,8 @@ def beam_sums(
     pixels, one there, shape ``(L, 2)``."""
     where = _device.resolve(device)
     grid = _beam_grid(shape, float(sigma), str(where))
-    row, column = pixel_of(directions, shape)
     sums = [wp.zeros(len(directions), dtype=wp.float64, device=where) for _ in range(2)]
-    inputs = [directions, row * shape[1] + column, *grid, *sums]
+    inputs = [directions, np.ravel_multi_index(pixel_of(directions, shape), shape), grid, *sums]
     _device.launch(beam_kernels.beam_normaliser, len(directions), inputs, device=where)
     return np.stack([one.numpy() for one in sums], axis=1)
 
@@ -328,7 +326,7 @@ def strongest_rays(
     best = wp.zeros(rows * columns, dtype=wp.int32, device=where)
     first_row, least_fall = _least_falls((rows, columns), float(sigma), str(where))
     inputs = [directions, len(power) // (rows * columns), log_power, top, wp.float64(top.max())]
-    inputs += [grid.pixels, grid.half_widths, first_row, least_fall, grid.kappa, grid.chord_limit, best]
+    inputs += [grid, first_row, least_fall, best]
     _device.launch(beam_kernels.strongest_rays, rows * columns, inputs, device=where)
     return best.numpy().reshape(rows, columns)
 
@@ -340,13 +338,11 @@ def unit_beams(
 
     The same beams as :func:`spread`, all images at once: for tens of paths, not for thousands.
     """
-    rows, columns = check_shape(shape)
-    where = _device.resolve(device)
-    row, column = pixel_of(directions, (rows, columns))
+    shape, where = check_shape(shape), _device.resolve(device)
     near, total = beam_sums(directions, shape, sigma, device=where).T
-    images = wp.zeros((len(directions), rows, columns), dtype=wp.float32, device=where)
-    beam = _beam_grid((rows, columns), float(sigma), str(where))
-    inputs = [directions, row * columns + column, near, total, *beam, images]
+    images = wp.zeros((len(directions), *shape), dtype=wp.float32, device=where)
+    grid = _beam_grid(shape, float(sigma), str(where))
+    inputs = [directions, np.ravel_multi_index(pixel_of(directions, shape), shape), near, total, grid, images]
     _device.launch(beam_kernels.separate_beams, len(directions), inputs, device=where)
     return images.numpy()
 
@@ -359,17 +355,9 @@ def _cutoff(shape: tuple[int, int], sigma: float) -> float:
     return float(min(max(beam_cutoff * sigma, np.hypot(np.pi / shape[0], 2.0 * np.pi / shape[1])), np.pi))
 
 
-class _BeamGrid(NamedTuple):
-    pixels: wp.array
-    solid_angles: wp.array
-    half_widths: wp.array
-    kappa: wp.float64
-    chord_limit: wp.float64
-
-
 @lru_cache(maxsize=8)
-def _beam_grid(shape: tuple[int, int], sigma: float, device: str) -> _BeamGrid:
-    """What both beam kernels need; ``half_widths[i, m]`` columns either side hold row i's share of paths in row m."""
+def _beam_grid(shape: tuple[int, int], sigma: float, device: str) -> Any:
+    """The grid, for beams of width ``sigma``, as :class:`~warprrf.kernels.radio.beam.BeamGrid` on the device."""
     rows, columns = shape
     cutoff = _cutoff(shape, sigma)
     zenith = pixel_angles(shape)[0]
@@ -383,13 +371,10 @@ def _beam_grid(shape: tuple[int, int], sigma: float, device: str) -> _BeamGrid:
     azimuth = 2.0 * np.arcsin(np.sqrt(np.clip(np.nan_to_num(ratio, nan=1.0, posinf=1.0), 0.0, 1.0)))
     half = np.ceil(azimuth * columns / (2.0 * np.pi) + 0.5).astype(np.int32)
     half = np.where(room < 0, -1, np.minimum(half, columns)).astype(np.int32)
-    return _BeamGrid(
-        pixels=wp.array(pixel_directions(shape), dtype=wp.vec3d, device=device),
-        solid_angles=wp.array(pixel_solid_angles(shape), dtype=wp.float64, device=device),
-        half_widths=wp.array(half, dtype=wp.int32, device=device),
-        kappa=wp.float64(1.0 / sigma**2),
-        chord_limit=wp.float64(4.0 * np.sin(0.5 * cutoff) ** 2 * (1.0 + 1e-12)),
-    )
+    return _device.filled(
+        beam_kernels.BeamGrid, device, pixels=pixel_directions(shape), solid_angles=pixel_solid_angles(shape), half_widths=half,
+        kappa=1.0 / sigma**2, chord_limit=4.0 * np.sin(0.5 * cutoff) ** 2 * (1.0 + 1e-12),
+    )  # fmt: skip
 
 
 @lru_cache(maxsize=8)

@@ -78,7 +78,7 @@ ARRAYS = {
 
 @dataclass(frozen=True)
 class Parameters:
-    """Radio parameters of the groups.
+    """Radio parameters of the groups of a surface, or of the materials that a fit takes several of them for: G rows of either.
 
     Attributes:
         log_weight: ln of the lobe weights, shape ``(G, L)``; their sum is S^2.
@@ -219,7 +219,8 @@ class Model:
 
 class Layout:
     """Order of the free parameters in a vector: per group lobes, excess, mirror, and what it lets through; then the common gain,
-    then the power of the carrier that roughness goes with, then the gains of measuring chains.
+    then the power of the carrier that roughness goes with, then the gains of measuring chains. Groups stand for materials where
+    those are fitted.
 
     Attributes:
         groups, lobes: how many.

@@ -90,6 +90,15 @@ def sequence(count: int, each: int) -> np.ndarray:
     return np.mod(steps[:, None] + shift, 1.0)  # the R3 sequence (Roberts 2018), shifted
 
 
+def by_cosine(normal: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Directions (N, 3) about ``normal`` (N, 3), of a density proportional to the cosine where ``u`` and ``v`` (N,) fill the unit
+    square; that cosine is sqrt(1 - u)."""
+    radius, turn = np.sqrt(u), 2.0 * np.pi * v
+    across, over = vectors_across(normal)
+    directions = (radius * np.cos(turn))[:, None] * across + (radius * np.sin(turn))[:, None] * over
+    return np.asarray(directions + np.sqrt(1.0 - u)[:, None] * normal)
+
+
 class RayGrid:
     """Rays that fill the sphere around a receiver, and other rays, on one surface.
 
@@ -160,11 +169,8 @@ class RayGrid:
         s = self.surface
         behind, tile = np.divmod(tile, len(s.tiles.face))
         normal = s.side_normal[s.tiles.face[tile]] * (1.0 - 2.0 * behind)[:, None]
-        radius, turn = np.sqrt(u), 2.0 * np.pi * v
-        across, over = vectors_across(normal)
-        directions = (radius * np.cos(turn))[:, None] * across + (radius * np.sin(turn))[:, None] * over
-        directions += np.sqrt(1.0 - u)[:, None] * normal
-        return self.hit_along(point + s.position_error_m * normal, directions, np.ones(len(tile)))
+        start, directions = point + s.position_error_m * normal, by_cosine(normal, u, v)
+        return self.hit_along(start, directions, np.ones(len(tile)))
 
     def tiles_met(self, hits: Hits) -> tuple[np.ndarray, np.ndarray]:
         """Which rays hit something, and the sides of tiles that they do."""

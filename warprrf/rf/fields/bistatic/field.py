@@ -357,12 +357,13 @@ class BistaticField(RadioField):
         field = self.on_grid(shape)
         if view is not None:
             return field._seen(view, uncertainty)
-        return field._looked(
-            receivers, transmitter, lambda *link: field._seen(field._view(*link), uncertainty)
-        )
+        look = partial(field._trace_spectrum, uncertainty=uncertainty)
+        return field._looked(receivers, transmitter, look)
 
-    def _trace_spectrum(self, receiver: np.ndarray, transmitter: np.ndarray) -> Spectrum:
-        return self._seen(self._view(receiver, transmitter), False)
+    def _trace_spectrum(
+        self, receiver: np.ndarray, transmitter: np.ndarray, uncertainty: bool = False
+    ) -> Spectrum:
+        return self._seen(self._view(receiver, transmitter), uncertainty)
 
     def _seen(self, view: View, uncertainty: bool) -> Spectrum:
         gains = self.path_gains(view)

@@ -262,12 +262,7 @@ def cross_validate(t: Training, choice: Solution) -> tuple[bool, ErrorModel | No
             model = t.model(own, residual=residual)
             learned = with_residual(t, model, kept) if residual else model
             found += t.predicted(learned, held)
-    loss = {
-        residual: float(
-            np.mean([t.observations[k].losses(x).mean() for k, x in zip(order, own, strict=True)])
-        )
-        for residual, own in power.items()
-    }
+    loss = {residual: t.mean_loss(order, own) for residual, own in power.items()}
     clearly_worse = 1.05  # one that is learned from all receivers gains more
     keep = loss[True] < clearly_worse * loss[False] if free else choice.effects.residual
     for residual, error in loss.items():

@@ -1,9 +1,12 @@
-"""Fitting material parameters to readings: damped Gauss-Newton in dB.
+"""Fitting material parameters to readings: Gauss-Newton in dB, damped as by Levenberg and Marquardt.
 
 Of each material the fit learns the weights of its scattering lobes, one permittivity (the Fresnel curve that lobes and
 mirror share) and the strength of its mirror reflection. All are positive, so their logarithms are fitted. Priors keep
 what no spectrum shows near plausible values and tie a surface's scattered and mirrored shares together, because they
-split one reflection (S^2 and 1 - S^2).
+split one reflection (S^2 and 1 - S^2). Also free, where the readings can tell, are the share that each lets through (where
+paths pass slabs), and of all together a common gain (an uncalibrated receiver), the power of the carrier that roughness goes with
+(several carriers) and the gains of measuring chains. Slopes of scattered light come from :meth:`Columns.slopes`, those of line of
+sight and mirrors from the kernel of records, or where phases count from :meth:`Observation.heard_slopes`.
 
 Parameters are fitted to a few hundred readings at each of many places: a :class:`Batch` is one table of several places'
 readings, because what is computed of all at once costs a fraction of what each costs alone.

@@ -93,10 +93,14 @@ class Place:
     chain: str = ""
 
     @property
+    def lit_from(self) -> tuple[object, ...]:
+        """All of :attr:`seen_from` but the receiver: one tracer serves places where it is the same."""
+        return self.transmitter.tobytes(), self.frequency_hz, self.shape, self.beam_sigma_rad, self.air
+
+    @property
     def seen_from(self) -> tuple[object, ...]:
         """All that the geometry seen there depends on."""
-        ends = self.transmitter.tobytes(), self.receiver.tobytes()
-        return *ends, self.frequency_hz, self.shape, self.beam_sigma_rad, self.air
+        return *self.lit_from, self.receiver.tobytes()
 
 
 Seen = tuple[Place, View]
@@ -474,7 +478,7 @@ class _Tables(Kind):
     """Tables of readings: horns, power alone, taps of delay."""
 
     one: Readings
-    _pointings: list[tuple[np.ndarray, np.ndarray] | None] = field(default_factory=list)
+    _pointings: Cache = field(init=False, default_factory=lambda: Cache(1))
 
     def places(self) -> list[Place]:
         one = self.one
@@ -503,8 +507,8 @@ class _Tables(Kind):
         floor = float(floors.min())
         step = None if one.bandwidth_hz is None else 1.0 / (TAP_STEPS * one.bandwidth_hz)
         weigh = partial(path_weights, one, rows, dtype=np.float32)
-        self._pointings[:] = self._pointings or [_pointings(one, view)]
-        if (known := self._pointings[0]) is not None:
+        known = self._pointings.get(view.tracer.grid.sub_pixels, lambda: _pointings(one, view))
+        if known is not None:
             measured = WeighedPaths.turned(view, weigh, known[0], known[1][rows])
         else:
             told_apart = {"arrival": one.arrival is not None, "departure": one.departure is not None}

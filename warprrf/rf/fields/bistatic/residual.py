@@ -72,9 +72,7 @@ def shares_of(o: Observation, model: Model) -> Shares:
     return Shares(o, own, rest)
 
 
-def fit_residual(
-    shares: Sequence[Shares], surface: Surface, *, quick: bool = False, noise_db: float = NOISE_DB
-) -> np.ndarray:
+def fit_residual(shares: Sequence[Shares], surface: Surface, *, quick: bool = False) -> np.ndarray:
     """ln of each cell's gains over its group's, shape ``(2, X)``; zero where nothing is seen of it.
 
     A cell's gain is the product of its element's and its own, each log-normal about 1: few spectra move elements, many
@@ -84,7 +82,6 @@ def fit_residual(
         shares: one for each training receiver.
         surface: whose cells they are.
         quick: with few steps, which find three quarters of what is to be found.
-        noise_db: standard deviation of a reading's error.
     """
     rounds, conjugate = (2, 8) if quick else (4, 12)  # Gauss-Newton steps, and of conjugate gradients in each
     own_rows = [slice(*own) for own in pairwise(np.cumsum([0, *(len(s.rest) for s in shares)]))]
@@ -130,7 +127,7 @@ def fit_residual(
             for s, own in zip(shares, own_rows, strict=True):
                 total = np.maximum(pull[own], 0.0) + s.rest
                 error, slope = s.observed.target.error(total), s.observed.target.slope(total)
-                robust = huber(error, s.observed.huber_db)[1] / noise_db**2
+                robust = huber(error, s.observed.huber_db)[1] / NOISE_DB**2
                 pull[own], weight[own] = slope * robust * error, slope**2 * robust
 
             def curvature(v: np.ndarray, gain: np.ndarray = gain, weight: np.ndarray = weight) -> np.ndarray:

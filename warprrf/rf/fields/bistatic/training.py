@@ -90,7 +90,7 @@ def trace(
     keeps = keeps and rays_of(places, sub_pixels) <= MOST_KEPT
     together: dict[tuple[object, ...], list[int]] = {}  # places under one transmitter
     for k, place in enumerate(places):
-        together.setdefault((place.transmitter.tobytes(), *place.seen_from[2:]), []).append(k)
+        together.setdefault(place.lit_from, []).append(k)
     views: dict[int, View] = {}
     for own in together.values():
         first = places[own[0]]
@@ -212,17 +212,17 @@ class Training:
     @property
     def deciding(self) -> np.ndarray:
         """Places by which effects and materials are decided: with few receivers all of them."""
-        if len(self.held) < LEAST_RECEIVERS:
+        enough = 4  # places held out, to decide by
+        if len(self.held) < enough:
             return np.arange(len(self.places))
         return np.union1d(self.few(2), self.held)
 
     def and_at(self, places: np.ndarray, seen: Sequence[Seen]) -> Training:
         """With what was read at ``places`` (P,), where that is ``seen``, and readings of them that parameters are fitted to."""
-        found = observe(self.data, seen, self.frequency_hz, self.chains)
-        parts = [self._part(o) for o in found]
-        own = places.tolist()
-        observations = _with(self.observations, own, found)
-        return replace(self, observations=observations, parts=_with(self.parts, own, parts))
+        observed = observe(self.data, seen, self.frequency_hz, self.chains)
+        found = self.observations | dict(zip(places.tolist(), observed, strict=True))
+        parts = self.parts | {k: self._part(found[k]) for k in places.tolist()}
+        return replace(self, observations=dict(sorted(found.items())), parts=dict(sorted(parts.items())))
 
     def _part(self, o: Observation) -> Observation:
         """Readings of a place that parameters are fitted to, and what they count."""
@@ -332,14 +332,18 @@ class Training:
 
     def loss(self, model: Model, places: Sequence[int] | np.ndarray) -> float:
         """Mean loss of all readings at ``places`` [dB^2]."""
-        predicted = self.predicted(model, places)
-        own = [self.observations[int(k)].losses(x).mean() for k, x in zip(places, predicted, strict=True)]
-        return float(np.mean(own))
+        return self.mean_loss(places, self.predicted(model, places))
+
+    def mean_loss(self, places: Iterable[int], predicted: Iterable[np.ndarray]) -> float:
+        """The same of what is ``predicted`` at each, in units of its floor."""
+        each = zip(places, predicted, strict=True)
+        return float(np.mean([self.observations[k].losses(x).mean() for k, x in each]))
 
     def held_loss(self, choice: Solution) -> float:
         """Mean square error at the places held out, without residual [dB^2]: of all readings where they are few, else of
         those chosen."""
-        if len(self.held) <= LEAST_RECEIVERS:
+        few = 4  # places, of which all readings are looked at
+        if len(self.held) <= few:
             return self.loss(self.model(choice), self.held)
         return self.part_loss(choice, self.held)
 
@@ -395,10 +399,3 @@ def _counted(progress: Progress | None, count: int, total: int) -> Callable[...,
             progress("fit", done * count, total * count)
 
     return step
-
-
-def _with(
-    known: dict[int, Observation], places: list[int], more: list[Observation]
-) -> dict[int, Observation]:
-    """Observations by place, in their order."""
-    return dict(sorted([*known.items(), *zip(places, more, strict=True)]))
