@@ -83,7 +83,7 @@ class Light:
         return np.flatnonzero(bright)
 
 
-def sequence(count: int, each: int) -> np.ndarray:
+def quasi_random(count: int, each: int) -> np.ndarray:
     """Numbers that fill the unit cube, ``each`` for each of ``count``, shape ``(3, count, each)``."""
     steps = np.multiply.outer([0.8191725133961645, 0.6710436067037893, 0.5497004779019703], np.arange(each))
     shift = np.random.default_rng(0).random((3, count, 1))

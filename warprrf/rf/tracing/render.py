@@ -15,7 +15,7 @@ from scipy.sparse import csr_matrix
 
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.tracing.model import Effects, Model, Parameters
-from warprrf.rf.tracing.rays import sequence
+from warprrf.rf.tracing.rays import quasi_random
 from warprrf.rf.tracing.records import Materials, Records
 from warprrf.rf.tracing.tracer import SPECULAR, Rays, Tracer, View
 
@@ -140,7 +140,7 @@ class Interreflection:
         # Rays start everywhere on what is open of a side, strata of its area in their order.
         order, known = np.argsort(side, kind="stable"), np.flatnonzero(open_m2)
         upto = np.cumsum(area[order])
-        place, *turn = sequence(len(known), ELEMENT_RAYS)
+        place, *turn = quasi_random(len(known), ELEMENT_RAYS)
         below = (np.cumsum(open_m2) - open_m2)[known, None] + place * open_m2[known, None]
         first, last = (np.searchsorted(side[order], known, end)[:, None] for end in ("left", "right"))
         chosen = np.clip(np.searchsorted(upto, below), first, last - 1)

@@ -32,7 +32,7 @@ from warprrf.rf.paths.polarisation import turns
 from warprrf.rf.paths.slabs import Slabs, Walls
 from warprrf.rf.spectra.spectrum import unit_beams
 from warprrf.rf.tracing.model import Effects
-from warprrf.rf.tracing.rays import NEAREST_M, Hits, RayGrid, sequence
+from warprrf.rf.tracing.rays import NEAREST_M, Hits, RayGrid, quasi_random
 from warprrf.rf.tracing.records import Interactions, Records
 from warprrf.rf.tracing.surface import Surface
 
@@ -462,7 +462,7 @@ class Tracer:
             point[tile[first]] = place[first]
             again = np.repeat(first, few)
             hits = self.grid.hit_from(
-                tile[again], place[again], *sequence(len(first), few)[1:].reshape(2, -1)
+                tile[again], place[again], *quasi_random(len(first), few)[1:].reshape(2, -1)
             )
         if most:
             air = self.reached(0)
