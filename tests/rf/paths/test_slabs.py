@@ -153,6 +153,24 @@ def test_what_scatters_before_and_behind_a_slab_is_the_integral_over_the_floor()
     assert by_field.sum() == pytest.approx(found["MTS"], rel=0.02)
 
 
+def test_what_is_lit_through_a_slab_is_as_late_as_in_the_exact_engine():
+    """Behind a wall nothing is lit in the air: a pixel's strongest path is still one of single scattering."""
+    effects = Effects(mirrors=0, scatterings=1, mirror_scatter=False, scatter_mirror=False, diffractions=0)
+    effects, shape = replace(effects, residual=False), (18, 36)
+    frame = SpectrumDataset.empty(
+        transmitter=TX, frequency_hz=F, shape=shape, beam_sigma_rad=0.1, floor=1e-20
+    )
+    found = BistaticField.prior(SHEET, frame, effects=effects).spectrum(RX)
+    engine = ExactEngine(
+        SHEET, transmitter=TX, frequency_hz=F, shape=shape, beam_sigma_rad=0.1, effects=effects
+    )
+    known, power = engine.receive(RX), found.path_gain
+    bright = power > 1e-4 * power.max()
+    assert bright.sum() > 50 and np.isfinite(found.delay_s[bright]).all()
+    apart = np.abs(found.delay_s - known.delay_s)[bright]  # lobes and rays are others
+    assert np.median(apart) < 0.3e-9 and np.mean(apart < 1e-9) > 0.9
+
+
 def test_spectra_do_not_jump_at_a_shadow_s_boundary():
     """The receiver rises past the shadow of a half plane: the total is that of the fields, on both sides."""
     corners = np.array([[0, -50, -50], [0, -50, 0], [0, 50, 0], [0, 50, -50.0]])

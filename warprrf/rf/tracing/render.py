@@ -70,8 +70,8 @@ class PathGains:
 
     @property
     def single(self) -> np.ndarray:
-        """Of what the transmitter lights and the receiver sees directly, by ray, shape ``(R K,)``."""
-        return self.by_ray(["S"])
+        """Of what the transmitter lights, through slabs too, and the receiver sees directly, by ray, shape ``(R K,)``."""
+        return self.by_ray(name for name in self.powers if name.rstrip("0123456789") in ("S", "TS"))
 
 
 def materials_of(tracer: Tracer, p: Parameters, effects: Effects) -> Materials:
