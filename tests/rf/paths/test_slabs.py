@@ -171,12 +171,17 @@ def test_what_is_lit_through_a_slab_is_as_late_as_in_the_exact_engine():
     assert np.median(apart) < 0.3e-9 and np.mean(apart < 1e-9) > 0.9
 
 
-def test_spectra_do_not_jump_at_a_shadow_s_boundary():
-    """The receiver rises past the shadow of a half plane: the total is that of the fields, on both sides."""
+METAL = itu_material("metal")
+SCREEN = Material.custom("screen", relative_permittivity=6.0, conductivity=0.01, thickness_m=0.004)
+WALL = Material.custom("wall", relative_permittivity=2.0, conductivity=0.005, thickness_m=0.2)
+
+
+@pytest.mark.parametrize("material", [METAL, SCREEN, WALL], ids=lambda material: material.name)
+def test_spectra_do_not_jump_at_a_shadow_s_boundary(material):
+    """The receiver rises past the shadow of a half plane, which may let a part through: the total is that of the fields, on both
+    sides."""
     corners = np.array([[0, -50, -50], [0, -50, 0], [0, 50, 0], [0, 50, -50.0]])
-    scene = Scene(
-        Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]])), [itu_material("metal")], np.zeros(2, np.int32)
-    )
+    scene = Scene(Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]])), [material], np.zeros(2, np.int32))
     start, total = np.array([-10.0, 0, -1]), []
     for z in (0.9, 0.98, 0.999, 1.001, 1.02, 1.1, 1.3):
         found = trace_paths(
@@ -184,13 +189,15 @@ def test_spectra_do_not_jump_at_a_shadow_s_boundary():
             transmitter=start,
             receivers=[10, 0.1, z],
             frequency_hz=10e9,
+            transmissions=1,
             diffractions=1,
             mirror_order=0,
         )
         whole = 0.5 * (np.abs(found.jones.sum(axis=0)) ** 2).sum()
         assert together(found).power.sum() == pytest.approx(whole, rel=0.01)  # other edges are far
         total.append(10 * np.log10(whole))
-    assert np.abs(np.diff(total)[2]) < 0.05 and np.all(np.diff(total) > 0)
+    assert np.abs(np.diff(total)[2]) < 0.05
+    assert material is not METAL or np.all(np.diff(total) > 0)
 
 
 @pytest.mark.parametrize(("kind", "most"), [("edge", 0), ("edge", 2), ("slab", 2)])
