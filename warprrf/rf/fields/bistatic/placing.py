@@ -121,6 +121,7 @@ def position_offset(one: Readings, o: Observation, other: np.ndarray, power: np.
         power: of those paths, shape ``(L,)``; both in the units of the target, gain of the chain included.
     """
     place, paths, std = o.place, o.view.paths, one.position_std_m
+    bent, (_, toward, _) = paths.over_edge[:, None], direct_paths(o.view)
     most = 2.0 * std  # along each axis
     s = o.view.tracer.surface
     image = place.receiver + paths.arrival * paths.length_m[:, None]
@@ -134,8 +135,9 @@ def position_offset(one: Readings, o: Observation, other: np.ndarray, power: np.
         out = image - place.receiver - offset
         length = np.linalg.norm(out, axis=1)
         arrival = out / length[:, None]
-        departure = (turn @ arrival[:, :, None])[..., 0]
-        weight = path_weights(one, place.rows, arrival, departure, length / SPEED_OF_LIGHT)
+        departure = np.where(bent, toward, (turn @ arrival[:, :, None])[..., 0])  # an edge stays where it is
+        delay_s = (length + paths.excess_m) / SPEED_OF_LIGHT
+        weight = path_weights(one, place.rows, arrival, departure, delay_s)
         missed = o.target.error(other + weight @ power) / NOISE_DB
         return np.concatenate([missed, offset / std])
 
