@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from radio_scenes import box_mesh, joined
+from scipy.spatial.transform import Rotation
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.fresnel import slab_passage, slab_reflection, slab_transmission
@@ -69,6 +70,25 @@ def test_one_wall_lets_the_same_through_however_it_is_drawn(how):
     assert found.kind.tolist() == expected.kind.tolist() == ["slab", "slab"]
     np.testing.assert_allclose(found.gain, expected.gain, rtol=1e-9)
     np.testing.assert_allclose(found.tau, expected.tau, rtol=1e-12)
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+@pytest.mark.parametrize("turn", [0.0, 1e-3, -1e-3, 0.4])
+def test_a_corner_lets_the_same_through_however_it_is_turned(turn, swapped):
+    """Faces at right angles are two sheets: rounding of the angle between them does not decide."""
+    vertices, faces = box_mesh([-0.1, -2.0, 0.0], [0.1, 0.01, 3.0])
+    turned = Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix()
+    scene = Scene(Mesh(vertices @ turned.T, faces), [GLASS], np.zeros(len(faces), np.int32))
+    ends = np.array([[-2.0, -1.0, 1.5], [2.0, 1.0, 1.5]])[:: -1 if swapped else 1] @ turned.T
+    found = trace_paths(
+        scene, transmitter=ends[0], receivers=ends[1], frequency_hz=F, mirror_order=0, transmissions=2
+    )
+    assert found.interactions[:, :2].tolist() == [[4, 4]]
+    eta, wavelength_m = GLASS.permittivity(F), SPEED_OF_LIGHT / F
+    front, side = (slab_transmission(c / 5**0.5, eta, 0.01, wavelength_m) for c in (2.0, 1.0))
+    power = 0.5 * sum(np.abs(a * b) ** 2 for a, b in zip(front, side, strict=True))
+    free = SPEED_OF_LIGHT / F / (4 * np.pi * np.linalg.norm(ends[1] - ends[0]))
+    assert found.power[0] == pytest.approx(power * free**2, rel=1e-6)
 
 
 def test_five_panes_let_through_what_each_does():

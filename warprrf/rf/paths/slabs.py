@@ -1,8 +1,8 @@
 """What stands on a straight way and lets a wave through: slabs, found by rays.
 
 Two faces of one closed part, met one after the other and turned against each other, at most :data:`THICKEST_M` apart, are
-one slab of that thickness. Any other face is a sheet: a slab as thick as its material is said to be. So a wall drawn as a
-sheet and the same wall drawn as a closed solid let the same through. The way is not bent.
+one slab of that thickness. Any other face is a sheet, at corners too: a slab as thick as its material is said to be. So a
+wall drawn as a sheet and the same wall drawn as a closed solid let the same through. The way is not bent.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ MOST_SLABS = 8
 """Most that may be asked for on one way: five partitions stand between the ends of links on a floor of offices."""
 THICKEST_M = 1.0
 """Thicker solids are taken to be hollow, a cabinet's or a room's: two sheets."""
+AGAINST = -0.1
+"""Largest cosine between the normals of faces that are turned against each other: at right angles rounding must not decide."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +161,7 @@ class Walls:
             again = again[self._part[face[again]] == self._part[before[again]]]
             r, k = row[again], place[again]
             apart = (t[again] - slabs.range_m[r, k]) * slabs.cosine[r, k]
-            back = (apart <= THICKEST_M) & (_dot(normal[face[again]], normal[before[again]]) < 0.0)
+            back = (apart <= THICKEST_M) & (_dot(normal[face[again]], normal[before[again]]) < AGAINST)
             slabs.thickness_m[r[back], k[back]] = apart[back]
             out = np.zeros(len(row), bool)
             out[again[back]] = True
