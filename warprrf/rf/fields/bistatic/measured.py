@@ -280,7 +280,7 @@ class Superposition(Rows):
 
     Attributes:
         field: amplitude of each reading for a path of amplitude 1, phase of its length included, shape ``(L, N)``.
-        power: what adds in power beside, because lengths are not known so well, shape ``(L, N)`` float32.
+        power: what adds in power beside, because lengths are not known so well, or nothing of the phase, shape ``(L, N)`` float32.
         sent, heard: fields of the antennas at both ends of each path, shape ``(L, 2)``; see :func:`vertical_ends`.
     """
 
@@ -338,6 +338,9 @@ class ArrayImage(ByPixels):
         heard *= np.sqrt(array.gain(paths.arrival))[:, None]
         wavelength = view.tracer.wavelength_m
         kept = np.exp(-0.5 * (2.0 * np.pi * length_std_m / wavelength) ** 2)
+        kept = np.where(paths.over_edge, 0.0, kept)[
+            :, None
+        ]  # by which phase an edge turns a field is not known
         phase = np.exp(-2j * np.pi * np.mod(paths.delay_m / wavelength, 1.0))
         together = Superposition(
             (kept * phase[:, None] * heard).astype(np.complex64),
