@@ -333,6 +333,21 @@ def test_what_glass_lets_through_is_found_at_any_carrier_or_said_to_be_left_out(
         assert sight == pytest.approx(friis**2 * np.mean(np.abs(waves) ** 2), rel=1e-6)
 
 
+@pytest.mark.parametrize("carrier_hz", [28e9, 140e9, 300e9])
+def test_what_a_slab_is_made_of_does_not_hang_on_what_it_is_called(carrier_hz):
+    """A material of ITU-R P.2040 under a name of its own, and one of several bands that is in no recommendation."""
+    glass = itu_material("glass", thickness_m=0.01)
+    mesh, part = joined(ROOM, box_mesh([2.5, 0.0, 0.0], [2.51, 4.0, 3.0]))
+    frame = SpectrumDataset.empty(transmitter=TX, frequency_hz=carrier_hz, shape=(12, 24))
+    effects, found = Effects(mirrors=0, scatterings=0, transmissions=1, diffractions=0), []
+    for one in glass, replace(glass, name="window"), replace(glass, name="screen", itu=None):
+        scene = Scene(mesh, [Material("walls", ()), one], part)
+        field = BistaticField.prior(scene, frame, effects=effects)
+        assert field.surface.slabs(carrier_hz)[0][1] == pytest.approx(glass.permittivity(carrier_hz))
+        found.append(field.links(RECEIVERS[3]).total_path_gain)
+    np.testing.assert_allclose(found, found[0], rtol=1e-6)
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_walls_let_through_at_another_carrier_what_they_are_taken_to_there(known):
     """Of a fit to nothing: slabs count in wavelengths, whether their material is known or assumed."""

@@ -242,7 +242,7 @@ class BistaticField(RadioField):
         Raises:
             TypeError: for a geometry without a mesh.
         """
-        surface = Surface.of(geometry)
+        surface = Surface.of(geometry, frequency_hz=ds.frequency_hz)
         return cls(
             surface=surface,
             transmitter=ds.transmitter,
