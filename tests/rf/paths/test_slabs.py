@@ -72,6 +72,20 @@ def test_one_wall_lets_the_same_through_however_it_is_drawn(how):
     np.testing.assert_allclose(found.tau, expected.tau, rtol=1e-12)
 
 
+@pytest.mark.parametrize("how", ["solid", "doubled"])
+def test_a_wall_of_unknown_material_is_as_late_however_it_is_drawn(how):
+    """A field assumes what such a wall absorbs; of its delay it knows nothing."""
+    effects = Effects(mirrors=0, scatterings=0, transmissions=1, diffractions=0)
+    frame = SpectrumDataset.empty(transmitter=TX, frequency_hz=F, shape=(12, 24))
+    found = []
+    for scene in SHEET, WALLS[how]:
+        nameless = Scene(scene.mesh, [FLOORING, Material("partition", ())], scene.face_material)
+        found.append(BistaticField.prior(nameless, frame, effects=effects).paths(RX))
+    assert found[0].kind.tolist() == found[1].kind.tolist() == ["slab"]
+    np.testing.assert_allclose(found[1].tau, found[0].tau, rtol=1e-9)
+    np.testing.assert_allclose(found[1].power, found[0].power, rtol=1e-6)
+
+
 @pytest.mark.parametrize("swapped", [False, True])
 @pytest.mark.parametrize("turn", [0.0, 1e-3, -1e-3, 0.4])
 def test_a_corner_lets_the_same_through_however_it_is_turned(turn, swapped):

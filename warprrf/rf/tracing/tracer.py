@@ -271,7 +271,8 @@ class Tracer:
 
     def _delayed(self, found: MirrorPaths) -> MirrorPaths:
         """``found`` with what slabs of known materials make them longer by."""
-        table, (row, k) = self.surface.table(self.frequency_hz), np.nonzero(found.slab >= 0)
+        table, known = self.surface.table(self.frequency_hz), np.abs(self.slabs[0])[self.surface.group] > 0
+        row, k = np.nonzero((found.slab >= 0) & known[found.slab])
         group, solid = self.surface.group[found.slab[row, k]], found.thickness_m[row, k]
         longer = table.passage(group, found.cosine[row, k], self.wavelength_m, solid)[2]
         return replace(found, excess_m=np.bincount(row, longer, minlength=len(found)))
