@@ -210,6 +210,30 @@ SCREEN = Material.custom("screen", relative_permittivity=6.0, conductivity=0.01,
 WALL = Material.custom("wall", relative_permittivity=2.0, conductivity=0.005, thickness_m=0.2)
 
 
+def test_a_pane_of_nearly_air_makes_nothing_later():
+    """Delays, departures and points of what is seen through it are those of what lies behind, not of the pane."""
+    air = Material.custom("air", relative_permittivity=1.0001, conductivity=0.0, thickness_m=0.01)
+    effects = Effects(mirrors=0, scatterings=1, mirror_scatter=False, diffractions=0, residual=False)
+    frame = SpectrumDataset.empty(
+        transmitter=TX, frequency_hz=F, shape=(18, 36), beam_sigma_rad=0.1, floor=1e-20
+    )
+    spectra, paths, spreads = [], [], []
+    for scene in Scene(Mesh(*FLOOR), [FLOORING], np.zeros(2, np.int32)), room(pane(1.0), air):
+        field = BistaticField.prior(scene, frame, effects=effects)
+        dark = field.parameters.log_weight - 40.0 * (np.arange(field.surface.groups) > 0)[:, None]
+        field = replace(field, parameters=replace(field.parameters, log_weight=dark))
+        spectra.append(field.spectrum(RX))
+        paths.append(field.paths(RX))
+        spreads.append(field.links(RX).delay_spread_s)
+    power, diffuse = spectra[0].path_gain, [p.select(p.kind == "diffuse") for p in paths]
+    bright = power > 1e-4 * power.max()
+    apart = np.abs(spectra[1].delay_s - spectra[0].delay_s)[bright]
+    assert np.mean(apart < 1e-10) > 0.97
+    assert spreads[1] == pytest.approx(spreads[0], rel=0.01)
+    later = [(p.power * p.tau).sum() / p.power.sum() for p in diffuse]
+    assert later[1] == pytest.approx(later[0], rel=0.002)
+
+
 @pytest.mark.parametrize("material", [METAL, SCREEN, WALL], ids=lambda material: material.name)
 def test_spectra_do_not_jump_at_a_shadow_s_boundary(material):
     """The receiver rises past the shadow of a half plane, which may let a part through: the total is that of the fields, on both

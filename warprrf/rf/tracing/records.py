@@ -79,6 +79,7 @@ class Records(Interactions):
         power: path gain without interactions, shape ``(N,)``; its precision is that of what is computed of it.
         ray: ray of the receiver's grid that sees it, or row of a specular path, or side of an element that is lit, ``(N,)``.
         residual_row: which row of the residual holds the gain of the cell that its ray sees, -1 for none.
+        reach_m: of what is seen through slabs, how far along the ray that is [m], shape ``(N,)``; None elsewhere.
         half_width: half of the cosine's stretch that a ray stands for.
     """
 
@@ -86,6 +87,7 @@ class Records(Interactions):
     ray: np.ndarray
     residual_row: int = -1
     half_width: float = 0.0
+    reach_m: np.ndarray | None = None
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(1))
 
     @property

@@ -391,8 +391,9 @@ class BistaticField(RadioField):
     ) -> Paths:
         """Propagation paths; see :meth:`RadioField.paths`.
 
-        A diffuse path goes over the point that the pixel's strongest ray hits; light that came over more surfaces has no
-        path of its own and is counted to that. ``view`` is what one receiver sees, if it was traced before (:meth:`view`).
+        A diffuse path goes over the point that the pixel's strongest ray hits, behind slabs if most comes from there; light that
+        came over more surfaces has no path of its own and is counted to that. ``view`` is what one receiver sees, if it was
+        traced before (:meth:`view`).
         """
         if view is None:
             return super().paths(

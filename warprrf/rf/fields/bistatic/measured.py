@@ -192,7 +192,8 @@ class WeighedPaths:
         """Those of one receiver.
 
         Light that comes over several surfaces is taken to leave and to be late as light scattered once is, which the
-        ray that brings it sees: its departure is not known, and its true delay is longer.
+        ray that brings it sees: its departure is not known, and its true delay is longer. So is light that is seen through
+        slabs: to be late as if the first one scattered it.
 
         Args:
             view: what the receiver sees.
