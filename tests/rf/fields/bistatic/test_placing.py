@@ -1,15 +1,18 @@
 """How a receiver stood, where paths pass slabs or go over edges on their way to it."""
 
 import numpy as np
+import pytest
 from radio_scenes import box_mesh, joined, seen
 
 from warprrf.rf.em.materials import Material
+from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.measured import direct_paths
 from warprrf.rf.fields.bistatic.observations import observe
-from warprrf.rf.fields.bistatic.placing import position_offset
+from warprrf.rf.fields.bistatic.placing import position_offset, with_zeros
 from warprrf.rf.paths.trace import trace_paths
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.antenna import horn
+from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings, path_weights
 from warprrf.rf.spectra.spectrum import angles_from_directions
 from warprrf.rf.tracing.model import Effects
@@ -62,3 +65,28 @@ def test_a_path_over_an_edge_leaves_for_the_edge():
     one, o, power = readings(scene, effects, departure=departure, transmit_pattern=horn(np.radians(20.0)))
     assert o.view.paths.over_edge.all()
     assert np.abs(position_offset(one, o, np.zeros(len(one)), power)).max() < 1e-3
+
+
+def test_the_zero_of_azimuths_is_that_of_what_walls_let_through():
+    """At 300 GHz a partition of unknown material takes 40 dB from line of sight: what is heard comes round it, over a mirror."""
+    carrier_hz, source, place = 300e9, np.array([-2.0, -1.0, 1.5]), np.array([2.0, -1.2, 1.2])
+    wall = np.array([[-5, 3, 0], [5, 3, 0], [5, 3, 3], [-5, 3, 3.0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    parting = np.array([[0, -6, -6], [0, 1, -6], [0, 1, 6], [0, -6, 6.0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    mesh, part = joined(wall, parting)
+    scene = Scene(mesh, [Material("wall", ()), Material("partition", ())], part)
+    effects = Effects(mirrors=1, scatterings=0, transmissions=1, diffractions=0, residual=False)
+    frame = SpectrumDataset.empty(transmitter=source, frequency_hz=carrier_hz, shape=(12, 24))
+    paths = BistaticField.prior(scene, frame, effects=effects).paths(place)
+    assert sorted(paths.kind) == ["mirror", "slab"] and paths.kind[0] == "mirror"
+    azimuth = np.radians(np.arange(-180, 180, 10))
+    arrival = np.column_stack([np.full(len(azimuth), np.pi / 2), azimuth])
+    how = {"arrival": arrival, "receive_pattern": horn(np.radians(20.0)), "azimuth_known": False}
+    places = np.repeat(place[None], len(azimuth), axis=0)
+    one = Readings(source, places, np.full(len(azimuth), 1e-9), carrier_hz, 1e-20, **how)
+    power = (
+        path_weights(one, np.arange(len(azimuth)), paths.arrival, paths.departure, paths.tau) @ paths.power
+    )
+    one = Readings(source, places, power, carrier_hz, 1e-6 * power.max(), **how)
+    every = seen(scene, one, effects=effects, decides=False, sub_pixels=1)
+    zero = with_zeros([one], every)[1]["azimuth_zero_deg"]["readings"]
+    assert zero == pytest.approx(0.0, abs=1.0)

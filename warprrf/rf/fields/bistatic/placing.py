@@ -19,9 +19,9 @@ from scipy.optimize import least_squares
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import Measured
 from warprrf.rf.fields.bistatic.measured import direct_paths
-from warprrf.rf.fields.bistatic.observations import NOISE_DB, TAP_STEPS, Observation, Place, Seen
+from warprrf.rf.fields.bistatic.observations import NOISE_DB, TAP_STEPS, Observation, Place, Seen, unmeasured
 from warprrf.rf.spectra.readings import Readings, path_weights
-from warprrf.rf.tracing.model import SETS, Parameters
+from warprrf.rf.tracing.model import SETS
 from warprrf.rf.tracing.render import materials_of
 from warprrf.rf.tracing.tracer import SPECULAR, View
 
@@ -96,8 +96,7 @@ def _clocks(one: Readings, paths: Sequence[tuple[np.ndarray, ...]]) -> np.ndarra
 def _strongest(view: View) -> tuple[np.ndarray, ...]:
     """Powers of its strongest direct paths before any measurement, directions of arrival and departure, delays."""
     tracer = view.tracer
-    prior = materials_of(tracer, Parameters.prior(tracer.surface.groups), SETS["single"])
-    power = view.records[SPECULAR].powers(prior)
+    power = view.records[SPECULAR].powers(materials_of(tracer, unmeasured(view), SETS["single"]))
     most = 20  # count
     kept = np.argsort(-power)[:most]
     return power[kept], *(values[kept] for values in direct_paths(view))
