@@ -258,6 +258,26 @@ def test_spectra_do_not_jump_at_a_shadow_s_boundary(material):
     assert material is not METAL or np.all(np.diff(total) > 0)
 
 
+@pytest.mark.parametrize("carrier_hz", [3.5e9, 28e9, 300e9])
+@pytest.mark.parametrize(("permittivity", "most_db"), [(1.0001, 0.01), (2.0, 0.4)])
+def test_a_pane_beside_a_path_stops_no_more_of_its_zone_than_it_does(permittivity, most_db, carrier_hz):
+    """Line of sight and a mirror path that pass by its border: what goes through it arrives too."""
+    corners = np.array([[0, -50, 0.1], [0, -50, 1.35], [0, 50, 1.35], [0, 50, 0.1]])
+    thin = Material.custom(
+        "thin", relative_permittivity=permittivity, conductivity=0.0, thickness_m=0.02 * 3e8 / carrier_hz
+    )
+    effects = Effects(mirrors=1, scatterings=0, transmissions=1, diffractions=0, residual=False)
+    frame = SpectrumDataset.empty(transmitter=TX, frequency_hz=carrier_hz, shape=(12, 24))
+    found = []
+    for scene in Scene(Mesh(*FLOOR), [FLOORING], np.zeros(2, np.int32)), room((corners, pane(0)[1]), thin):
+        field = BistaticField.prior(scene, frame, effects=effects)
+        view = field.view(RX + [0, 0, 0.001])
+        assert view.paths.kind.tolist().count("los") == 1
+        found.append(np.sort(field.path_gains(view).specular))
+    assert len(found[0]) == len(found[1]) == 2
+    assert np.abs(10 * np.log10(found[1] / found[0])).max() < most_db
+
+
 @pytest.mark.parametrize(("kind", "most"), [("edge", 0), ("edge", 2), ("slab", 2)])
 def test_a_field_s_paths_through_slabs_and_over_edges_are_those_that_are_traced(kind, most):
     """Points, what happens there, and delays, those of slabs included."""

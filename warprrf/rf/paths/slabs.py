@@ -15,7 +15,7 @@ import numpy as np
 from warprrf.cache import cached_property
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.em.fresnel import slab_transmission
+from warprrf.rf.em.fresnel import slab_passage, slab_transmission
 from warprrf.rows import Rows
 
 MOST_SLABS = 8
@@ -73,6 +73,8 @@ class Walls:
     Attributes:
         mesh: the mesh.
         passes: which faces let something through, shape ``(F,)`` bool.
+        permittivity, thickness_m: of the slabs, if they are sheets, shape ``(F,)`` each.
+        wavelength_m: wavelength [m].
         most: most slabs on one way.
         clearance_m: ways end so far before what lies at their end, and go on so far behind each face.
         device: where rays are cast.
@@ -80,6 +82,9 @@ class Walls:
 
     mesh: Mesh
     passes: np.ndarray
+    permittivity: np.ndarray
+    thickness_m: np.ndarray
+    wavelength_m: float
     most: int
     clearance_m: float
     device: DeviceLike = None
@@ -100,7 +105,19 @@ class Walls:
         # A solid is perhaps only a centimetre thick.
         thickness = np.where(mesh.closed_part_of >= 0, np.minimum(thickness_m, 0.01), thickness_m)
         te = slab_transmission(1.0, permittivity, thickness, wavelength_m)[0]
-        return cls(mesh, np.abs(te) ** 2 > 1e-6, most, clearance_m, device)
+        passes = np.abs(te) ** 2 > 1e-6
+        return cls(mesh, passes, permittivity, thickness_m, wavelength_m, most, clearance_m, device)
+
+    def field(self, slabs: Slabs) -> np.ndarray:
+        """Field behind slabs over that without them, mean of both polarisations, complex, shape ``(N,)``."""
+        met = slabs.face >= 0
+        face, solid, found = slabs.face[met], slabs.thickness_m[met], np.ones(met.shape, complex)
+        thickness = np.where(np.isnan(solid), self.thickness_m[face], solid)
+        te, tm, longer = slab_passage(
+            slabs.cosine[met], self.permittivity[face], thickness, self.wavelength_m
+        )
+        found[met] = 0.5 * (te + tm) * np.exp(-2j * np.pi / self.wavelength_m * longer)
+        return np.asarray(found.prod(axis=1))
 
     @cached_property
     def _part(self) -> np.ndarray:
