@@ -160,7 +160,7 @@ def zone_paths(
     A mirror point needs a surface of the patch at that place, not a face of exact outline. Of several reflections the
     middle ray must be free; line of sight and single mirrors may be partly covered anywhere. Where ``walls`` may be
     passed, a path whose middle ray meets some goes through what that one passes, with the share of its zone that arrives
-    freely or through.
+    freely or through; of any other what arrives through walls counts with what they leave of the field.
 
     Args:
         images: Its boxes say how far beside its faces a patch may still mirror, the tolerance of its patches what the position
@@ -179,8 +179,8 @@ def zone_paths(
     """
     zone, parts = ZoneRays(images, wavelength_m), list[MirrorPaths]()
 
-    def keep(ways: Ways, rays: ZoneRays) -> None:
-        share = rays.share(ways)
+    def keep(ways: Ways, rays: ZoneRays, beside: Walls | None = None) -> None:
+        share = rays.share(ways, beside)
         kept = share >= 0.05
         parts.append(replace(described(ways.take(kept), order, walls), share=share[kept]))
 
@@ -193,7 +193,7 @@ def zone_paths(
             own, beyond = zone.through(walls, ways, free)
             kept[own] = False
             keep(beyond, replace(zone, walls=walls))
-        keep(ways.take(kept), zone)
+        keep(ways.take(kept), zone, walls)
     return MirrorPaths.joined(parts)
 
 
@@ -227,11 +227,23 @@ class ZoneRays:
             self.wavelength_m * near * far / np.maximum(near + far, 1e-9) + self.position_error_m**2
         )
 
-    def share(self, ways: Ways) -> np.ndarray:
-        """Share of each path's rays that arrive, shape ``(L,)``."""
-        return self._mirror_share(ways) if ways.patch.shape[1] else self._direct_share(ways)
+    def share(self, ways: Ways, beside: Walls | None = None) -> np.ndarray:
+        """Share of each path's field that arrives: of its rays, and what walls ``beside`` the path let through of others, in phase
+        as far as that leaves them, shape ``(L,)``."""
+        share = self._mirror_share if ways.patch.shape[1] else self._direct_share
+        return np.asarray(np.abs(share(ways, beside)))
 
-    def _direct_share(self, ways: Ways) -> np.ndarray:
+    def _through_any(self, beside: Walls, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Field that arrives through walls over legs from ``begin`` to ``end`` (N, K, 3), complex, shape ``(N,)``."""
+        whole = np.ones(len(begin), complex)
+        for k in range(begin.shape[1]):
+            rows, slabs = beside.between(begin[:, k], end[:, k])
+            own = np.zeros(len(begin), complex)
+            own[rows] = beside.field(slabs)
+            whole *= own
+        return whole
+
+    def _direct_share(self, ways: Ways, beside: Walls | None) -> np.ndarray:
         """That of line of sight, by rays over the zone's widest place."""
         count, source, receivers = len(ways), ways.stops[:, 0], ways.stops[:, 1]
         toward, length = headings(source - receivers)
@@ -245,7 +257,12 @@ class ZoneRays:
         left = np.flatnonzero(free)
         end = source[left // len(_SAMPLES)]
         free[left] = self.clear(self._past(end, middle[left]), end)
-        return np.asarray(free.reshape(count, len(_SAMPLES)).mean(axis=1))
+        field = free.astype(complex)
+        if beside is not None:
+            dark = np.flatnonzero(~free)
+            stops = np.stack([source[dark // len(_SAMPLES)], middle[dark], start[dark]], axis=1)
+            field[dark] = self._through_any(beside, stops[:, :2], stops[:, 1:])
+        return np.asarray(field.reshape(count, len(_SAMPLES)).mean(axis=1))
 
     def _past(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Points so far behind b, seen from a, that a ray to them misses nothing at b, where no surface is, shape ``(N, 3)``."""
@@ -253,7 +270,7 @@ class ZoneRays:
         length = np.linalg.norm(way, axis=1, keepdims=True)
         return np.asarray(b + 2.0 * self.position_error_m / np.maximum(length, 1e-12) * way)
 
-    def _mirror_share(self, ways: Ways) -> np.ndarray:
+    def _mirror_share(self, ways: Ways, beside: Walls | None) -> np.ndarray:
         """That of mirror paths; a zone cuts a patch's plane in an ellipse, longer by 1 / cos."""
         count, order = ways.patch.shape
         along, lengths = headings(np.diff(ways.stops, axis=1))
@@ -268,8 +285,14 @@ class ZoneRays:
             offset = _SAMPLES[:, 0, None] * across[:, None] + _SAMPLES[:, 1, None] * further[:, None]
             around[:, :, k] += radius[:, k, None, None] * offset
         each = ways.take(np.repeat(np.arange(count), len(_SAMPLES)))
-        met = self.reached(each.over(slice(1, -1), around.reshape(-1, order, 3)))
-        return met.reshape(count, len(_SAMPLES)).mean(axis=1)
+        each = each.over(slice(1, -1), around.reshape(-1, order, 3))
+        met = self.reached(each)
+        field = met.astype(complex)
+        if beside is not None:
+            dark = np.flatnonzero(~met)
+            dark = dark[replace(self, walls=beside).reached(each.take(dark))]
+            field[dark] = self._through_any(beside, *each.take(dark).legs(beside.clearance_m))
+        return np.asarray(field.reshape(count, len(_SAMPLES)).mean(axis=1))
 
     def reached(self, ways: Ways) -> np.ndarray:
         """Whether each leg reaches its patch and nothing stands between, or nothing but walls, shape ``(L,)``."""

@@ -1,8 +1,8 @@
 """What stands on a straight way and lets a wave through: slabs, found by rays.
 
 Two faces of one closed part, met one after the other and turned against each other, at most :data:`THICKEST_M` apart, are
-one slab of that thickness. Any other face is a sheet: a slab as thick as its material is said to be. So a wall drawn as a
-sheet and the same wall drawn as a closed solid let the same through. The way is not bent.
+one slab of that thickness. Any other face is a sheet, at corners too: a slab as thick as its material is said to be. So a
+wall drawn as a sheet and the same wall drawn as a closed solid let the same through. The way is not bent.
 """
 
 from __future__ import annotations
@@ -15,13 +15,15 @@ import numpy as np
 from warprrf.cache import cached_property
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh, headings
-from warprrf.rf.em.fresnel import slab_transmission
+from warprrf.rf.em.fresnel import slab_passage, slab_transmission
 from warprrf.rows import Rows
 
 MOST_SLABS = 8
 """Most that may be asked for on one way: five partitions stand between the ends of links on a floor of offices."""
 THICKEST_M = 1.0
 """Thicker solids are taken to be hollow, a cabinet's or a room's: two sheets."""
+AGAINST = -0.1
+"""Largest cosine between the normals of faces that are turned against each other: at right angles rounding must not decide."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,8 @@ class Walls:
     Attributes:
         mesh: the mesh.
         passes: which faces let something through, shape ``(F,)`` bool.
+        permittivity, thickness_m: of the slabs, if they are sheets, shape ``(F,)`` each.
+        wavelength_m: wavelength [m].
         most: most slabs on one way.
         clearance_m: ways end so far before what lies at their end, and go on so far behind each face.
         device: where rays are cast.
@@ -78,6 +82,9 @@ class Walls:
 
     mesh: Mesh
     passes: np.ndarray
+    permittivity: np.ndarray
+    thickness_m: np.ndarray
+    wavelength_m: float
     most: int
     clearance_m: float
     device: DeviceLike = None
@@ -98,7 +105,19 @@ class Walls:
         # A solid is perhaps only a centimetre thick.
         thickness = np.where(mesh.closed_part_of >= 0, np.minimum(thickness_m, 0.01), thickness_m)
         te = slab_transmission(1.0, permittivity, thickness, wavelength_m)[0]
-        return cls(mesh, np.abs(te) ** 2 > 1e-6, most, clearance_m, device)
+        passes = np.abs(te) ** 2 > 1e-6
+        return cls(mesh, passes, permittivity, thickness_m, wavelength_m, most, clearance_m, device)
+
+    def field(self, slabs: Slabs) -> np.ndarray:
+        """Field behind slabs over that without them, mean of both polarisations, complex, shape ``(N,)``."""
+        met = slabs.face >= 0
+        face, solid, found = slabs.face[met], slabs.thickness_m[met], np.ones(met.shape, complex)
+        thickness = np.where(np.isnan(solid), self.thickness_m[face], solid)
+        te, tm, longer = slab_passage(
+            slabs.cosine[met], self.permittivity[face], thickness, self.wavelength_m
+        )
+        found[met] = 0.5 * (te + tm) * np.exp(-2j * np.pi / self.wavelength_m * longer)
+        return np.asarray(found.prod(axis=1))
 
     @cached_property
     def _part(self) -> np.ndarray:
@@ -157,7 +176,7 @@ class Walls:
             again = again[self._part[face[again]] == self._part[before[again]]]
             r, k = row[again], place[again]
             apart = (t[again] - slabs.range_m[r, k]) * slabs.cosine[r, k]
-            back = (apart <= THICKEST_M) & (_dot(normal[face[again]], normal[before[again]]) < 0.0)
+            back = (apart <= THICKEST_M) & (_dot(normal[face[again]], normal[before[again]]) < AGAINST)
             slabs.thickness_m[r[back], k[back]] = apart[back]
             out = np.zeros(len(row), bool)
             out[again[back]] = True

@@ -178,9 +178,9 @@ class FullModel:
         """One spectrum; light over several surfaces is as long as what the same ray sees of single ones."""
         gains = field.path_gains(view)
         if gas:
-            single, powers = view.single_bounce_m(), {}
+            powers = {}
             for name, power in gains.powers.items():
-                length = view.paths.length_m if name == "specular" else single[gains.records[name].ray]
+                length = view.paths.length_m if name == "specular" else view.over_m(gains.records[name])
                 powers[name] = power * 10.0 ** (-0.1 * self.gas_db_per_m * length)
             gains = replace(gains, powers=powers)
         return np.asarray(spectra_of(gains, self.beam)[0])

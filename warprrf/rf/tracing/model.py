@@ -165,10 +165,11 @@ class Parameters:
         return replace(self, **rows)
 
     def at_ratio(self, ratio: float) -> Parameters:
-        """Those of the same surfaces at ``ratio`` times the carrier: roughness counts in wavelengths.
+        """Those of the same surfaces at ``ratio`` times the carrier: roughness and slabs count in wavelengths.
 
         What is not scattered, exp(-(4 pi sigma_h / lambda)^2) (Ament 1953), is raised to the square of the ratio, or to
-        another power where the data say so; the sum of both shares, the mix of lobes and the permittivity stay.
+        another power where the data say so; the sum of both shares, the mix of lobes and the permittivity stay. What slabs
+        lose beside, as absorption does at one loss tangent, goes with the carrier; what more they let through stays.
         """
         if ratio == 1.0:
             return self
@@ -179,7 +180,12 @@ class Parameters:
         return replace(
             self, log_weight=np.maximum(self.log_weight + grown[:, None], -MOST_NEPERS),
             log_mirror=np.maximum(log_smooth + np.log(both), -MOST_NEPERS),
+            log_through=np.maximum(self.through_slope(ratio) * self.log_through, -MOST_NEPERS),
         )  # fmt: skip
+
+    def through_slope(self, ratio: float) -> np.ndarray:
+        """Derivative of what :meth:`at_ratio` makes of each of ``log_through``, shape ``(G,)``."""
+        return np.where(self.log_through < 0.0, ratio, 1.0)
 
     @classmethod
     def prior(cls, groups: int, lobes: Sequence[int] = LOBES, *, reciprocal: bool = False) -> Parameters:
@@ -318,6 +324,9 @@ class Layout:
         table = np.tile(np.eye(self.stride), (self.groups, 1, 1))
         table[:, mirrored] = smooth + share
         table[:, :n] += grown[:, None]
+        if self.through:
+            through = n + THROUGH_COLUMN
+            table[:, through, through] = p.through_slope(ratio)
         groups = bsr_matrix((table, np.arange(self.groups), np.arange(self.groups + 1)))
         found = block_diag([groups, identity(self.size - groups.shape[0])], format="lil")
         if self.roughness:

@@ -79,6 +79,7 @@ class Records(Interactions):
         power: path gain without interactions, shape ``(N,)``; its precision is that of what is computed of it.
         ray: ray of the receiver's grid that sees it, or row of a specular path, or side of an element that is lit, ``(N,)``.
         residual_row: which row of the residual holds the gain of the cell that its ray sees, -1 for none.
+        reach_m: of what is seen through slabs, how far along the ray that is [m], shape ``(N,)``; None elsewhere.
         half_width: half of the cosine's stretch that a ray stands for.
     """
 
@@ -86,6 +87,7 @@ class Records(Interactions):
     ray: np.ndarray
     residual_row: int = -1
     half_width: float = 0.0
+    reach_m: np.ndarray | None = None
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(1))
 
     @property
@@ -93,6 +95,12 @@ class Records(Interactions):
         """Column of what leaves light unpolarised, K where there is none."""
         found = np.isin(self.kind[:1], (kernels.SCATTER, kernels.SOURCE)).nonzero()[1]
         return int(found[0]) if len(found) else self.index.shape[1]
+
+    @property
+    def is_single(self) -> bool:
+        """Whether surfaces scatter it once and slabs are all that it meets else."""
+        kinds = set(self.kind[:1].ravel().tolist())
+        return kernels.SCATTER in kinds and kinds <= {kernels.SCATTER, kernels.SLAB}
 
     @property
     def is_sent(self) -> bool:

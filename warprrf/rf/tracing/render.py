@@ -69,9 +69,24 @@ class PathGains:
         return np.asarray(direct + self.by_ray().reshape(count, -1).sum(axis=1))
 
     @property
+    def nearest(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of each ray the power of the strongest light that was scattered once, seen through slabs or not, and how far along the
+        ray that was [m], shape ``(R K,)`` each."""
+        power, range_m = self.single, self.view.hits.range_m
+        for name, records in self.records.items():
+            if records.is_single and records.reach_m is not None:
+                order = np.argsort(self.powers[name], kind="stable")  # the strongest comes last, and stays
+                ray, own = records.ray[order], np.zeros((2, len(power)))
+                own[:, ray] = self.powers[name][order], records.reach_m[order]
+                range_m = np.where(own[0] > power, own[1], range_m)
+                power = np.maximum(own[0], power)
+        return power, range_m
+
+    @property
     def single(self) -> np.ndarray:
-        """Of what the transmitter lights and the receiver sees directly, by ray, shape ``(R K,)``."""
-        return self.by_ray(["S"])
+        """Of what the transmitter lights, through slabs too, and the receiver sees directly, by ray, shape ``(R K,)``."""
+        own = self.records.items()
+        return self.by_ray(name for name, r in own if r.is_single and r.reach_m is None)
 
 
 def materials_of(tracer: Tracer, p: Parameters, effects: Effects) -> Materials:

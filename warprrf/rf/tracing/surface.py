@@ -25,7 +25,7 @@ from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.scans import is_scan, scanned_patches
 from warprrf.geometry.splats.gaussians import gaussians_of
 from warprrf.rf.em.fresnel import SurfaceTable
-from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, is_name_alone, itu_name, itu_permittivity
+from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, Material, is_name_alone, itu_name, itu_permittivity
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.slabs import Walls
 from warprrf.rf.tracing.cells import ELEMENT_M, Cells, Tiles
@@ -185,12 +185,15 @@ class Surface:
         return np.asarray(self.group == (self.group_names.index(name) if name in self.group_names else -1))
 
     @classmethod
-    def of(cls, geometry: GeometryLike, *, element_m: float | None = None) -> Surface:
+    def of(
+        cls, geometry: GeometryLike, *, element_m: float | None = None, frequency_hz: float | None = None
+    ) -> Surface:
         """Patches, groups and elements of a Reconstruction, a Scene or a Mesh; a Surface is returned as it is.
 
         Materials of a Scene become groups, and those that a Mesh has names of; else pieces of one colour, or of one shape
         where there are no colours. A mesh with the noise of a scan is flattened where planes are found in it. Elements are
-        ``element_m`` wide; by default as the whole asks for.
+        ``element_m`` wide; by default as the whole asks for. Materials of several bands are of that which holds
+        ``frequency_hz``, by default the first.
 
         Raises:
             TypeError: if it has no mesh.
@@ -230,7 +233,7 @@ class Surface:
         return cls(
             mesh=mesh, normal=np.asarray(normal[parent]), patch=patch, plane_normal=planes[0], plane_offset=planes[1],
             group=group, material=alike, appearance=appearance, patch_group=largest_groups(mesh, patch, group, len(planes[1])),
-            **_slabs(geometry, material, len(names)), group_names=tuple(names), position_error_m=error_m,
+            **_slabs(geometry, material, len(names), frequency_hz), group_names=tuple(names), position_error_m=error_m,
             two_sided=sides, cells=cells, **objects_of(geometry, parent),
         )  # fmt: skip
 
@@ -243,7 +246,7 @@ class Surface:
             mesh=mesh, normal=mesh.face_normals, patch=patches.face_patch, plane_normal=patches.normal,
             plane_offset=patches.offset, group=material, material=np.arange(groups, dtype=np.int32),
             appearance=np.full((groups, 4), np.nan), patch_group=faces, cells=one,
-            **_slabs(mesh, None, groups), group_names=tuple(names), position_error_m=TRUE_ERROR_M, two_sided=True,
+            **_slabs(mesh, None, groups, None), group_names=tuple(names), position_error_m=TRUE_ERROR_M, two_sided=True,
         )  # fmt: skip
 
     @cached_property
@@ -365,7 +368,9 @@ def named_faces(geometry: GeometryLike, mesh: Mesh) -> tuple[np.ndarray | None, 
     return group.reshape(-1).astype(np.int32), tuple((*names, "unnamed")[k] for k in used)
 
 
-def _slabs(geometry: GeometryLike, named: np.ndarray | None, groups: int) -> dict[str, Any]:
+def _slabs(
+    geometry: GeometryLike, named: np.ndarray | None, groups: int, frequency_hz: float | None
+) -> dict[str, Any]:
     """Thickness and dispersion of each group, where the groups are a Scene's materials; else NaN."""
     materials = getattr(geometry, "materials", ())
     thickness, dispersion = np.full(groups, np.nan), np.full((groups, 4), np.nan)
@@ -373,10 +378,20 @@ def _slabs(geometry: GeometryLike, named: np.ndarray | None, groups: int) -> dic
         for g, m in enumerate(materials):
             if not is_name_alone(m):
                 thickness[g] = float(m.thickness_m)
-                if getattr(m, "bands", ()) and m.itu is None:
-                    band = m.bands[0]
-                    dispersion[g] = band.a, band.b, band.c, band.d
+                if isinstance(m, Material):
+                    dispersion[g] = law_of(m, m.name, frequency_hz)
     return {"thickness_m": thickness, "dispersion": dispersion}
+
+
+def law_of(
+    material: Material, name: str, frequency_hz: float | None = None
+) -> tuple[float, float, float, float]:
+    """Dispersion of a group called ``name`` of a ``material`` whose bands are known, by that which holds ``frequency_hz`` or is
+    nearest to it, by default the first; NaN where ITU-R P.2040-4 tells by the name."""
+    if material.itu is not None and itu_name(name) == material.itu:
+        return np.nan, np.nan, np.nan, np.nan
+    band = material.bands[0] if frequency_hz is None else material.extrapolated().band(frequency_hz)
+    return band.a, band.b, band.c, band.d
 
 
 def objects_of(geometry: GeometryLike, parent: np.ndarray) -> dict[str, Any]:

@@ -117,14 +117,25 @@ class View:
         first = self.paths.point[:, 0]
         return np.where(np.isnan(first), self.receivers[0], first) - self.tracer.transmitter
 
-    def single_bounce_m(self) -> np.ndarray:
-        """Length from the transmitter over what each ray meets to the receiver [m], shape ``(R K,)``; 0 where that is nothing."""
+    def single_bounce_m(self, range_m: np.ndarray | None = None) -> np.ndarray:
+        """Length from the transmitter over what each ray meets, by default first, else at ``range_m`` (R K,), to the receiver [m],
+        shape ``(R K,)``; 0 where that is nothing."""
+        reach = self.hits.range_m if range_m is None else range_m
         ray = np.flatnonzero(self.hits.face >= 0)
         found = np.zeros(len(self.hits.face))
-        found[ray] = (
-            np.linalg.norm(self.hits.points(ray) - self.tracer.transmitter, axis=1) + self.hits.range_m[ray]
-        )
+        found[ray] = self._over(ray, reach[ray])
         return found
+
+    def over_m(self, records: Records) -> np.ndarray:
+        """Length from the transmitter over where the light of each record is scattered or sent last to the receiver [m], ``(N,)``;
+        of what is seen in mirrors the length over what the ray meets first."""
+        reach = self.hits.range_m[records.ray] if records.reach_m is None else records.reach_m
+        return self._over(records.ray, reach)
+
+    def _over(self, ray: np.ndarray, reach_m: np.ndarray) -> np.ndarray:
+        start, toward, _ = self.hits.rays(ray)
+        point = start + np.asarray(reach_m, float)[:, None] * toward
+        return np.asarray(np.linalg.norm(point - self.tracer.transmitter, axis=1) + reach_m)
 
     def traced(self, effects: Effects) -> dict[str, Records]:
         """The tables that count under ``effects``; they are traced when they are first asked for."""
@@ -160,11 +171,12 @@ class View:
 @dataclass(frozen=True)
 class Rays:
     """Rays and what they hit: ``ray`` of the receiver's grid that each belongs to, and the interactions between the hit and
-    the receiver, if any."""
+    the receiver, if any; ``straight``: slabs alone."""
 
     hits: Hits
     ray: np.ndarray
     after: Interactions | None = None
+    straight: bool = False
 
 
 class Tracer:
@@ -271,7 +283,8 @@ class Tracer:
 
     def _delayed(self, found: MirrorPaths) -> MirrorPaths:
         """``found`` with what slabs of known materials make them longer by."""
-        table, (row, k) = self.surface.table(self.frequency_hz), np.nonzero(found.slab >= 0)
+        table, known = self.surface.table(self.frequency_hz), np.abs(self.slabs[0])[self.surface.group] > 0
+        row, k = np.nonzero((found.slab >= 0) & known[found.slab])
         group, solid = self.surface.group[found.slab[row, k]], found.thickness_m[row, k]
         longer = table.passage(group, found.cosine[row, k], self.wavelength_m, solid)[2]
         return replace(found, excess_m=np.bincount(row, longer, minlength=len(found)))
@@ -410,6 +423,7 @@ class Tracer:
         return Records(
             every.index.astype(np.int32), every.angle.astype(dtype), every.kind, np.asarray(power, dtype),
             rays.ray[row].astype(np.int32), -1 if behind else residual_row, self.grid.half_width,
+            rays.hits.range_m[row].astype(np.float32) if rays.straight else None,
         )  # fmt: skip
 
     def _through(self, slabs: Slabs, way: np.ndarray) -> Interactions:
@@ -433,7 +447,7 @@ class Tracer:
         row, face, range_m, slabs = walls.behind(origins, directions, hits.face[ray], hits.range_m[ray])
         after = self._through(slabs.reversed, -directions[row])
         found = Hits(origins[row], directions[row], solid_angle[row], face.astype(np.int32), range_m)
-        return Rays(found, rays.ray[ray[row]], after)
+        return Rays(found, rays.ray[ray[row]], after, straight=True)
 
     def reached(self, most: int) -> np.ndarray:
         """Where light from the transmitter reaches each side of a tile, over any number of bounces [m]: first sides, then second

@@ -92,6 +92,23 @@ def test_a_pane_of_nearly_air_changes_nothing(swapped):
     np.testing.assert_allclose(found[1], found[0], rtol=0.01, atol=0.001 * found[0].max())
 
 
+def test_paths_over_edges_add_in_power():
+    """By which phase an edge turns a field is in none of its records."""
+    screen = np.array([[0, -6, 0], [0, 0.2, 0], [0, 0.2, 3], [0, -6, 3.0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    mesh, part = joined(screen)
+    scene, ends = Scene(mesh, [Material.conductor()], part), np.array([[-2.0, 0.0, 1.5], [2.0, 1.5, 1.2]])
+    effects = Effects(mirrors=0, scatterings=0, transmissions=0, diffractions=1)
+    nothing = SpectrumDataset.empty(transmitter=ends[0], frequency_hz=F, shape=(24, 48))
+    over = BistaticField.prior(scene, nothing, effects=effects)
+    view = over.view(ends[1])
+    power, edges = over.path_gains(view).specular, np.flatnonzero(view.paths.over_edge)
+    assert len(edges) > 0 and view.paths.in_sight.sum() == 1 and power[edges].max() > 1e-3 * power.max()
+    found = over.array_spectrum(ends[1], ARRAY, DIRECTIONS)
+    sight = replace(over, effects=replace(effects, diffractions=0)).array_spectrum(ends[1], ARRAY, DIRECTIONS)
+    beams = np.abs(STEERED @ ARRAY.response(view.paths.arrival[edges], 1.0).T) ** 2
+    np.testing.assert_allclose(found - sight, beams @ power[edges], atol=1e-5 * found.max())
+
+
 def test_one_path_alone_peaks_at_its_path_gain(field):
     alone = replace(field, effects=Effects(mirrors=0, scatterings=0, transmissions=0, diffractions=0))
     place = RECEIVERS[1]

@@ -274,3 +274,12 @@ def test_edges_are_made_of_what_their_faces_are(field):
     last.thickness_m[-1] = np.inf
     other = replace(edges, surface=last)
     assert edges.paths(BLOCKED).power.sum() == other.paths(BLOCKED).power.sum() > 0
+
+
+def test_a_new_pane_at_another_carrier_is_the_one_that_is_added_there(field):
+    """A material of ITU-R P.2040 has a law for each band: that of 300 GHz does not hold at 28 GHz."""
+    glass = itu_material("glass", thickness_m=0.006).extrapolated()
+    pane = {"objects": {"pane": sheet(1.6, (0.1, 0.1), (3.9, 2.9))}, "materials": {"pane": glass}}
+    first, then = field.with_objects(**pane).at_frequency(28e9), field.at_frequency(28e9).with_objects(**pane)
+    for one in first, then:
+        assert one.surface.slabs(28e9)[0][-1] == pytest.approx(glass.permittivity(28e9))

@@ -11,7 +11,7 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_path
 from warprrf.rf.channel.array_spectra import UP, hemisphere
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.fresnel import fresnel_curves, slab_transmission
-from warprrf.rf.em.materials import itu_material
+from warprrf.rf.em.materials import Material, itu_material
 from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import fit as fitting
@@ -23,11 +23,13 @@ from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, Weig
 from warprrf.rf.fields.bistatic.merging import _mirror_changes
 from warprrf.rf.fields.bistatic.observations import Columns
 from warprrf.rf.fields.bistatic.training import trace
+from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.beam import BeamOperator
+from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.lookups import nearest
 from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.spectrum import spread, sub_pixel_directions, to_db
-from warprrf.rf.tracing.model import SETS, Effects, Parameters
+from warprrf.rf.tracing.model import SETS, Effects, Layout, Parameters
 from warprrf.rf.tracing.records import Materials
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import SPECULAR
@@ -329,6 +331,49 @@ def test_what_glass_lets_through_is_found_at_any_carrier_or_said_to_be_left_out(
         view = before.view(receiver)
         sight = before.path_gains(view).specular[(view.paths.order == 0) & (view.paths.slabs == 1)]
         assert sight == pytest.approx(friis**2 * np.mean(np.abs(waves) ** 2), rel=1e-6)
+
+
+@pytest.mark.parametrize("carrier_hz", [28e9, 140e9, 300e9])
+def test_what_a_slab_is_made_of_does_not_hang_on_what_it_is_called(carrier_hz):
+    """A material of ITU-R P.2040 under a name of its own, and one of several bands that is in no recommendation."""
+    glass = itu_material("glass", thickness_m=0.01)
+    mesh, part = joined(ROOM, box_mesh([2.5, 0.0, 0.0], [2.51, 4.0, 3.0]))
+    frame = SpectrumDataset.empty(transmitter=TX, frequency_hz=carrier_hz, shape=(12, 24))
+    effects, found = Effects(mirrors=0, scatterings=0, transmissions=1, diffractions=0), []
+    for one in glass, replace(glass, name="window"), replace(glass, name="screen", itu=None):
+        scene = Scene(mesh, [Material("walls", ()), one], part)
+        field = BistaticField.prior(scene, frame, effects=effects)
+        assert field.surface.slabs(carrier_hz)[0][1] == pytest.approx(glass.permittivity(carrier_hz))
+        found.append(field.links(RECEIVERS[3]).total_path_gain)
+    np.testing.assert_allclose(found, found[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_walls_let_through_at_another_carrier_what_they_are_taken_to_there(known):
+    """Of a fit to nothing: slabs count in wavelengths, whether their material is known or assumed."""
+    glass = itu_material("glass", thickness_m=0.01) if known else Material("pane", ())
+    mesh, part = joined(ROOM, box_mesh([2.5, 0.0, 0.0], [2.51, 4.0, 3.0]))
+    scene = Scene(mesh, [itu_material("concrete"), glass], part)
+    effects = Effects(mirrors=0, scatterings=0, transmissions=1, diffractions=0, residual=False)
+    carriers = np.array([3.5e9, 28e9, 140e9, 300e9])
+    frames = [SpectrumDataset.empty(transmitter=TX, frequency_hz=f, shape=(12, 24)) for f in carriers]
+    fields = [BistaticField.prior(scene, frame, effects=effects) for frame in frames]
+    total = np.array([one.links(RECEIVERS[3]).total_path_gain for one in fields])
+    assert (np.diff(NEPER * np.log(total * carriers**2)) < -3.0).any()  # more than free space takes
+    for one in fields:
+        found = [one.at_frequency(f).links(RECEIVERS[3]).total_path_gain for f in carriers]
+        np.testing.assert_allclose(found, total, rtol=1e-6)
+
+
+@pytest.mark.parametrize("ratio", [0.4, 3.0])
+def test_slopes_at_another_carrier_are_those_of_differences(ratio):
+    p = replace(Parameters.prior(3, (0, 4)), log_through=np.array([-0.7, -0.05, 0.1]))
+    layout = Layout(3, 2, through=True, gain=True, roughness=True)
+    x, step = layout.pack(p), 1e-5
+    ends = [x + sign * step * np.eye(layout.size) for sign in (1.0, -1.0)]
+    there = [[layout.pack(layout.unpack(row, p).at_ratio(ratio)) for row in end] for end in ends]
+    slopes = (np.array(there[0]) - np.array(there[1])).T / (2.0 * step)
+    np.testing.assert_allclose(layout.slopes_at_ratio(p, ratio).toarray(), slopes, atol=1e-8)
 
 
 def test_an_open_room_s_fit_leaves_nothing_out(scene, data):

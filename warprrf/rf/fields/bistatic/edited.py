@@ -20,7 +20,7 @@ from warprrf.rf.em.materials import ITU_BANDS, Material, is_name_alone, library_
 from warprrf.rf.fields.bistatic.options import assumed
 from warprrf.rf.tracing.edits import Called, Room, edited
 from warprrf.rf.tracing.model import ARRAYS, MOST_NEPERS, Parameters
-from warprrf.rf.tracing.surface import Surface
+from warprrf.rf.tracing.surface import Surface, law_of
 
 
 def with_geometry(field: Any, geometry: GeometryLike) -> dict[str, Any]:
@@ -99,10 +99,12 @@ def _group(s: Surface, name: str, material: Material | str | None, new: dict[str
 def _parts(field: Any, room: Room, materials: Sequence[Material | None]) -> dict[str, Any]:
     """The parts of ``field`` that are others in ``room``, whose new groups are of ``materials``; None where nobody knows."""
     frequency_hz, p, laws = field.frequency_hz, field.parameters, np.full((len(materials), 4), np.nan)
-    for k, material in enumerate(materials):
+    for k, (material, called) in enumerate(
+        zip(materials, room.materials[field.surface.groups :], strict=True)
+    ):
         if material is not None:
-            band = material.band(frequency_hz)
-            laws[k] = band.a, band.b, band.c, band.d
+            material.band(frequency_hz)  # it must be known there
+            laws[k] = law_of(material, called.name, frequency_hz)
     thick = np.array([np.nan if m is None else m.thickness_m for m in materials], float)
     surface, cell = edited(field.surface, room, thickness_m=thick, dispersion=laws)
     if surface is field.surface:

@@ -242,7 +242,7 @@ class BistaticField(RadioField):
         Raises:
             TypeError: for a geometry without a mesh.
         """
-        surface = Surface.of(geometry)
+        surface = Surface.of(geometry, frequency_hz=ds.frequency_hz)
         return cls(
             surface=surface,
             transmitter=ds.transmitter,
@@ -272,9 +272,10 @@ class BistaticField(RadioField):
 
         What carries over: geometry, and so directions and delays; permittivities, which ITU-R P.2040-4 has constant above
         100 GHz for every indoor material; how surfaces differ; the roughness that their mirrored and scattered shares tell,
-        counted in the new wavelengths (Ament 1953); absorption by the air, at the new carrier. Floor and range move with
-        the square of the wavelength. What does not: the width of scattering lobes stays as it was, thin slabs are none,
-        gains of measuring chains and the stated uncertainty are not known there.
+        counted in the new wavelengths (Ament 1953); slabs as thick as they are, and what they lose beside, in proportion to
+        the carrier; absorption by the air, at the new carrier. Floor and range move with the square of the wavelength. What
+        does not: the width of scattering lobes stays as it was, thin slabs mirror as if they were none, gains of measuring
+        chains and the stated uncertainty are not known there.
 
         Args:
             frequency_hz: the other carrier [Hz].
@@ -391,8 +392,9 @@ class BistaticField(RadioField):
     ) -> Paths:
         """Propagation paths; see :meth:`RadioField.paths`.
 
-        A diffuse path goes over the point that the pixel's strongest ray hits; light that came over more surfaces has no
-        path of its own and is counted to that. ``view`` is what one receiver sees, if it was traced before (:meth:`view`).
+        A diffuse path goes over the point that the pixel's strongest ray hits, behind slabs if most comes from there; light that
+        came over more surfaces has no path of its own and is counted to that. ``view`` is what one receiver sees, if it was
+        traced before (:meth:`view`).
         """
         if view is None:
             return super().paths(

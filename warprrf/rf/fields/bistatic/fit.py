@@ -78,7 +78,7 @@ def fit(
         warn_of_unmodelled(*link, frequency_hz=frequency_hz, device=device, **rare)
     tell = progress or (lambda *_: None)
     tell("patches", 0, 1)
-    surface = Surface.of(geometry)
+    surface = Surface.of(geometry, frequency_hz=frame_of(data).frequency_hz)
     tell("patches", 1, 1)
     look = partial(trace, sub_pixels=options.rays_a_side, client=client, device=device, progress=progress)
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.

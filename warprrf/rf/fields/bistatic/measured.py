@@ -192,7 +192,8 @@ class WeighedPaths:
         """Those of one receiver.
 
         Light that comes over several surfaces is taken to leave and to be late as light scattered once is, which the
-        ray that brings it sees: its departure is not known, and its true delay is longer.
+        ray that brings it sees: its departure is not known, and its true delay is longer. So is light that is seen through
+        slabs: to be late as if the first one scattered it.
 
         Args:
             view: what the receiver sees.
@@ -280,7 +281,7 @@ class Superposition(Rows):
 
     Attributes:
         field: amplitude of each reading for a path of amplitude 1, phase of its length included, shape ``(L, N)``.
-        power: what adds in power beside, because lengths are not known so well, shape ``(L, N)`` float32.
+        power: what adds in power beside, because lengths are not known so well, or nothing of the phase, shape ``(L, N)`` float32.
         sent, heard: fields of the antennas at both ends of each path, shape ``(L, 2)``; see :func:`vertical_ends`.
     """
 
@@ -338,6 +339,8 @@ class ArrayImage(ByPixels):
         heard *= np.sqrt(array.gain(paths.arrival))[:, None]
         wavelength = view.tracer.wavelength_m
         kept = np.exp(-0.5 * (2.0 * np.pi * length_std_m / wavelength) ** 2)
+        # By which phase an edge turns a field is not known.
+        kept = np.where(paths.over_edge, 0.0, kept)[:, None]
         phase = np.exp(-2j * np.pi * np.mod(paths.delay_m / wavelength, 1.0))
         together = Superposition(
             (kept * phase[:, None] * heard).astype(np.complex64),

@@ -554,7 +554,7 @@ class _Arrays(Kind):
             unit = float(free_space_gain(place.transmitter, place.receiver, one.frequency_hz))
         target, chain = Target(NEPER * np.log1p(power[known] / one.floor)), OWN_GAIN if one.relative else -1
         bare = Observation(place, view, measured.part(known), target, unit * one.floor, chain)
-        start, single = Parameters.prior(view.tracer.surface.groups), SETS["single"]
+        start, single = unmeasured(view), SETS["single"]
         scattered = columns_of(bare, single, start).power(start)
         total = scattered + bare.heard(single, materials_of(view.tracer, start, single))
         gain = bare.gain(start, total)
@@ -595,12 +595,18 @@ def observe(
     return found
 
 
+def unmeasured(view: View) -> Parameters:
+    """What the groups that are seen are taken for before any measurement, with what slabs of them absorb there."""
+    surface = view.tracer.surface
+    return replace(Parameters.prior(surface.groups), log_through=surface.slabs(view.tracer.frequency_hz)[2])
+
+
 def _shares(o: Observation) -> tuple[np.ndarray, np.ndarray]:
     """Of each reading before any measurement: the share of line of sight, and the sum of the squared shares of line of sight
     and mirror paths, shape ``(N,)`` each."""
     surface = o.view.tracer.surface
     none = np.zeros((2, len(surface.cells)))
-    model = Model(SETS["single"], Parameters.prior(surface.groups), none, o.place.transmitter)
+    model = Model(SETS["single"], unmeasured(o.view), none, o.place.transmitter)
     materials = materials_of(o.view.tracer, model.parameters, model.effects)
     single = o.view.records[SPECULAR].powers(materials)[:, None] * o.path
     share = single / np.maximum(o.predicted(model), np.maximum(single.sum(axis=0), 1e-300))

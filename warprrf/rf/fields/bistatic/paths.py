@@ -45,7 +45,7 @@ def paths_of(
     exact = np.flatnonzero(gains.specular > 0)
     specular, vertices = gains.specular[exact], found.point[exact]
     diffuse = gains.by_ray().reshape(*image.shape, -1).sum(axis=-1)
-    point = _bounce_points(view, gains.single, floor)
+    point = _bounce_points(view, *gains.nearest, floor)
     kept = diffuse > floor
     if not kept.any() and diffuse.max() > 0:
         kept = diffuse == diffuse.max()
@@ -77,10 +77,11 @@ def strongest(gains: PathGains, image: np.ndarray, beam_sigma_rad: float) -> tup
     receiver's beam; NaN where empty."""
     view, power = gains.view, gains.specular
     grid, receiver, transmitter = view.tracer.grid, view.receivers[0], view.tracer.transmitter
-    ray = strongest_rays(grid.device_directions, gains.single, grid.shape, beam_sigma_rad, device=grid.device)
+    single, reach_m = gains.nearest
+    ray = strongest_rays(grid.device_directions, single, grid.shape, beam_sigma_rad, device=grid.device)
     dark = ray < 0
     ray = np.maximum(ray, 0)
-    range_m = np.where(dark, np.nan, view.hits.range_m[ray])
+    range_m = np.where(dark, np.nan, reach_m[ray])
     point = receiver + range_m[..., None] * grid.directions[ray]
     outward = np.where(dark[..., None], 1.0, point - transmitter)
     length = np.where(dark, np.nan, np.linalg.norm(outward, axis=-1) + range_m)
@@ -98,13 +99,13 @@ def strongest(gains: PathGains, image: np.ndarray, beam_sigma_rad: float) -> tup
     return length / SPEED_OF_LIGHT, np.where(np.isnan(length)[..., None], np.nan, aod).astype(np.float32)
 
 
-def _bounce_points(view: View, power: np.ndarray, floor: float) -> np.ndarray:
-    """The point that each pixel's strongest ray hits, shape ``(H, W, 3)``; any, where only further bounces light it."""
+def _bounce_points(view: View, power: np.ndarray, range_m: np.ndarray, floor: float) -> np.ndarray:
+    """The point of each pixel's strongest ray, at its range, shape ``(H, W, 3)``; any, where only further bounces light it."""
     grid = view.tracer.grid
     any_hit = np.where(view.hits.face >= 0, 1e-12 * floor * grid.solid_angle, 0.0)
     per_pixel = (power + any_hit).reshape(-1, grid.per_pixel)
     best = per_pixel.argmax(axis=1) + np.arange(len(per_pixel)) * per_pixel.shape[1]
-    return view.hits.points(best).reshape(*grid.shape, 3)
+    return replace(view.hits, range_m=range_m).points(best).reshape(*grid.shape, 3)
 
 
 def receivers_at_once(shape: tuple[int, int]) -> int:
@@ -141,11 +142,18 @@ def links(
     np.maximum.at(best, paths.receiver, specular)
     image = np.zeros((count, *shape))
     if effects.scatterings:
+        far = [name for name, records in gains.records.items() if records.reach_m is not None]
+        near = gains.by_ray(name for name in gains.powers if name not in far)
+        delay, each = view.single_bounce_m() / SPEED_OF_LIGHT, len(near) // count
+        scattered = [(near, delay, np.repeat(np.arange(count), each))]
+        for records, power in ((gains.records[name], gains.powers[name]) for name in far):
+            scattered.append((power, view.over_m(records) / SPEED_OF_LIGHT, records.ray // each))
+        for power, delay, own in scattered:
+            total, moment, square = (
+                sums + np.bincount(own, power * delay**k, minlength=count)
+                for k, sums in enumerate((total, moment, square))
+            )
         power = gains.by_ray().reshape(count, -1)
-        delay = view.single_bounce_m().reshape(count, -1) / SPEED_OF_LIGHT
-        total, moment, square = (
-            sums + np.einsum("rk,rk->r", power, delay**k) for k, sums in enumerate((total, moment, square))
-        )
         image = power.reshape(count, *shape, -1).sum(axis=-1)
         # a path's pixel is one of the field's spectrum
         finer = shape[0] * shape[1] / (bistatic.shape[0] * bistatic.shape[1])

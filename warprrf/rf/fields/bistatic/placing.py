@@ -19,9 +19,9 @@ from scipy.optimize import least_squares
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import Measured
 from warprrf.rf.fields.bistatic.measured import direct_paths
-from warprrf.rf.fields.bistatic.observations import NOISE_DB, TAP_STEPS, Observation, Place, Seen
+from warprrf.rf.fields.bistatic.observations import NOISE_DB, TAP_STEPS, Observation, Place, Seen, unmeasured
 from warprrf.rf.spectra.readings import Readings, path_weights
-from warprrf.rf.tracing.model import SETS, Parameters
+from warprrf.rf.tracing.model import SETS
 from warprrf.rf.tracing.render import materials_of
 from warprrf.rf.tracing.tracer import SPECULAR, View
 
@@ -96,8 +96,7 @@ def _clocks(one: Readings, paths: Sequence[tuple[np.ndarray, ...]]) -> np.ndarra
 def _strongest(view: View) -> tuple[np.ndarray, ...]:
     """Powers of its strongest direct paths before any measurement, directions of arrival and departure, delays."""
     tracer = view.tracer
-    prior = materials_of(tracer, Parameters.prior(tracer.surface.groups), SETS["single"])
-    power = view.records[SPECULAR].powers(prior)
+    power = view.records[SPECULAR].powers(materials_of(tracer, unmeasured(view), SETS["single"]))
     most = 20  # count
     kept = np.argsort(-power)[:most]
     return power[kept], *(values[kept] for values in direct_paths(view))
@@ -121,6 +120,7 @@ def position_offset(one: Readings, o: Observation, other: np.ndarray, power: np.
         power: of those paths, shape ``(L,)``; both in the units of the target, gain of the chain included.
     """
     place, paths, std = o.place, o.view.paths, one.position_std_m
+    bent, (_, toward, _) = paths.over_edge[:, None], direct_paths(o.view)
     most = 2.0 * std  # along each axis
     s = o.view.tracer.surface
     image = place.receiver + paths.arrival * paths.length_m[:, None]
@@ -134,8 +134,9 @@ def position_offset(one: Readings, o: Observation, other: np.ndarray, power: np.
         out = image - place.receiver - offset
         length = np.linalg.norm(out, axis=1)
         arrival = out / length[:, None]
-        departure = (turn @ arrival[:, :, None])[..., 0]
-        weight = path_weights(one, place.rows, arrival, departure, length / SPEED_OF_LIGHT)
+        departure = np.where(bent, toward, (turn @ arrival[:, :, None])[..., 0])  # an edge stays where it is
+        delay_s = (length + paths.excess_m) / SPEED_OF_LIGHT
+        weight = path_weights(one, place.rows, arrival, departure, delay_s)
         missed = o.target.error(other + weight @ power) / NOISE_DB
         return np.concatenate([missed, offset / std])
 
