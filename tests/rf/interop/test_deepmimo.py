@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from path_makers import random_paths
-from radio_scenes import box_mesh
+from radio_scenes import box_mesh, joined
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.materials import Material
@@ -102,3 +102,29 @@ def test_folder_without_the_package(tmp_path):
     most = {"path_depth": 4, "reflections": 1, "diffractions": 1, "scattering": 1, "transmissions": 2}
     assert said["rt_params"] == said["rt_params"] | {f"max_{name}": count for name, count in most.items()}
     assert not [f for f in folder.iterdir() if f.name.startswith(".")]
+
+
+def test_codes_of_many_interactions_keep_their_last_digit(deepmimo, tmp_path, monkeypatch):
+    """Eight panes and a mirror: nine digits, which float32 does not hold."""
+    thin = Material.custom("thin", relative_permittivity=1.5, conductivity=0.0, thickness_m=0.001)
+    panes = [
+        (np.array([[x, -6, 0.1], [x, 6, 0.1], [x, 6, 6], [x, -6, 6]]), np.array([[0, 1, 2], [0, 2, 3]]))
+        for x in np.linspace(-2.0, 2.0, 8)
+    ]
+    mesh, part = joined((np.array([[-9.0, 5, 0], [9, 5, 0], [9, 5, 6], [-9, 5, 6]]), panes[0][1]), *panes)
+    scene = Scene(mesh, [WALLS, thin], np.minimum(part, 1))
+    paths = trace_paths(
+        scene,
+        transmitter=[-6.0, 0, 3],
+        receivers=[2.1, 0, 3],
+        frequency_hz=F,
+        mirror_order=1,
+        transmissions=8,
+    )
+    codes = ["".join(str({1: 1, 4: 4}[c]) for c in own if c) for own in paths.interactions]
+    assert sorted(map(len, codes)) == [8, 9]
+    write_deepmimo(paths, tmp_path / "deepmimo_scenarios" / "panes")
+    monkeypatch.chdir(tmp_path)
+    data = deepmimo.load("panes", max_paths=100)
+    order = np.argsort(-paths.power, kind="stable")
+    assert [str(int(code)) for code in data.inter[0][: len(codes)]] == [codes[k] for k in order]

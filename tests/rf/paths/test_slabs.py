@@ -278,6 +278,21 @@ def test_a_pane_beside_a_path_stops_no_more_of_its_zone_than_it_does(permittivit
     assert np.abs(10 * np.log10(found[1] / found[0])).max() < most_db
 
 
+def test_what_passes_a_path_s_wall_is_the_same_however_it_is_drawn():
+    """A screen of unknown material beside line of sight: as a solid it is no thicker than what is assumed of it."""
+    corners = np.array([[0, -50, 0.1], [0, -50, 1.35], [0, 50, 1.35], [0, 50, 0.1]])
+    effects = Effects(mirrors=0, scatterings=0, transmissions=1, diffractions=0, residual=False)
+    frame, shares = SpectrumDataset.empty(transmitter=TX, frequency_hz=F, shape=(12, 24)), []
+    for screen in (corners, pane(0)[1]), box_mesh([0.0, -50.0, 0.1], [0.1, 50.0, 1.35]):
+        scene = room(screen)
+        scene = Scene(scene.mesh, [FLOORING, Material("screen", ())], scene.face_material)
+        paths = BistaticField.prior(scene, frame, effects=effects).view(RX + [0, 0, 0.03]).paths
+        assert paths.kind.tolist() == ["los"]
+        shares.append(paths.share[0])
+    assert 0.8 < shares[0] < 0.99
+    assert shares[1] == pytest.approx(shares[0], abs=0.05)  # a few rays of the zone meet its upper corner
+
+
 @pytest.mark.parametrize(("kind", "most"), [("edge", 0), ("edge", 2), ("slab", 2)])
 def test_a_field_s_paths_through_slabs_and_over_edges_are_those_that_are_traced(kind, most):
     """Points, what happens there, and delays, those of slabs included."""

@@ -4,8 +4,8 @@ One transmitter (set 0), one set of receivers (set 1): an ``.npz`` file for each
 as a triangular mesh. Powers are path gains in decibels (transmit power 0 dB, isotropic antennas, averaged over transmit
 and summed over receive polarisations), phases those of the gains, -2 pi f_c tau included, so that DeepMIMO's channels
 are baseband channels about the carrier. Angles in degrees, elevations counted from the zenith, delays in seconds,
-float32 throughout, NaN where there is no path. Paths are sorted by power; DeepMIMO loads 25 of them unless told
-otherwise (``max_paths``).
+float32 throughout (but codes of eight interactions and more: float64), NaN where there is no path. Paths are sorted by
+power; DeepMIMO loads 25 of them unless told otherwise (``max_paths``).
 """
 
 from __future__ import annotations
@@ -149,7 +149,9 @@ def _matrices(paths: Paths, coefficient: np.ndarray, max_paths: int | None) -> d
         "delay": real(pick(paths.tau)),
         "power": real(power),
         "phase": real(np.rad2deg(np.angle(gain))),
-        "inter": real(pick(codes)),
+        "inter": np.where(there, pick(codes), np.nan).astype(
+            np.float32 if codes.max() < 2**24 else np.float64
+        ),
         "inter_pos": np.take_along_axis(paths.vertices, index, axis=1)[:, :, :deep].astype(np.float32),
     }
 

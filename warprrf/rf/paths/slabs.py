@@ -74,6 +74,7 @@ class Walls:
         mesh: the mesh.
         passes: which faces let something through, shape ``(F,)`` bool.
         permittivity, thickness_m: of the slabs, if they are sheets, shape ``(F,)`` each.
+        known: of which faces these are known, not assumed: others are as thick as that, drawn as solids too, ``(F,)`` bool.
         wavelength_m: wavelength [m].
         most: most slabs on one way.
         clearance_m: ways end so far before what lies at their end, and go on so far behind each face.
@@ -84,6 +85,7 @@ class Walls:
     passes: np.ndarray
     permittivity: np.ndarray
     thickness_m: np.ndarray
+    known: np.ndarray
     wavelength_m: float
     most: int
     clearance_m: float
@@ -99,20 +101,23 @@ class Walls:
         most: int,
         clearance_m: float,
         device: DeviceLike = None,
+        *,
+        known: np.ndarray | None = None,
     ) -> Walls:
         """Those of which slabs of ``permittivity`` (F,) and ``thickness_m`` (F,), if they are sheets, let more than a
-        millionth of the power through."""
+        millionth of the power through; of what is not ``known`` (F,) these are assumed."""
         # A solid is perhaps only a centimetre thick.
         thickness = np.where(mesh.closed_part_of >= 0, np.minimum(thickness_m, 0.01), thickness_m)
         te = slab_transmission(1.0, permittivity, thickness, wavelength_m)[0]
         passes = np.abs(te) ** 2 > 1e-6
-        return cls(mesh, passes, permittivity, thickness_m, wavelength_m, most, clearance_m, device)
+        known = np.ones(len(passes), bool) if known is None else known
+        return cls(mesh, passes, permittivity, thickness_m, known, wavelength_m, most, clearance_m, device)
 
     def field(self, slabs: Slabs) -> np.ndarray:
         """Field behind slabs over that without them, mean of both polarisations, complex, shape ``(N,)``."""
         met = slabs.face >= 0
         face, solid, found = slabs.face[met], slabs.thickness_m[met], np.ones(met.shape, complex)
-        thickness = np.where(np.isnan(solid), self.thickness_m[face], solid)
+        thickness = np.where(np.isnan(solid) | ~self.known[face], self.thickness_m[face], solid)
         te, tm, longer = slab_passage(
             slabs.cosine[met], self.permittivity[face], thickness, self.wavelength_m
         )

@@ -299,7 +299,8 @@ class Surface:
         wavelength_m, known = SPEED_OF_LIGHT / frequency_hz, np.abs(eta) > 0
         permittivity = np.where(known, eta, 1.0 + 0.5j * absorbed / (np.pi * thickness))[self.group]
         return Walls.of_slabs(
-            self.mesh, permittivity, (wavelength_m * thickness)[self.group], wavelength_m, most, self.position_error_m, device
+            self.mesh, permittivity, (wavelength_m * thickness)[self.group], wavelength_m, most, self.position_error_m, device,
+            known=known[self.group],
         )  # fmt: skip
 
     @cached_property
