@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -155,3 +155,34 @@ def _clock(seconds: float | None) -> str:
         return "?"
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes:02}:{rest:02}" if minutes < 60 else f"{minutes // 60}:{minutes % 60:02}:{rest:02}"
+
+
+def table(methods: dict[str, dict[str, Any]]) -> str:
+    """The figures of several methods as aligned text, one row a method."""
+    columns = {
+        "psnr_db": "PSNR dB",
+        "ssim": "SSIM",
+        "rmse_db": "RMSE dB",
+        "direction_median_deg": "direction deg",
+        "direction_within_3deg": "within 3 deg",
+        "direction_within_3deg_blocked": "blocked",
+        "beam_gain_loss_db": "beam loss dB",
+        "tof_error_median_ns": "ToF ns",
+        "aod_error_median_deg": "AoD deg",
+    }
+    shown = [key for key in columns if any(figures.get(key) is not None for figures in methods.values())]
+    rows = [["method", *(columns[key] for key in shown)]]
+    rows += [[name, *(_cell(figures.get(key)) for key in shown)] for name, figures in methods.items()]
+    return aligned(rows)
+
+
+def _cell(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}" if value < 10 else f"{value:.2f}"
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of text with their columns flush right."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return "\n".join(
+        "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows
+    )

@@ -36,8 +36,7 @@ from warprrf.cli.inputs import (
     read_scale,
     refuse,
 )
-from warprrf.cli.output import Output
-from warprrf.cli.tables import table
+from warprrf.cli.output import Output, table
 from warprrf.files import plain, write_json, write_text
 from warprrf.geometry.photos.config import LENSES, ReconstructionConfig
 from warprrf.rf.tracing.model import SETS

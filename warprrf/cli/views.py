@@ -21,8 +21,7 @@ from warprrf.cli.inputs import (
     load_field,
     read_measured,
 )
-from warprrf.cli.output import Output
-from warprrf.cli.tables import aligned
+from warprrf.cli.output import Output, aligned
 from warprrf.device import require
 from warprrf.files import write_arrays, write_atomically
 

@@ -126,7 +126,7 @@ def build(real: type) -> Any:
             through = 0
             row = m.row[g]
         known = through == 0 and m.slab == 1
-        if through == 1 and m.permittivity.shape[0] > 0:
+        if through == 1:
             known = m.permittivity[g][0] > real(0.0)
         if known:
             thickness = m.thickness[row]
@@ -146,9 +146,8 @@ def build(real: type) -> Any:
         if kind_of(t, i, k) == wp.static(SLAB):
             r = half_space(x, angle[0])
             rise = vec2(real(-2.0) * r[0] * rise[0], real(-2.0) * r[1] * rise[1])
-            if m.permittivity.shape[0] > 0:
-                if m.permittivity[g][0] > real(0.0):
-                    rise = vec2(real(0.0), real(0.0))
+            if m.permittivity[g][0] > real(0.0):
+                rise = vec2(real(0.0), real(0.0))
         return rise
 
     @wp.func

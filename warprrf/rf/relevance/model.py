@@ -180,7 +180,11 @@ class FullModel:
         if gas:
             powers = {}
             for name, power in gains.powers.items():
-                length = view.paths.length_m if name == "specular" else view.over_m(gains.records[name])
+                length = (
+                    view.paths.length_m
+                    if name == "specular"
+                    else view.over_m(gains.records[name].ray, gains.records[name].reach_m)
+                )
                 powers[name] = power * 10.0 ** (-0.1 * self.gas_db_per_m * length)
             gains = replace(gains, powers=powers)
         return np.asarray(spectra_of(gains, self.beam)[0])
@@ -202,7 +206,7 @@ class FullModel:
     @property
     def longest_m(self) -> float:
         """Length of the longest path [m]."""
-        lengths = [v.single_bounce_m()[v.traced(effects_of(self.all))["S"].ray] for v in self.views]
+        lengths = [v.over_m(v.traced(effects_of(self.all))["S"].ray) for v in self.views]
         return max(float(np.max(x, initial=0.0)) for x in (*lengths, *(v.paths.length_m for v in self.views)))
 
 

@@ -85,8 +85,7 @@ class PathGains:
     @property
     def single(self) -> np.ndarray:
         """Of what the transmitter lights, through slabs too, and the receiver sees directly, by ray, shape ``(R K,)``."""
-        own = self.records.items()
-        return self.by_ray(name for name, r in own if r.is_single and r.reach_m is None)
+        return self.by_ray(n for n, r in self.records.items() if r.is_single and r.reach_m is None)
 
 
 def materials_of(tracer: Tracer, p: Parameters, effects: Effects) -> Materials:

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -45,37 +45,23 @@ SPECULAR = "specular"
 _TRACED = Cache(6)  # a lobby's take up to 90 MB each; the bound is the process's, not a surface's
 
 
-class Sequence(NamedTuple):
-    """A sequence of interactions: how a surface is lit, and how it is seen.
+def sequences(effects: Effects) -> dict[str, tuple[str, str]]:
+    """How a surface is lit, and how it is seen, in the tables that ``effects`` want besides :data:`SPECULAR`, by their names: from
+    the transmitter to the receiver, and the most slabs on each of those ways.
 
-    Attributes:
-        light: ``"S"`` by the transmitter, ``"MS"`` by its images in mirrors, ``"TS"`` through slabs, ``"MTS"`` through slabs before
-            or behind a mirror; ``"E"``: it is an element that sends on what it got of others.
-        sight: ``""`` directly, ``"M"`` in a mirror, ``"T"`` through slabs.
-        slabs: most slabs on each of those ways, 0 where there are none.
+    Lit: ``"S"`` by the transmitter, ``"MS"`` by its images in mirrors, ``"TS"`` through slabs, ``"MTS"`` through slabs before or
+    behind a mirror; ``"E"``: it is an element that sends on what it got of others. Seen: ``""`` directly, ``"M"`` in a mirror,
+    ``"T"`` through slabs.
     """
-
-    light: str
-    sight: str
-    slabs: int
-
-    @property
-    def name(self) -> str:
-        """From the transmitter to the receiver."""
-        return self.light + self.sight + str(self.slabs or "")
-
-
-def sequences(effects: Effects) -> list[Sequence]:
-    """Those of the tables that ``effects`` want besides :data:`SPECULAR`."""
-    e, found = effects, []
+    e, found = effects, {}
     lights = {"S": True, "MS": e.mirror_scatter, "E": e.scatterings > 1}
     lights |= {"TS": e.transmissions > 0, "MTS": e.transmissions > 0 and e.mirror_scatter}
     sights = {"": True, "M": e.scatter_mirror, "T": e.transmissions > 0 and e.scatter_mirror}
     for light, lit in lights.items():
         for sight, seen in sights.items():
-            slabs = e.transmissions if "T" in light + sight else 0
+            slabs = str(e.transmissions) if "T" in light + sight else ""
             if lit and seen and e.scatterings > 0 and (light, sight) not in UNMODELLED:
-                found.append(Sequence(light, sight, slabs))
+                found[light + sight + slabs] = light, sight
     return found
 
 
@@ -117,35 +103,24 @@ class View:
         first = self.paths.point[:, 0]
         return np.where(np.isnan(first), self.receivers[0], first) - self.tracer.transmitter
 
-    def single_bounce_m(self, range_m: np.ndarray | None = None) -> np.ndarray:
-        """Length from the transmitter over what each ray meets, by default first, else at ``range_m`` (R K,), to the receiver [m],
-        shape ``(R K,)``; 0 where that is nothing."""
-        reach = self.hits.range_m if range_m is None else range_m
-        ray = np.flatnonzero(self.hits.face >= 0)
-        found = np.zeros(len(self.hits.face))
-        found[ray] = self._over(ray, reach[ray])
-        return found
-
-    def over_m(self, records: Records) -> np.ndarray:
-        """Length from the transmitter over where the light of each record is scattered or sent last to the receiver [m], ``(N,)``;
-        of what is seen in mirrors the length over what the ray meets first."""
-        reach = self.hits.range_m[records.ray] if records.reach_m is None else records.reach_m
-        return self._over(records.ray, reach)
-
-    def _over(self, ray: np.ndarray, reach_m: np.ndarray) -> np.ndarray:
+    def over_m(self, ray: np.ndarray, reach_m: np.ndarray | None = None) -> np.ndarray:
+        """Length from the transmitter over what the rays ``ray`` (N,) see to the receiver [m], shape ``(N,)``: over what they meet
+        first, or over what lies behind slabs, ``reach_m`` (N,) along them."""
         start, toward, _ = self.hits.rays(ray)
-        point = start + np.asarray(reach_m, float)[:, None] * toward
-        return np.asarray(np.linalg.norm(point - self.tracer.transmitter, axis=1) + reach_m)
+        reach = np.asarray(self.hits.range_m[ray] if reach_m is None else reach_m, float)
+        point = start + reach[:, None] * toward
+        return np.asarray(np.linalg.norm(point - self.tracer.transmitter, axis=1) + reach)
 
     def traced(self, effects: Effects) -> dict[str, Records]:
         """The tables that count under ``effects``; they are traced when they are first asked for."""
         wanted = sequences(effects)
-        made = self.tracer.trace(self, [own for own in wanted if own.name not in self.records])
+        lacking = {name: own for name, own in wanted.items() if name not in self.records}
+        made = self.tracer.trace(self, lacking, effects.transmissions)
         if made and self.keeps:
             with making:
                 self.records.update(made)
         every = self.records | made
-        return {name: every[name] for name in (SPECULAR, *(own.name for own in wanted))}
+        return {name: every[name] for name in (SPECULAR, *wanted)}
 
     def of(self, k: int) -> View:
         """That of receiver ``k`` alone; nothing but its line of sight and mirrors is known."""
@@ -311,12 +286,11 @@ class Tracer:
         found = self.paths(places, effects) if paths is None else paths
         return View(self, places, self.grid.hit(places), found, {SPECULAR: self.specular(found)}, keeps)
 
-    def trace(self, view: View, wanted: list[Sequence]) -> dict[str, Records]:
-        """Tables of sequences that a receiver sees, by name."""
+    def trace(self, view: View, wanted: dict[str, tuple[str, str]], most: int) -> dict[str, Records]:
+        """Tables of the sequences ``wanted`` of what a receiver sees, with up to ``most`` slabs, by name; see :func:`sequences`."""
         first = Rays(view.hits, np.arange(len(view.hits.face)))
         seen, lit, made = {"": first}, dict[str, dict[str, Records]](), dict[str, Records]()
-        deepest = max((own.slabs for own in wanted if own.light == "TS"), default=0)
-        for light, sight, most in wanted:
+        for name, (light, sight) in wanted.items():
             if sight not in seen:
                 seen[sight] = self.turned(first) if sight == "M" else self.behind(first, most)
             rays = seen[sight]
@@ -326,9 +300,9 @@ class Tracer:
                 table = self.lit_by_mirrors(rays, most if light == "MTS" else 0)
             else:
                 if sight not in lit:
-                    lit[sight] = self.lit(rays, deepest)
+                    lit[sight] = self.lit(rays, most)
                 table = lit[sight][light]
-            made[Sequence(light, sight, most).name] = table
+            made[name] = table
         return made
 
     def specular(self, p: MirrorPaths) -> Records:

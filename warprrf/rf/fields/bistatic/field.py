@@ -44,7 +44,7 @@ from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.materials import Material
 from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT, check_frequency
-from warprrf.rf.fields.base import Data, Measured, RadioField, with_settings
+from warprrf.rf.fields.base import Data, Location, Measured, RadioField, with_settings
 from warprrf.rf.fields.batches import Work
 from warprrf.rf.fields.bistatic import edited, files
 from warprrf.rf.fields.bistatic.fit import fit
@@ -67,7 +67,6 @@ from warprrf.rf.fields.bistatic.paths import (
 from warprrf.rf.fields.bistatic.suggest import SHAPE as SUGGEST_SHAPE
 from warprrf.rf.fields.bistatic.suggest import Sensitivity, Unknowns, suggest
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
-from warprrf.rf.fields.location import Location
 from warprrf.rf.maps.links import LinkOptions
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.antenna import Antenna, Pattern

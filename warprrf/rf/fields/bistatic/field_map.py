@@ -136,7 +136,8 @@ def _mapped(bistatic: Any, part: tuple[np.ndarray, np.ndarray]) -> dict[str, np.
     paths, rays = view.paths, gains.by_ray()
     pixel = np.ravel_multi_index((paths.receiver, *pixel_of(paths.arrival, SHAPE)), (count, *SHAPE))
     image = rays + np.bincount(pixel, gains.specular, len(rays))
-    length = np.where(rays > 0, view.single_bounce_m(gains.nearest[1]), 0.0)
+    length, ray = np.zeros(len(rays)), np.flatnonzero(rays > 0)
+    length[ray] = view.over_m(ray, gains.nearest[1][ray])
     stronger = np.flatnonzero(gains.specular > rays[pixel])
     stronger = stronger[np.argsort(gains.specular[stronger], kind="stable")]
     length[pixel[stronger]] = paths.delay_m[stronger]

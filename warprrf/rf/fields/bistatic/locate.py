@@ -21,12 +21,11 @@ from threadpoolctl import threadpool_limits
 
 from warprrf.device import Progress
 from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT
-from warprrf.rf.fields.base import Measured
+from warprrf.rf.fields.base import Location, Measured
 from warprrf.rf.fields.bistatic.field_map import SPACING_M, FieldMap, best_on_map, coarse, maps_of
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, Place, as_list, huber, kinds_of, places_of
 from warprrf.rf.fields.bistatic.placing import from_zero
 from warprrf.rf.fields.bistatic.uncertainty import bins
-from warprrf.rf.fields.location import Location
 from warprrf.rf.positions import beside, quotients
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings

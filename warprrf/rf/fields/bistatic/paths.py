@@ -21,7 +21,7 @@ from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.spectrum import angles_from_directions, strongest_rays
 from warprrf.rf.tracing.model import Effects
 from warprrf.rf.tracing.render import PathGains, path_gains
-from warprrf.rf.tracing.tracer import View
+from warprrf.rf.tracing.tracer import SPECULAR, View
 
 LINK_SHAPE = (20, 40)
 """Default grid of a link's rays."""
@@ -142,18 +142,14 @@ def links(
     np.maximum.at(best, paths.receiver, specular)
     image = np.zeros((count, *shape))
     if effects.scatterings:
-        far = [name for name, records in gains.records.items() if records.reach_m is not None]
-        near = gains.by_ray(name for name in gains.powers if name not in far)
-        delay, each = view.single_bounce_m() / SPEED_OF_LIGHT, len(near) // count
-        scattered = [(near, delay, np.repeat(np.arange(count), each))]
-        for records, power in ((gains.records[name], gains.powers[name]) for name in far):
-            scattered.append((power, view.over_m(records) / SPEED_OF_LIGHT, records.ray // each))
-        for power, delay, own in scattered:
-            total, moment, square = (
-                sums + np.bincount(own, power * delay**k, minlength=count)
-                for k, sums in enumerate((total, moment, square))
-            )
         power = gains.by_ray().reshape(count, -1)
+        for name, records in gains.records.items():
+            if name != SPECULAR:
+                delay_s = view.over_m(records.ray, records.reach_m) / SPEED_OF_LIGHT
+                total, moment, square = (
+                    sums + np.bincount(records.ray // power.shape[1], gains.powers[name] * delay_s**k, count)
+                    for k, sums in enumerate((total, moment, square))
+                )
         image = power.reshape(count, *shape, -1).sum(axis=-1)
         # a path's pixel is one of the field's spectrum
         finer = shape[0] * shape[1] / (bistatic.shape[0] * bistatic.shape[1])
