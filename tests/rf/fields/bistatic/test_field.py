@@ -58,6 +58,17 @@ def test_spectra_that_would_not_fit_into_memory_are_refused(scene, data, monkeyp
     RadioField.fit(scene, data.subset(np.arange(9)), sub_pixels=2, effects="single", iterations=1)
 
 
+def test_what_was_learned_under_another_transmitter_than_its_own_a_field_does_not_use(scene, data):
+    """A first data set without receivers says where the field's own stands; all that was read is of another."""
+    own = np.array([4.2, 3.4, 2.3])
+    nothing = replace(data.subset([]), transmitter=own)
+    known = {"effects": SETS["room"], "quick": True}
+    field = RadioField.fit(scene, [nothing, data.subset(np.arange(4))], **known)
+    assert np.array_equal(field.transmitter, own) and np.abs(field.residual[0]).max() > 0.1
+    assert not field.residual[1].any()
+    assert np.abs(RadioField.fit(scene, data.subset(np.arange(4)), **known).residual[1]).max() > 0.1
+
+
 def test_a_fit_to_many_keeps_no_records_and_is_the_same(scene, data, field, monkeypatch):
     """Of each ray 4 bytes of its face and 8 of its range; records alone would take 24."""
     monkeypatch.setattr(training, "MOST_KEPT", 0)
