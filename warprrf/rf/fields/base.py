@@ -452,7 +452,8 @@ class RadioField(ABC):
         """Where to measure next: the candidates that lower the expected error most, one after another.
 
         It goes by what is seen there and how far that is known: a field of no measurement knows nothing but its prior;
-        at the receivers in ``fitted_on`` the same is taken to have been measured that is asked for here.
+        at the receivers in ``fitted_on``, each under its transmitter, the same is taken to have been measured that is asked
+        for here.
 
         Args:
             candidates: receivers that could be measured [m], shape ``(C, 3)``. Predictions count at all of them.
