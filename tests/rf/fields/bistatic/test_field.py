@@ -69,6 +69,18 @@ def test_what_was_learned_under_another_transmitter_than_its_own_a_field_does_no
     assert np.abs(RadioField.fit(scene, data.subset(np.arange(4)), **known).residual[1]).max() > 0.1
 
 
+def test_a_field_is_scored_under_the_transmitter_of_the_spectra(scene, data):
+    field, other = BistaticField.prior(scene, data), np.array([4.2, 3.4, 2.3])
+    gain = field.spectrum(RECEIVERS[1:3], other).path_gain
+    there = replace(data.subset([1, 2]), transmitter=other, path_gain=gain)
+    assert (
+        evaluate(there, field.spectrum)["psnr_db"]
+        == evaluate(there, lambda rx: field.spectrum(rx, other))["psnr_db"]
+        > 100
+    )
+    assert evaluate(there, lambda rx: field.spectrum(rx))["psnr_db"] < 40
+
+
 def test_a_fit_to_many_keeps_no_records_and_is_the_same(scene, data, field, monkeypatch):
     """Of each ray 4 bytes of its face and 8 of its range; records alone would take 24."""
     monkeypatch.setattr(training, "MOST_KEPT", 0)
