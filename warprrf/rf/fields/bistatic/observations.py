@@ -516,7 +516,10 @@ class _Tables(Kind):
         bare = Observation(place, view, measured, Target(np.zeros(len(rows))), floor)
         sight, steady = _shares(bare)
         bias, fading = fading_db(one.samples, steady)
-        above = NEPER * np.log1p(one.power[rows] / floor * 10.0 ** (-bias / 10.0))
+        heard = np.maximum(
+            one.power[rows], floors
+        )  # there was no more than the floor: what was read below it is noise
+        above = NEPER * np.log1p(heard / floor * 10.0 ** (-bias / 10.0))
         # Of all power errors of single directions average out.
         unexplained = 0.5 if one.total else READING_ERROR_DB
         trust = NOISE_DB / np.hypot(np.hypot(unexplained, np.asarray(one.std_db)[rows]), fading)
