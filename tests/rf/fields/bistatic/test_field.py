@@ -69,6 +69,18 @@ def test_what_was_learned_under_another_transmitter_than_its_own_a_field_does_no
     assert np.abs(RadioField.fit(scene, data.subset(np.arange(4)), **known).residual[1]).max() > 0.1
 
 
+def test_where_nothing_was_measured_a_field_was_not_fitted(scene, data):
+    gain = data.path_gain[:5].copy()
+    gain[2] = np.nan
+    known = {"effects": "single", "quick": True, "iterations": 2}
+    field = RadioField.fit(scene, replace(data.subset(np.arange(5)), path_gain=gain), **known)
+    other = RadioField.fit(scene, data.subset([0, 1, 3, 4]), **known)
+    np.testing.assert_array_equal(field.fitted_on, other.fitted_on)
+    np.testing.assert_array_equal(field.residual, other.residual)
+    with pytest.raises(ValueError, match="measured: got a spectrum of NaN alone"):
+        field.locate(replace(data.subset([2]), path_gain=gain[2:3]))
+
+
 def test_a_field_is_scored_under_the_transmitter_of_the_spectra(scene, data):
     field, other = BistaticField.prior(scene, data), np.array([4.2, 3.4, 2.3])
     gain = field.spectrum(RECEIVERS[1:3], other).path_gain

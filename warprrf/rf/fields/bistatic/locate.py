@@ -68,6 +68,8 @@ def as_data(field: Any, measured: Any) -> list[Measured]:
             raise ValueError(
                 f"measured: got spectra of {len(one)} receivers, expected that of one: ds.subset([k])"
             )
+        if isinstance(one, SpectrumDataset) and np.isnan(one.path_gain).all():
+            raise ValueError("measured: got a spectrum of NaN alone, expected pixels that were measured")
         sources = one.transmitter[None] if isinstance(one, SpectrumDataset) else one.transmitters
         found.append(replace(one, receivers=sources + [1.0, 0.0, 0.0]))
     return found

@@ -429,7 +429,7 @@ class Kind(ABC):
 
     @abstractmethod
     def places(self) -> list[Place]:
-        """Where it was taken; warns of powers that nobody can have read."""
+        """Where anything was measured; warns of powers that nobody can have read."""
 
     @abstractmethod
     def observe(self, place: Place, view: View) -> Observation:
@@ -458,6 +458,7 @@ class _Spectra(Kind):
         return [
             Place(self.number, np.array([r]), one.transmitter, receiver, one.frequency_hz, one.shape, one.air, one.beam_sigma_rad)
             for r, receiver in enumerate(one.receivers)
+            if np.isfinite(one.path_gain[r]).any()
         ]  # fmt: skip
 
     def observe(self, place: Place, view: View) -> Observation:
@@ -540,6 +541,7 @@ class _Arrays(Kind):
         return [
             Place(self.number, np.array([r]), *ends, one.frequency_hz, READINGS_SHAPE, one.air)
             for r, ends in enumerate(zip(one.transmitters, one.receivers, strict=True))
+            if np.isfinite(one.power[r]).any()
         ]
 
     def observe(self, place: Place, view: View) -> Observation:
