@@ -76,6 +76,13 @@ def test_package_reads_what_was_written(loaded):
     assert list(data.materials.name) == ["stone"]
 
 
+def test_paths_of_several_transmitters_are_refused(tmp_path):
+    paths = traced()
+    with pytest.raises(ValueError, match="paths: got ones of several transmitters"):
+        write_deepmimo(replace(paths, transmitter=np.tile(paths.transmitter, (5, 1))), tmp_path / "a")
+    assert not (tmp_path / "a").exists()
+
+
 def test_folder_without_the_package(tmp_path):
     """What DeepMIMO relies on: names of files, NaN where there is no path, codes of interactions."""
     parts = [

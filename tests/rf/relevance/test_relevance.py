@@ -107,6 +107,15 @@ def test_a_lobe_that_hardly_differs_is_replaced_and_power_is_kept():
     assert 0 < mixed.weight[0, 0] < mixed.weight[0, 1]  # exponent 5 is nearer to 6 than to Lambertian
 
 
+def test_what_a_field_learned_under_its_transmitter_is_not_judged_under_another(slabs, data):
+    field = BistaticField.prior(slabs, data, effects=SETS["room"])
+    field = replace(field, residual=np.full_like(field.residual, np.log(4.0)))
+    for source in (TX, np.array([4.0, 0.7, 2.3])):
+        full, _ = full_model(field, RECEIVERS[:1], progress=lambda *_: None, transmitter=source)
+        expected = replace(field, effects=full.field.effects).spectrum(RECEIVERS[:1], source).path_gain
+        np.testing.assert_allclose(full.image(full.all - {"gas"}), expected, rtol=1e-5)
+
+
 def test_gas_matters_over_a_kilometre_and_not_over_ten_metres():
     def air(length):
         """Two boxes as far apart as that, of nothing: only the air between them counts."""

@@ -488,7 +488,8 @@ class RadioField(ABC):
         """Where to measure next: the candidates that lower the expected error most, one after another.
 
         It goes by what is seen there and how far that is known: a field of no measurement knows nothing but its prior;
-        at the receivers in ``fitted_on`` the same is taken to have been measured that is asked for here.
+        at the receivers in ``fitted_on``, each under its transmitter, the same is taken to have been measured that is asked
+        for here.
 
         Args:
             candidates: receivers that could be measured [m], shape ``(C, 3)``. Predictions count at all of them.
@@ -528,7 +529,8 @@ class RadioField(ABC):
             measured: the spectrum of one receiver; or its readings under transmitters of known places: of a horn's pointings
                 at either end, profiles of delay, or power alone; or an array's spectrum; or a list of them. Where they say the
                 receiver stood is not looked at. Gains of measuring chains (``chain``), azimuths with ``azimuth_known=False``
-                and delays with ``clock_known=False`` are found too.
+                and delays with ``clock_known=False`` are found too. Absorption that is in the powers, by their ``air``, is
+                reckoned with in place of the field's.
             store: a NetCDF-4 file that keeps the map, for another process.
             progress: called as ``progress("map", done, total)``.
 

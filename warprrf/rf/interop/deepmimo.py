@@ -53,8 +53,8 @@ def write_deepmimo(
         The folder.
 
     Raises:
-        ValueError: for a name that DeepMIMO cannot load, unknown positions or carrier, paths without delay, ``diffuse``
-            not stated.
+        ValueError: for a name that DeepMIMO cannot load, unknown positions or carrier, several transmitters, paths without
+            delay, ``diffuse`` not stated.
     """
     folder = Path(folder)
     name = folder.name
@@ -62,6 +62,8 @@ def write_deepmimo(
         raise ValueError(f"folder: got the name {name!r}, which DeepMIMO cannot load; expected lower case")
     if paths.transmitter is None or paths.receiver is None:
         raise ValueError("paths: got ones without transmitter and receiver, which a scenario needs")
+    if np.ndim(paths.transmitter) != 1:
+        raise ValueError("paths: got ones of several transmitters, expected those of one")
     scattered = bool((paths.valid & (paths.kind == "diffuse")).any())
     if scattered and diffuse not in ("random_phase", "given"):
         raise ValueError(

@@ -66,8 +66,11 @@ def full_field(geometry: Any, frame: SpectrumDataset, device: Any = None) -> tup
     Of ``frame`` transmitter, carrier, grid and beam count; where a field is given, the transmitter alone."""
     if isinstance(geometry, BistaticField):
         effects = replace(EVERYTHING, residual=geometry.effects.residual)
-        # Air is judged by itself.
-        return replace(geometry, effects=effects, transmitter=frame.transmitter, air=None), "fit"
+        # Gains that were learned under its own transmitter stay with that. Air is judged by itself.
+        learned = np.arange(len(geometry.residual)) < geometry.state.learned_rows(frame.transmitter)
+        residual = np.where(learned[:, None], geometry.residual, 0.0)
+        moved = replace(geometry, effects=effects, residual=residual, transmitter=frame.transmitter, air=None)
+        return moved, "fit"
     field = BistaticField.prior(geometry, frame, effects=replace(EVERYTHING, residual=False), device=device)
     if not hasattr(geometry, "materials"):
         return field, "assumed"

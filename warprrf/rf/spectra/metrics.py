@@ -14,7 +14,7 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Annotated, Any, TypeAlias
 
 import numpy as np
@@ -183,8 +183,8 @@ def evaluate(
     Args:
         test: truth: held-out receivers.
         predict: from a receiver position ``(3,)`` [m] to a :class:`Spectrum`, or to a path gain array
-            ``(height, width)`` alone (then there is no ToF or AoD error). A field's ``spectrum`` is asked on the grid of
-            ``test``, whatever the field's own.
+            ``(height, width)`` alone (then there is no ToF or AoD error). A field's ``spectrum`` is asked on the grid and
+            under the transmitter of ``test``, whatever the field's own.
         beam_width_rad: full width at half maximum of the beam in ``beam_gain_loss_db``.
         progress: called once a receiver with the stage ``"evaluate"``.
 
@@ -216,7 +216,7 @@ def evaluate(
             f"test: {fitted_on} of its {count} receivers are among those that the predictor was fitted on: these are "
             "no errors of prediction; score receivers that were held out (ds.split)"
         )
-    predict = _on_grid(predict, test.path_gain.shape[1:])
+    predict = _asked_alike(predict, test)
     floor, range_db = float(test.floor), test.range_db
     rows = defaultdict[str, np.ndarray](lambda: np.full(count, np.nan))
     seconds = np.zeros(count)
@@ -286,11 +286,16 @@ def _fitted_on(predict: Callable[[np.ndarray], Any], test: SpectrumDataset) -> i
     return int(np.count_nonzero(owner.was_fitted_on(test))) if hasattr(owner, "was_fitted_on") else None
 
 
-def _on_grid(predict: Callable[[np.ndarray], Any], shape: tuple[int, int]) -> Callable[[np.ndarray], Any]:
-    """``predict``, with spectra of ``shape`` if they are a field's."""
+def _asked_alike(predict: Callable[[np.ndarray], Any], test: SpectrumDataset) -> Callable[[np.ndarray], Any]:
+    """``predict``, with spectra of the grid and the transmitter of ``test`` if they are a field's."""
     owner: Any = getattr(predict, "__self__", None)
-    is_field = hasattr(owner, "on_grid") and getattr(predict, "__name__", "") == "spectrum"
-    return owner.on_grid(shape).spectrum if is_field else predict
+    if not hasattr(owner, "on_grid") or getattr(predict, "__name__", "") != "spectrum":
+        return predict
+    spectrum: Callable[..., Any] = owner.on_grid(test.shape).spectrum
+    same_m = 1e-3  # a transmitter this near is the same one
+    if np.linalg.norm(owner.transmitter - test.transmitter) <= same_m:
+        return spectrum
+    return partial(spectrum, transmitter=test.transmitter)
 
 
 def _unit(angles: np.ndarray | None) -> np.ndarray:

@@ -58,6 +58,41 @@ def test_spectra_that_would_not_fit_into_memory_are_refused(scene, data, monkeyp
     RadioField.fit(scene, data.subset(np.arange(9)), sub_pixels=2, effects="single", iterations=1)
 
 
+def test_what_was_learned_under_another_transmitter_than_its_own_a_field_does_not_use(scene, data):
+    """A first data set without receivers says where the field's own stands; all that was read is of another."""
+    own = np.array([4.2, 3.4, 2.3])
+    nothing = replace(data.subset([]), transmitter=own)
+    known = {"effects": SETS["room"], "quick": True}
+    field = RadioField.fit(scene, [nothing, data.subset(np.arange(4))], **known)
+    assert np.array_equal(field.transmitter, own) and np.abs(field.residual[0]).max() > 0.1
+    assert not field.residual[1].any()
+    assert np.abs(RadioField.fit(scene, data.subset(np.arange(4)), **known).residual[1]).max() > 0.1
+
+
+def test_where_nothing_was_measured_a_field_was_not_fitted(scene, data):
+    gain = data.path_gain[:5].copy()
+    gain[2] = np.nan
+    known = {"effects": "single", "quick": True, "iterations": 2}
+    field = RadioField.fit(scene, replace(data.subset(np.arange(5)), path_gain=gain), **known)
+    other = RadioField.fit(scene, data.subset([0, 1, 3, 4]), **known)
+    np.testing.assert_array_equal(field.fitted_on, other.fitted_on)
+    np.testing.assert_array_equal(field.residual, other.residual)
+    with pytest.raises(ValueError, match="measured: got a spectrum of NaN alone"):
+        field.locate(replace(data.subset([2]), path_gain=gain[2:3]))
+
+
+def test_a_field_is_scored_under_the_transmitter_of_the_spectra(scene, data):
+    field, other = BistaticField.prior(scene, data), np.array([4.2, 3.4, 2.3])
+    gain = field.spectrum(RECEIVERS[1:3], other).path_gain
+    there = replace(data.subset([1, 2]), transmitter=other, path_gain=gain)
+    assert (
+        evaluate(there, field.spectrum)["psnr_db"]
+        == evaluate(there, lambda rx: field.spectrum(rx, other))["psnr_db"]
+        > 100
+    )
+    assert evaluate(there, lambda rx: field.spectrum(rx))["psnr_db"] < 40
+
+
 def test_a_fit_to_many_keeps_no_records_and_is_the_same(scene, data, field, monkeypatch):
     """Of each ray 4 bytes of its face and 8 of its range; records alone would take 24."""
     monkeypatch.setattr(training, "MOST_KEPT", 0)

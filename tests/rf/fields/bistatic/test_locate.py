@@ -64,6 +64,22 @@ def test_what_is_said_of_the_place_does_not_count(scene, field):
     np.testing.assert_array_equal(field.locate(one).position, field.locate(elsewhere).position)
 
 
+def test_powers_that_hold_absorption_are_looked_for_with_it(field):
+    air = wr.Air(pressure_hpa=30_000.0, water_vapour_g_m3=100.0)
+    humid = field.with_gas(air)
+    read = wr.SpectrumDataset.from_spectra(
+        receivers=UNSEEN[:1], transmitter=field.transmitter, frequency_hz=field.frequency_hz,
+        path_gain=humid.spectrum(UNSEEN[:1]).path_gain, beam_sigma_rad=field.beam_sigma_rad, floor=field.floor,
+        attributes=air.attributes,
+    )  # fmt: skip
+    found = field.locate(read)
+    np.testing.assert_array_equal(found.position, humid.locate(read).position)
+    assert np.linalg.norm(found.position - UNSEEN[0]) < 0.05 and field.locate(read).misfit == found.misfit
+    other = replace(read, attributes=wr.Air().attributes)
+    with pytest.raises(ValueError, match="measured: got the absorption of 2 kinds of air"):
+        field.locate([read, other])
+
+
 def test_a_horn_of_unknown_gain_and_azimuth_finds_all_three(field, horn):
     found = field.locate(horn)
     assert np.linalg.norm(found.position - UNSEEN[1]) < 0.15

@@ -49,6 +49,23 @@ def field(scene):
     return BistaticField.prior(scene, spectra(scene, RX[None]), effects=SINGLE)
 
 
+def test_whatever_is_read_below_a_floor_says_that_there_was_no_more_than_that(field):
+    """Another reading's floor may lie far below it."""
+    view, floor = field.view(RX), np.array([1e-13, 1e-9, 1e-9, 1e-9])
+    angles = np.column_stack([np.full(4, np.pi / 2), [0.0, 1.0, 2.0, 3.0]])
+    errors = []
+    for power in ([2e-10, 1e-9, 1e-9, 1e-9], [2e-10, 0.0, 1e-11, 0.9e-9]):
+        one = Readings(
+            TX, RX, np.array(power), F, floor, arrival=angles, receive_pattern=horn(np.radians(20.0))
+        )
+        (place,) = places_of([one], None, None)
+        (o,) = observe([one], [(place, view)], F, [])
+        assert o.target.censored.tolist() == [False, True, True, True]
+        errors.append(o.target.error(np.array([2e-10, 5e-10, 9e-10, 4e-9]) / o.floor))
+    np.testing.assert_array_equal(*errors)
+    assert not errors[0][1:3].any() and errors[0][3] > 3.0
+
+
 def test_a_delay_profile_is_the_sum_of_its_paths(field):
     view = field.view(RX)
     profile = delay_profile(view)

@@ -51,7 +51,7 @@ def test_a_receiver_behind_a_wall_is_where_it_is_said_to_be():
     delay_s = traced.tau[0] + np.arange(-4, 5) * 0.25e-9
     one, o, power = readings(scene, effects, delay_s=delay_s, bandwidth_hz=1e9)
     assert o.view.paths.slabs.tolist() == [1]
-    assert np.abs(position_offset(one, o, np.zeros(len(one)), power)).max() < 1e-3
+    assert np.abs(position_offset(one, [(o, np.zeros(len(one)), power)])).max() < 1e-3
 
 
 def test_a_path_over_an_edge_leaves_for_the_edge():
@@ -64,7 +64,7 @@ def test_a_path_over_an_edge_leaves_for_the_edge():
     departure = np.column_stack([np.repeat(zenith, len(turn)), azimuth + turn])
     one, o, power = readings(scene, effects, departure=departure, transmit_pattern=horn(np.radians(20.0)))
     assert o.view.paths.over_edge.all()
-    assert np.abs(position_offset(one, o, np.zeros(len(one)), power)).max() < 1e-3
+    assert np.abs(position_offset(one, [(o, np.zeros(len(one)), power)])).max() < 1e-3
 
 
 def test_the_zero_of_azimuths_is_that_of_what_walls_let_through():

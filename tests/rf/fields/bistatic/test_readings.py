@@ -199,6 +199,20 @@ def test_receivers_that_stood_elsewhere_are_found(scene, turned):
         replace(turned, arrival=None, receive_pattern=None, position_std_m=0.05)
 
 
+def test_a_receiver_stands_at_one_place_whoever_reads_it(scene, turned):
+    """Every other pointing is of another chain: what both read tells of one place."""
+    away = 0.08 * np.random.default_rng(2).normal(size=(6, 3)).clip(-1.5, 1.5)
+    said = replace(turned, receivers=turned.receivers + np.repeat(away, len(turned) // 6, axis=0))
+    known = {"quick": True, "effects": "single"}
+    one, two = (
+        RadioField.fit(scene, replace(said, chain=chain, position_std_m=0.08, name="away"), **known).report
+        for chain in (turned.chain, np.resize(["horn", "other"], len(turned)))
+    )
+    places, offsets = np.moveaxis(np.array(two["position_offset_m"]["away"]), 1, 0)
+    np.testing.assert_allclose(places, RECEIVERS[:6] + away)
+    np.testing.assert_allclose(offsets, [offset for _, offset in one["position_offset_m"]["away"]], atol=0.01)
+
+
 def test_roughness_counts_in_wavelengths_at_another_carrier(scene):
     """A mirror's share exp(-(4 pi sigma_h / lambda)^2) is found again, the sum of both shares stays, and so does what
     free space gives: the square of the wavelength."""

@@ -1,5 +1,7 @@
 """Where to measure next, and fields of no measurement."""
 
+from dataclasses import replace
+
 import furnished
 import numpy as np
 import pytest
@@ -86,6 +88,18 @@ def test_what_was_measured_is_not_measured_again(scene, unmeasured):
     first = int(unmeasured.suggest(CANDIDATES)[0])
     field = wr.RadioField.fit(scene, spectra(scene, CANDIDATES).subset([first]), quick=True)
     assert field.suggest(CANDIDATES)[0] != first
+
+
+def test_what_was_measured_under_another_transmitter_tells_what_that_one_lights(unmeasured):
+    other, place = EAST[:1] + [0.3, 0.2, 0.9], WEST[3:4]
+    field = replace(unmeasured, fitted_on=place, fitted_under=other)
+    moved = replace(unmeasured, fitted_on=place, transmitter=other[0])
+    alike = replace(unmeasured, fitted_on=place, fitted_under=TX[None])
+    np.testing.assert_array_equal(field.gain_std_db(), moved.gain_std_db())
+    np.testing.assert_array_equal(alike.gain_std_db(), replace(unmeasured, fitted_on=place).gain_std_db())
+    assert np.abs(field.gain_std_db() - alike.gain_std_db()).max() > 0.5
+    candidates = np.concatenate([WEST[1:], WEST[3:]])  # the last two are one
+    assert alike.suggest(candidates)[0] not in (2, 3) and field.suggest(candidates)[0] in (2, 3)
 
 
 def test_a_horn_is_not_pointed_twice_at_one_place(unmeasured):

@@ -65,7 +65,7 @@ from warprrf.rf.fields.bistatic.paths import (
     strongest,
 )
 from warprrf.rf.fields.bistatic.suggest import SHAPE as SUGGEST_SHAPE
-from warprrf.rf.fields.bistatic.suggest import Sensitivity, Unknowns, suggest
+from warprrf.rf.fields.bistatic.suggest import Sensitivity, Unknowns, precision, suggest
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
 from warprrf.rf.maps.links import LinkOptions
 from warprrf.rf.paths.path_set import Paths
@@ -503,9 +503,8 @@ class BistaticField(RadioField):
             turned = check_turned("arrival", arrival, len(places))
             antenna = antenna_of("receive_pattern", receive_pattern)
         sensitivity, unknowns = self._sensitivity(antenna)
-        return suggest(
-            sensitivity, unknowns, places, n, measured=self.fitted_on, turned=turned, progress=progress
-        )
+        measured = self._measured(antenna)
+        return suggest(sensitivity, unknowns, places, n, measured=measured, turned=turned, progress=progress)
 
     def locate(
         self,
@@ -520,12 +519,21 @@ class BistaticField(RadioField):
     def gain_std_db(self, progress: Progress | None = None) -> np.ndarray:
         """How far the gain of what each element of the surface scatters is known after spectra at ``fitted_on``: standard
         deviation [dB], shape ``(E,)``; see :mod:`warprrf.rf.fields.bistatic.suggest`."""
-        sensitivity, unknowns = self._sensitivity()
-        variance = unknowns.variance(sensitivity.precision(self.fitted_on, progress=progress))
+        unknowns = self._sensitivity()[1]
+        variance = unknowns.variance(precision(self._measured(), unknowns, progress=progress))
         return NEPER * np.sqrt(variance[: len(self.surface.element_area)])
 
-    def _sensitivity(self, antenna: Antenna | None = None) -> tuple[Sensitivity, Unknowns]:
-        tracer = self.tracer().on_grid(SUGGEST_SHAPE, 1)
+    def _measured(self, antenna: Antenna | None = None) -> list[tuple[Sensitivity, np.ndarray]]:
+        """Receivers that it was fitted to, each as its own transmitter lights what it sees."""
+        under = self.transmitter if self.fitted_under is None else self.fitted_under
+        sources, own = np.unique(np.broadcast_to(under, self.fitted_on.shape), axis=0, return_inverse=True)
+        by_source = [self._sensitivity(antenna, source)[0] for source in sources]
+        return [(by_source[k], place) for k, place in zip(own.reshape(-1), self.fitted_on, strict=True)]
+
+    def _sensitivity(
+        self, antenna: Antenna | None = None, transmitter: np.ndarray | None = None
+    ) -> tuple[Sensitivity, Unknowns]:
+        tracer = self.tracer(transmitter).on_grid(SUGGEST_SHAPE, 1)
         floor = self.floor * np.prod(self.shape) / np.prod(SUGGEST_SHAPE)
         return Sensitivity(tracer, self.state, floor, antenna), Unknowns.of(tracer, self.material)
 

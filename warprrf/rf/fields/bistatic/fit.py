@@ -25,7 +25,7 @@ from warprrf.rf.fields.bistatic.measured import SpectrumPixels, read
 from warprrf.rf.fields.bistatic.merging import merge
 from warprrf.rf.fields.bistatic.observations import Place, Seen, as_list, frame_of, places_of
 from warprrf.rf.fields.bistatic.options import RARE, FitOptions, evenly
-from warprrf.rf.fields.bistatic.placing import moved, position_offset, with_zeros
+from warprrf.rf.fields.bistatic.placing import Heard, moved, position_offset, with_zeros
 from warprrf.rf.fields.bistatic.report import covariance_of, left_out, report_of, warn_of
 from warprrf.rf.fields.bistatic.residual import fit_residual, shares_of
 from warprrf.rf.fields.bistatic.training import (
@@ -91,10 +91,10 @@ def fit(
             t, model, found, _ = _learned(surface, data, places, look, options, progress)
     report = found["report"]
     warn_of(t.data, report)
-    places_moved = {
-        t.names[k]: [(place.receiver.tolist(), offset.tolist()) for place, offset in own]
-        for k, own in offsets.items()
-    }
+    places_moved = {}
+    for k, own in offsets.items():
+        once = {place.receiver.tobytes(): (place.receiver.tolist(), offset.tolist()) for place, offset in own}
+        places_moved[t.names[k]] = list(once.values())
     parameters = replace(model.parameters, log_gains=np.zeros(0))  # chains are of the data, not of the field
     return found | {
         "parameters": parameters, "report": report | zeros | {"position_offset_m": places_moved},
@@ -306,16 +306,19 @@ def with_residual(t: Training, model: Model, places: Sequence[int] | np.ndarray)
 
 def _offsets(t: Training, found: Model) -> dict[int, list[tuple[Place, np.ndarray]]]:
     """By data set of unknown positions its places, and how far each receiver is from where it is said to be [m]."""
-    offsets: dict[int, list[tuple[Place, np.ndarray]]] = {}
+    heard: dict[tuple[int, bytes], list[Heard]] = {}
     for o in t.observations.values():
-        one = t.data[o.place.data]
-        if getattr(one, "position_std_m", 0.0) == 0:
+        if getattr(t.data[o.place.data], "position_std_m", 0.0) == 0:
             continue
         gains = o.path_gains(found)
         total = np.maximum(read(gains, o.measured), 0.0) / o.floor
         direct = gains.specular / o.floor
         gain = o.gain(gains.parameters, total)
         other = np.maximum(total - direct @ o.measured.of_paths(o.view), 0.0)
-        offset = position_offset(one, o, gain * other, gain * direct)  # type: ignore[arg-type]
-        offsets.setdefault(o.place.data, []).append((o.place, offset))
+        receiver = o.place.data, o.place.receiver.tobytes()
+        heard.setdefault(receiver, []).append((o, gain * other, gain * direct))
+    offsets: dict[int, list[tuple[Place, np.ndarray]]] = {}
+    for (data, _), own in heard.items():
+        offset = position_offset(t.data[data], own)  # type: ignore[arg-type]
+        offsets.setdefault(data, []).extend((o.place, offset) for o, *_ in own)
     return offsets

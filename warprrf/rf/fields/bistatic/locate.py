@@ -67,6 +67,8 @@ def as_data(field: Any, measured: Any) -> list[Measured]:
             raise ValueError(
                 f"measured: got spectra of {len(one)} receivers, expected that of one: ds.subset([k])"
             )
+        if isinstance(one, SpectrumDataset) and np.isnan(one.path_gain).all():
+            raise ValueError("measured: got a spectrum of NaN alone, expected pixels that were measured")
         sources = one.transmitter[None] if isinstance(one, SpectrumDataset) else one.transmitters
         found.append(replace(one, receivers=sources + [1.0, 0.0, 0.0]))
     return found
@@ -287,9 +289,15 @@ def locate(
     field: Any, measured: Any, store: str | os.PathLike[str] | None, progress: Progress | None
 ) -> Location:
     """See :meth:`RadioField.locate`; ``field`` is a bistatic one."""
-    question = Question(field, as_data(field, measured))
-    sources = question.transmitters
-    maps = field._maps.get(np.stack(sources).tobytes(), lambda: maps_of(field, sources, store, progress))
+    data = as_data(field, measured)
+    air = {one.air for one in data} - {None}
+    if len(air) > 1:
+        raise ValueError(f"measured: got the absorption of {len(air)} kinds of air, expected one")
+    question = Question(field if air <= {field.air} else field.with_gas(*air), data)
+    of, sources = question.field, question.transmitters
+    maps = field._maps.get(
+        (of.air, np.stack(sources).tobytes()), lambda: maps_of(of, sources, store, progress)
+    )
     with threadpool_limits(1, user_api="blas"):  # matrices are small
         return search(question, maps)
 

@@ -429,7 +429,7 @@ class Kind(ABC):
 
     @abstractmethod
     def places(self) -> list[Place]:
-        """Where it was taken; warns of powers that nobody can have read."""
+        """Where anything was measured; warns of powers that nobody can have read."""
 
     @abstractmethod
     def observe(self, place: Place, view: View) -> Observation:
@@ -458,6 +458,7 @@ class _Spectra(Kind):
         return [
             Place(self.number, np.array([r]), one.transmitter, receiver, one.frequency_hz, one.shape, one.air, one.beam_sigma_rad)
             for r, receiver in enumerate(one.receivers)
+            if np.isfinite(one.path_gain[r]).any()
         ]  # fmt: skip
 
     def observe(self, place: Place, view: View) -> Observation:
@@ -516,7 +517,10 @@ class _Tables(Kind):
         bare = Observation(place, view, measured, Target(np.zeros(len(rows))), floor)
         sight, steady = _shares(bare)
         bias, fading = fading_db(one.samples, steady)
-        above = NEPER * np.log1p(one.power[rows] / floor * 10.0 ** (-bias / 10.0))
+        heard = np.maximum(
+            one.power[rows], floors
+        )  # there was no more than the floor: what was read below it is noise
+        above = NEPER * np.log1p(heard / floor * 10.0 ** (-bias / 10.0))
         # Of all power errors of single directions average out.
         unexplained = 0.5 if one.total else READING_ERROR_DB
         trust = NOISE_DB / np.hypot(np.hypot(unexplained, np.asarray(one.std_db)[rows]), fading)
@@ -537,6 +541,7 @@ class _Arrays(Kind):
         return [
             Place(self.number, np.array([r]), *ends, one.frequency_hz, READINGS_SHAPE, one.air)
             for r, ends in enumerate(zip(one.transmitters, one.receivers, strict=True))
+            if np.isfinite(one.power[r]).any()
         ]
 
     def observe(self, place: Place, view: View) -> Observation:

@@ -10,7 +10,7 @@ and what is scattered hardly changes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -110,18 +110,37 @@ def moved(one: Readings, offsets: Sequence[tuple[Place, np.ndarray]]) -> Reading
     return replace(one, receivers=receivers, position_std_m=0.0)
 
 
-def position_offset(one: Readings, o: Observation, other: np.ndarray, power: np.ndarray) -> np.ndarray:
+Heard = tuple[Observation, np.ndarray, np.ndarray]
+"""What was read of a receiver; its prediction without line of sight and mirrors, shape ``(N,)``; and the power of those paths,
+shape ``(L,)``: both in the units of the target, gain of the chain included."""
+
+
+def position_offset(one: Readings, heard: Sequence[Heard]) -> np.ndarray:
     """Offset of a receiver from where it is said to be [m], shape ``(3,)``: the one that readings and prior like best.
 
     Args:
         one: table that holds its readings.
-        o: what was read where it is said to be.
-        other: prediction without line of sight and mirrors, shape ``(N,)``.
-        power: of those paths, shape ``(L,)``; both in the units of the target, gain of the chain included.
+        heard: under each transmitter, and by each measuring chain, where it is said to be.
     """
-    place, paths, std = o.place, o.view.paths, one.position_std_m
+    std, first = one.position_std_m, heard[0][0]
+    receiver, most = first.place.receiver, 2.0 * std  # along each axis
+    missed = [_missed(one, *own) for own in heard]
+    found = least_squares(
+        lambda offset: np.concatenate([*(own(offset) for own in missed), offset / std]), np.zeros(3), bounds=(-most, most),
+        loss="huber", f_scale=first.huber_db / NOISE_DB, x_scale=std, diff_step=1e-3,
+    ).x  # fmt: skip
+    # A step and a half of it must be free, or the receiver would end in a wall.
+    mesh = first.view.tracer.surface.mesh
+    free = mesh.visible(receiver[None], (receiver + 1.5 * found)[None])[0]
+    return np.asarray(found) if free and np.abs(found).max() > 0 else np.zeros(3)
+
+
+def _missed(
+    one: Readings, o: Observation, other: np.ndarray, power: np.ndarray
+) -> Callable[[np.ndarray], np.ndarray]:
+    """From an offset (3,) of a receiver [m] to errors of what was read (N,), in standard deviations; see :data:`Heard`."""
+    place, paths = o.place, o.view.paths
     bent, (_, toward, _) = paths.over_edge[:, None], direct_paths(o.view)
-    most = 2.0 * std  # along each axis
     s = o.view.tracer.surface
     image = place.receiver + paths.arrival * paths.length_m[:, None]
     turn = np.tile(-np.eye(3), (len(paths), 1, 1))  # from arrival to departure
@@ -137,13 +156,6 @@ def position_offset(one: Readings, o: Observation, other: np.ndarray, power: np.
         departure = np.where(bent, toward, (turn @ arrival[:, :, None])[..., 0])  # an edge stays where it is
         delay_s = (length + paths.excess_m) / SPEED_OF_LIGHT
         weight = path_weights(one, place.rows, arrival, departure, delay_s)
-        missed = o.target.error(other + weight @ power) / NOISE_DB
-        return np.concatenate([missed, offset / std])
+        return np.asarray(o.target.error(other + weight @ power) / NOISE_DB)
 
-    found = least_squares(
-        error, np.zeros(3), bounds=(-most, most), loss="huber", f_scale=o.huber_db / NOISE_DB,
-        x_scale=std, diff_step=1e-3,
-    ).x  # fmt: skip
-    # A step and a half of it must be free, or the receiver would end in a wall.
-    free = s.mesh.visible(place.receiver[None], (place.receiver + 1.5 * found)[None])[0]
-    return np.asarray(found) if free and np.abs(found).max() > 0 else np.zeros(3)
+    return error

@@ -9,6 +9,7 @@ that share a reading are told apart as if the others were known.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,12 +91,15 @@ class Sensitivity:
         own = mirror >= 0
         parts = [(pixel[own], 2 * elements + mirror[own], found.specular[own])]
         rest = [(pixel[~own], found.specular[~own])]
+        learned = self.model.learned_rows(self.tracer.transmitter)
         for name, power in found.powers.items():
             ray, gain = found.records[name].ray, found.records[name].residual_row
-            if gain >= 0:
+            if 0 <= gain < learned:
                 parts.append((ray, elements * gain + s.cells.element[view.cell(ray)], power))
             elif name != SPECULAR:
-                rest.append((ray, power))  # what mirrors show is taken for known, as line of sight is
+                # What mirrors show is taken for known, as line of sight is; so is what surfaces send on of another
+                # transmitter's light, whose gains are others.
+                rest.append((ray, power))
         row, unknown, power = (np.concatenate(column) for column in zip(*parts, strict=True))
         table = csr_matrix((power, (row, unknown)), shape=(count, 2 * elements + s.groups))
         ray, power = (np.concatenate(column) for column in zip(*rest, strict=True))
@@ -117,16 +121,20 @@ class Sensitivity:
         least_db = 1e-3  # per neper: readings that change less tell nothing
         return summed, csr_matrix(np.where(slope > least_db, (slope / READING_ERROR_DB) ** 2, 0.0))
 
-    def precision(
-        self, places: np.ndarray, turned: np.ndarray | None = None, progress: Progress | None = None
-    ) -> np.ndarray:
-        """With which readings at all of ``places`` (R, 3), at each ``turned`` to all of (K, 2), tell the gains [1/neper^2], shape
-        ``(U,)``."""
-        surface = self.tracer.surface
-        known = np.zeros(2 * len(surface.element_area) + surface.groups)
-        for place in with_progress(places, "suggest", progress):
-            known += np.asarray(self.of(place, turned)[1].sum(axis=0)).ravel()
-        return known
+
+Measured = Sequence[tuple[Sensitivity, np.ndarray]]
+"""Receivers (3,), each with how readings there depend on the gains, under its transmitter."""
+
+
+def precision(
+    measured: Measured, unknowns: Unknowns, turned: np.ndarray | None = None, progress: Progress | None = None
+) -> np.ndarray:
+    """With which readings at all that was measured, at each ``turned`` to all of (K, 2), tell the gains [1/neper^2], shape
+    ``(U,)``."""
+    known = np.zeros(len(unknowns.material))
+    for sensitivity, place in with_progress(measured, "suggest", progress):
+        known += np.asarray(sensitivity.of(place, turned)[1].sum(axis=0)).ravel()
+    return known
 
 
 def first_mirror(table: Records) -> np.ndarray:
@@ -142,15 +150,14 @@ def suggest(
     candidates: np.ndarray,
     n: int,
     *,
-    measured: np.ndarray,
+    measured: Measured,
     turned: np.ndarray | None = None,
     progress: Progress | None = None,
 ) -> np.ndarray:
     """Indices of the ``n`` of ``candidates`` (C, 3) that tell most about spectra at all of them, best first.
 
     Args:
-        measured: receivers that have been measured before, in every direction in which candidates would be [m], shape
-            ``(R, 3)``.
+        measured: receivers that have been measured before, in every direction in which candidates would be [m].
         turned: zenith and azimuth that the antenna would be turned to at each candidate [rad], shape ``(C, 2)``; None for whole
             spectra.
         progress: called with the stage ``"suggest"``.
@@ -167,7 +174,7 @@ def suggest(
             progress("suggest", k + 1, total)
     every = None if turned is None else np.unique(turned, axis=0)
     after = None if progress is None else lambda stage, done, _: progress(stage, len(places) + done, total)
-    known = sensitivity.precision(measured, every, after)
+    known = precision(measured, unknowns, every, after)
     return _greedy(told, square, unknowns, known, n)
 
 

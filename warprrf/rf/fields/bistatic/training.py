@@ -284,9 +284,10 @@ class Training:
 
     @property
     def transmitter(self) -> np.ndarray:
-        """Under which gains of light sent on are learned: of several transmitters none."""
-        sources = np.unique([o.place.transmitter for o in self.observations.values()], axis=0)
-        return sources[0] if len(sources) == 1 else np.full(3, np.nan)
+        """Under which gains of light sent on are learned: the field's own, if all was read under that, else none."""
+        own = frame_of(self.data).transmitter
+        alone = all(np.array_equal(o.place.transmitter, own) for o in self.observations.values())
+        return own if alone else np.full(3, np.nan)
 
     def start(self, material: np.ndarray) -> Parameters:
         """Parameters of materials before any measurement."""
