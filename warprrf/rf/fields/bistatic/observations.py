@@ -517,9 +517,7 @@ class _Tables(Kind):
         bare = Observation(place, view, measured, Target(np.zeros(len(rows))), floor)
         sight, steady = _shares(bare)
         bias, fading = fading_db(one.samples, steady)
-        heard = np.maximum(
-            one.power[rows], floors
-        )  # there was no more than the floor: what was read below it is noise
+        heard = np.maximum(one.power[rows], floors)  # no more than the floor: what was read below it is noise
         above = NEPER * np.log1p(heard / floor * 10.0 ** (-bias / 10.0))
         # Of all power errors of single directions average out.
         unexplained = 0.5 if one.total else READING_ERROR_DB
