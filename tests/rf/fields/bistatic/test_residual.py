@@ -124,6 +124,11 @@ def test_another_transmitters_light_falls_elsewhere(field):
     assert not np.allclose(ours["S"], bare["S"], atol=0.0)
 
 
+def test_a_transmitter_is_the_one_learned_under_within_a_micrometre(field):
+    at = field.transmitter
+    assert [field.state.learned_rows(at + off) for off in (0.0, 1e-9, 1e-3, np.nan)] == [2, 2, 1, 1]
+
+
 def test_links_have_the_same_gains(field):
     """What either gain adds to the total path gain of a link is what it adds to the spectrum."""
     rng = np.random.default_rng(6)
