@@ -163,7 +163,7 @@ class BistaticField(RadioField):
         """Fit a bistatic field.
 
         Args:
-            geometry: Reconstruction, Scene (its materials name the groups and say what slabs are; what surfaces scatter is fitted) or Mesh.
+            geometry: Reconstruction, Scene (its materials name the groups and say what slabs are, no more) or Mesh.
             ds: training set: spectra, readings, or a list of them. The field's own transmitter and carrier are the first.
                 Without any receiver the field is what is known beforehand.
             model: ``"bistatic"``.
