@@ -76,7 +76,7 @@ def run(options: Options, job: Job) -> Report:
         compare = partial(compared, job, held_out)
         inputs = [steps.key("geometry")]
         figures |= steps.run("comparison", lambda attempt: compare(), version=1, inputs=inputs)
-        figures |= {"seconds": steps.seconds("geometry"), "stages": steps.stages("geometry")}
+        figures |= {name: steps.records["geometry"][name] for name in ("seconds", "stages")}
     figures["machine"] = machine(job.device)
     return Report("photos", figures, summary(figures))
 

@@ -179,9 +179,9 @@ def test_a_killed_attempt_is_continued_and_its_time_counted(tmp_path):
             return {}
 
         steps.run("slow", make, version=1, inputs=[1])
-        assert steps.attempts("slow") == 2
-        assert steps.seconds() >= recorded >= 0.2
-        assert steps.stages("slow")["slow"] >= 0.1
+        assert steps.records["slow"]["attempts"] == 2
+        assert steps.records["slow"]["seconds"] >= recorded >= 0.2
+        assert steps.records["slow"]["stages"]["slow"] >= 0.1
         assert len(steps.key("slow")) == 64
     assert told == [("slow", 1000, 1000)]
 

@@ -72,6 +72,10 @@ class Steps:
         progress: called as ``progress(stage, done, total)`` by what the steps report.
         shared: several processes may work here at once, which is safe for :meth:`arrays` alone.
 
+    Attributes:
+        records: of the steps that this job has run or found finished, in order: ``key``, ``figures``, ``attempts`` until it was
+            finished, wall time ``seconds`` of them all, and in ``stages`` by what was reported as progress [s].
+
     Raises:
         ValueError: on entering, if another process is at work in ``folder``.
     """
@@ -88,7 +92,7 @@ class Steps:
         self._own = self.folder / ".steps"  # records, scratch and lock
         self._fresh, self._progress, self._shared = fresh, progress, shared
         self._lock: IO[str] | None = None
-        self._records: dict[str, dict[str, Any]] = {}
+        self.records: dict[str, dict[str, Any]] = {}
 
     def __enter__(self) -> Steps:
         self._own.mkdir(parents=True, exist_ok=True)
@@ -136,7 +140,7 @@ class Steps:
         known = self._read(name)
         same = known.get("key") == key
         if same and known["finished"] and all((self.folder / file).exists() for file in outputs):
-            self._records[name] = known
+            self.records[name] = known
             return dict(known["figures"])
         going_on = same and not known["finished"]
         record: dict[str, Any] = {"key": key, "finished": False, "seconds": 0.0, "attempts": 0, "stages": {}}
@@ -149,7 +153,7 @@ class Steps:
         last = written = start
 
         def write(**news: Any) -> None:
-            self._records[name] = record
+            self.records[name] = record
             record.update(seconds=before + time.monotonic() - start, **news)
             write_json(self._file(name), record, seal=True)
 
@@ -204,42 +208,18 @@ class Steps:
         write_arrays(path, {"key": np.array(key), **made}, compress=False)
         return made
 
-    @property
-    def names(self) -> list[str]:
-        """Steps that this job has run or found finished, in order."""
-        return list(self._records)
-
-    def figures(self, name: str) -> dict[str, Any]:
-        """Figures of step ``name``, which this job has run."""
-        return dict(self._record(name)["figures"])
-
     def key(self, name: str) -> str:
         """Key of step ``name``, which this job has run: an input for the steps that read what it left."""
-        return str(self._record(name)["key"])
-
-    def seconds(self, *names: str) -> float:
-        """Wall time [s] of the named steps (default: all that this job has run), killed attempts included."""
-        return float(sum(self._record(name)["seconds"] for name in names or self._records))
-
-    def stages(self, name: str) -> dict[str, float]:
-        """Wall time [s] by what step ``name`` reported to its progress callback."""
-        return dict(self._record(name)["stages"])
-
-    def attempts(self, name: str) -> int:
-        """How many times step ``name`` was started until it was finished."""
-        return int(self._record(name)["attempts"])
+        if name not in self.records:
+            raise ValueError(f"name: got {name!r}, expected a step that ran: {', '.join(self.records)}")
+        return str(self.records[name]["key"])
 
     def _file(self, name: str) -> Path:
         return self._own / f"{name}.json"
 
-    def _record(self, name: str) -> dict[str, Any]:
-        if name not in self._records:
-            raise ValueError(f"name: got {name!r}, expected a step that ran: {', '.join(self._records)}")
-        return self._records[name]
-
     def _read(self, name: str) -> dict[str, Any]:
         """The record of step ``name``; empty where there is none, none that reads, or none that counts."""
-        if self._fresh and name not in self._records:
+        if self._fresh and name not in self.records:
             return {}
         try:
             record = read_json(self._file(name))

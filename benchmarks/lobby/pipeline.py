@@ -188,18 +188,18 @@ class Lobby:
         )  # fmt: skip
         return {
             **{key: errors.get(key) for key, *_ in page.FIGURES},
-            "pipeline_time_s": steps.seconds(),
+            "pipeline_time_s": sum(record["seconds"] for record in steps.records.values()),
             "methods": found["exact"],
             "methods_sionna": found["sionna"],
             "data": {truth: self.about(truth) for truth in TRUTHS},
             "geometry": {**geometry, **errors},
             "stages": {
                 name: {
-                    "seconds": steps.seconds(name),
-                    "attempts": steps.attempts(name),
-                    "steps": steps.stages(name),
+                    "seconds": record["seconds"],
+                    "attempts": record["attempts"],
+                    "steps": record["stages"],
                 }
-                for name in steps.names
+                for name, record in steps.records.items()
             },
         }
 

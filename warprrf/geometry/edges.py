@@ -44,9 +44,6 @@ class Edges(Rows):
     n: np.ndarray
     face: np.ndarray
 
-    def __len__(self) -> int:
-        return len(self.length)
-
     @property
     def outward(self) -> np.ndarray:
         """Unit vectors into the air, halfway between the faces, shape ``(E, 3)``."""
@@ -54,13 +51,7 @@ class Edges(Rows):
         return np.cos(half) * self.inward + np.sin(half) * np.cross(self.along, self.inward)
 
 
-def mesh_edges(
-    mesh: Mesh,
-    normal: np.ndarray | None = None,
-    groups: np.ndarray | None = None,
-    *,
-    least_bend_rad: float = LEAST_BEND_RAD,
-) -> Edges:
+def mesh_edges(mesh: Mesh, normal: np.ndarray | None = None, groups: np.ndarray | None = None) -> Edges:
     """The edges of ``mesh``.
 
     Args:
@@ -68,11 +59,11 @@ def mesh_edges(
         normal: Normals that say how faces lie, shape ``(F, 3)``, in place of their own: of the planes that they are part of,
             say. A face whose normal is zero is left out.
         groups: Index of what each face is made of, shape ``(F,)``: edges end where it changes.
-        least_bend_rad: Faces that are bent less make no edge [rad].
     """
     normal = mesh.face_normals if normal is None else normal
+    groups = np.zeros(len(mesh.faces), int) if groups is None else groups
     reach = max(2.0 * mesh.rounding_m, 0.5e-6 * float(np.linalg.norm(np.ptp(mesh.bounds, axis=0))))
-    sides, place = _candidates(mesh, normal, least_bend_rad), _places(mesh)
+    sides, place = _candidates(mesh, normal), _places(mesh)
     ends = _split(mesh, sides, place, reach)
     span = place[ends[:, 1]] - place[ends[:, 0]]
     span *= np.where(span @ _SIDE < 0, -1.0, 1.0)[:, None]
@@ -80,10 +71,10 @@ def mesh_edges(
     along = span / np.maximum(length, 1e-300)[:, None]
     middle = 0.5 * (place[ends[:, 0]] + place[ends[:, 1]])
     piece, inward, n, face = _gaps(mesh, normal, middle, along, length, reach)
-    keep = n > 1.0 + least_bend_rad / np.pi
+    keep = n > 1.0 + LEAST_BEND_RAD / np.pi
     piece, inward, n, face = piece[keep], inward[keep], n[keep], face[keep]
     pieces = Edges(middle[piece] - 0.5 * span[piece], along[piece], length[piece], inward, n, face)
-    return _merged(pieces, ends[piece], face if groups is None else groups[face], groups is None, reach)
+    return _merged(pieces, ends[piece], groups[face], reach)
 
 
 def _places(mesh: Mesh) -> np.ndarray:
@@ -94,7 +85,7 @@ def _places(mesh: Mesh) -> np.ndarray:
     return place
 
 
-def _candidates(mesh: Mesh, normal: np.ndarray, least_bend_rad: float) -> np.ndarray:
+def _candidates(mesh: Mesh, normal: np.ndarray) -> np.ndarray:
     """Sides of triangles that may be on an edge: all but those of two faces in one plane; pairs of places ``(S, 2)``."""
     face = mesh.distinct_faces[(normal[mesh.distinct_faces] != 0).any(axis=1)]
     corner = mesh.welded_faces[face]
@@ -113,7 +104,7 @@ def _candidates(mesh: Mesh, normal: np.ndarray, least_bend_rad: float) -> np.nda
         across * (third[second] - start[first])
     ).sum(axis=1)
     flat = count == 2
-    flat[flat] = (np.arctan2(sine, cosine) <= least_bend_rad) & (apart < 0)
+    flat[flat] = (np.arctan2(sine, cosine) <= LEAST_BEND_RAD) & (apart < 0)
     return found[~flat & (found[:, 0] != found[:, 1])]
 
 
@@ -193,7 +184,7 @@ def _depth(mesh: Mesh, face: np.ndarray, point: np.ndarray, toward: np.ndarray) 
     return depth
 
 
-def _merged(pieces: Edges, ends: np.ndarray, group: np.ndarray, any_group: bool, reach: float) -> Edges:
+def _merged(pieces: Edges, ends: np.ndarray, group: np.ndarray, reach: float) -> Edges:
     """Collinear ``pieces`` that share an end, between alike faces, as one edge each."""
     count = len(pieces)
     owner, name = np.tile(np.arange(count), 2), ends.T.reshape(-1)
@@ -209,8 +200,7 @@ def _merged(pieces: Edges, ends: np.ndarray, group: np.ndarray, any_group: bool,
     alike = np.abs(pieces.n[a] - pieces.n[b]) <= limit
     for vector in (pieces.along, pieces.inward):
         alike &= np.linalg.norm(vector[a] - vector[b], axis=1) <= limit
-    if not any_group:
-        alike &= (group[a] == group[b]).all(axis=1)
+    alike &= (group[a] == group[b]).all(axis=1)
     label = components(count, np.column_stack([a, b])[alike]) if count else np.zeros(0, int)
     longest = np.lexsort((-pieces.length, label))
     longest = longest[np.flatnonzero(np.diff(label[longest], prepend=-1))]

@@ -234,9 +234,7 @@ class Mesh:
         point = self.vertices[first]
         reach = max(2.0 * self.rounding_m, 0.5e-6 * float(np.linalg.norm(np.ptp(self.bounds, axis=0))))
         near = cKDTree(point - self.center).query_pairs(reach, output_type="ndarray")
-        link = sparse.coo_array((np.ones(len(near), bool), near.T), shape=(len(point), len(point)))
-        place = csgraph.connected_components(link, directed=False)[1]
-        return np.asarray(place[index][self.faces])
+        return components(len(point), near)[index][self.faces]
 
     @cached_property
     def first_at_place(self) -> np.ndarray:

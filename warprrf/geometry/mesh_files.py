@@ -20,6 +20,7 @@ from warprrf.geometry.mesh_content import LARGEST_BYTES, Folder, MeshContent, to
 from warprrf.geometry.obj_files import read_obj
 from warprrf.geometry.ply_files import Element, Lists, read_ply, write_ply
 from warprrf.geometry.rays import open3d
+from warprrf.rows import distinct_rows
 
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "ft": 0.3048}
 """Units of length [m]."""
@@ -125,17 +126,11 @@ def read_mesh(
 
 def _merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices of the same coordinates as one, in the order in which they come, and faces of those."""
-    bits = np.ascontiguousarray(vertices + 0.0).view(np.uint64)  # -0 and 0 are one place
-    mixed = (bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)).sum(
-        axis=1
-    )
-    first, index = np.unique(mixed ^ (mixed >> np.uint64(29)), return_index=True, return_inverse=True)[1:]
-    if not np.array_equal(vertices[first][index], vertices):  # two places of one number: compare them in full
-        first, index = np.unique(vertices, axis=0, return_index=True, return_inverse=True)[1:]
+    first, index, _ = distinct_rows(vertices)
     order = np.argsort(first)
     place = np.empty(len(first), np.int64)
     place[order] = np.arange(len(first))
-    return vertices[first[order]], place[index.reshape(-1)][faces].astype(np.int32)
+    return vertices[first[order]], place[index][faces].astype(np.int32)
 
 
 def _simplified(

@@ -195,14 +195,9 @@ class PlanarPatches:
 
         return self._grown.get(slack_m, make)
 
-    def contains(self, patch: np.ndarray, points: np.ndarray, slack_m: float = 1e-9) -> np.ndarray:
-        """Whether point k, on the plane of ``patch[k]``, lies in that patch or ``slack_m`` beside it, shape ``(N,)``.
-
-        Args:
-            patch: Indices, shape ``(N,)``.
-            points: Positions [m], shape ``(N, 3)``.
-            slack_m: Width added to every face [m]: faces leave no seam between them.
-        """
+    def contains(self, patch: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Whether point k [m], on the plane of patch ``patch[k]``, lies in it or close beside it, shape ``(N,)``."""
+        slack_m = 1e-9  # width added to every face: faces leave no seam between them
         where, inside = _device.resolve("cpu"), np.empty(len(patch), dtype=bool)
         given = partial(wp.array, device=where, copy=False)
         inputs = [

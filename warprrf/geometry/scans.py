@@ -194,15 +194,15 @@ def flattened(patches: PlanarPatches) -> PlanarPatches:
     return replace(patches, mesh=Mesh(vertices, mesh.faces))
 
 
-def simplified(patches: PlanarPatches, *, cell_m: float = SIMPLIFY_M) -> PlanarPatches:
+def simplified(patches: PlanarPatches) -> PlanarPatches:
     """``patches`` of their mesh with their insides, and the straight edges between two of them, made coarse.
 
-    Vertices inside a flattened patch are gathered by cells of ``cell_m`` into one of their number, those on an edge of
+    Vertices inside a flattened patch are gathered by cells of ``SIMPLIFY_M`` into one of their number, those on an edge of
     two patches by stretches of that length. A continuous map of a plane piece onto itself that keeps its border leaves
     no hole, and no vertex leaves its plane: the surface stays the same. Elsewhere nothing changes.
     """
     mesh, label = patches.mesh, patches.face_patch.astype(np.int64)
-    target = _gathered(patches, cell_m)
+    target = _gathered(patches)
     faces = target[mesh.faces]
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     used, faces = np.unique(faces[whole], return_inverse=True)
@@ -217,7 +217,7 @@ def simplified(patches: PlanarPatches, *, cell_m: float = SIMPLIFY_M) -> PlanarP
     )
 
 
-def _gathered(patches: PlanarPatches, cell_m: float) -> np.ndarray:
+def _gathered(patches: PlanarPatches) -> np.ndarray:
     """The vertex that each vertex moves to: itself, or the one nearest to the middle of its group, shape ``(V,)``."""
     mesh, label = patches.mesh, patches.face_patch.astype(np.int64)
     count = len(mesh.vertices)
@@ -235,12 +235,12 @@ def _gathered(patches: PlanarPatches, cell_m: float) -> np.ndarray:
     inside = np.flatnonzero(movable & (low == high))
     # Cells within the plane: the world axis nearest to the normal takes no part.
     flat = np.arange(3) != np.abs(patches.normal[low[inside]]).argmax(axis=1)[:, None]
-    key[inside, 2:] = np.floor((mesh.vertices[inside] - mesh.bounds[0]) / cell_m) * flat
+    key[inside, 2:] = np.floor((mesh.vertices[inside] - mesh.bounds[0]) / SIMPLIFY_M) * flat
     edge = np.flatnonzero(movable & (low != high))
     along = np.cross(patches.normal[low[edge]], patches.normal[high[edge]])
     size = np.linalg.norm(along, axis=1)
     movable[edge[size <= 0.2]] = False  # of planes so alike that their edge is not straight
-    stretch = (mesh.vertices[edge] * along).sum(axis=1) / np.maximum(size, 1e-30) / cell_m
+    stretch = (mesh.vertices[edge] * along).sum(axis=1) / np.maximum(size, 1e-30) / SIMPLIFY_M
     key[edge, 2] = np.floor(stretch)
     target, chosen = np.arange(count), np.flatnonzero(movable)
     _, group, members = distinct_rows(key[chosen])

@@ -34,8 +34,6 @@ _FOLDERS = (
     "/usr/lib/*-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/local/lib", "/usr/lib/llvm-*/lib", "/opt/homebrew/opt/llvm*/lib",
 )  # fmt: skip
 
-Positions = dict[str, np.ndarray]
-
 
 def parts_of(rt_scene: Any, choice: MaterialChoice) -> tuple[list[ScenePart], dict[str, Any]]:
     """Objects of a ``sionna.rt.Scene``; and its transmitters, receivers and antennas by the arguments of :class:`Scene`.

@@ -220,10 +220,9 @@ def reading_errors(field: RadioField, readings: Readings, progress: Progress | N
     return error
 
 
-def delay_profile(
-    paths: Sequence[Paths], bandwidth_hz: float, taps: int = 256
-) -> tuple[np.ndarray, np.ndarray]:
-    """Power of each tap [dB] over delay [ns], shapes ``(taps,)``: those of ``bandwidth_hz``, from the first path on."""
+def delay_profile(paths: Sequence[Paths], bandwidth_hz: float) -> tuple[np.ndarray, np.ndarray]:
+    """Power of each tap [dB] over delay [ns], shapes ``(256,)``: those of ``bandwidth_hz``, from the first path on."""
+    taps = 256
     tau = np.concatenate([p.tau for p in paths])
     power = np.concatenate([p.power for p in paths])
     first = tau.min() - 4.0 / bandwidth_hz if len(tau) else 0.0

@@ -62,9 +62,9 @@ class Seen:
         return np.array(table)[self.classes]
 
 
-def how_seen(mesh: Mesh, cameras: Sequence[Camera], *, device: DeviceLike = None, seed: int = 0) -> Seen:
+def how_seen(mesh: Mesh, cameras: Sequence[Camera], *, device: DeviceLike = None) -> Seen:
     """By how many of ``cameras`` the fronts of a mesh are seen: in the frame, near, not grazing, not hidden."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     face = rng.choice(len(mesh.faces), SAMPLES, p=mesh.areas / mesh.areas.sum())
     a, b = np.sort(rng.random((2, SAMPLES)), axis=0)
     weights = np.stack([a, b - a, 1 - b], axis=1)

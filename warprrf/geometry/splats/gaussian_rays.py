@@ -37,7 +37,8 @@ ORDERS = {"peak": kernels.BY_PEAK, "range": kernels.BY_RANGE}
 
 @dataclass(frozen=True)
 class RayHits:
-    """The first K Gaussians along each ray, in order.
+    """The first K Gaussians along each ray, in order; of :meth:`GaussianRays.trace` on the device, where under a tape all but
+    ``index`` carry gradients.
 
     Attributes:
         index: Gaussian, shape ``(N, K)`` int32, -1 where fewer than K.
@@ -48,25 +49,14 @@ class RayHits:
             Gaussians may follow.
     """
 
-    index: np.ndarray = field(repr=False)
-    t: np.ndarray = field(repr=False)
-    alpha: np.ndarray = field(repr=False)
-    weight: np.ndarray = field(repr=False)
-    left: np.ndarray = field(repr=False)
-
-
-@dataclass(frozen=True)
-class Traced:
-    """:class:`RayHits` on the device; all but ``index`` carry gradients under a tape."""
-
-    index: wp.array
-    t: wp.array
-    alpha: wp.array
-    weight: wp.array
-    left: wp.array
+    index: Any = field(repr=False)
+    t: Any = field(repr=False)
+    alpha: Any = field(repr=False)
+    weight: Any = field(repr=False)
+    left: Any = field(repr=False)
 
     @property
-    def outputs(self) -> tuple[wp.array, ...]:
+    def outputs(self) -> tuple[Any, ...]:
         """The arrays that a loss may use."""
         return self.t, self.alpha, self.weight, self.left
 
@@ -167,7 +157,9 @@ class GaussianRays:
         values: np.ndarray = self._transmit(a, b, requires_grad=False)[0].numpy()
         return values
 
-    def trace(self, origins: ArrayLike, directions: ArrayLike, k: int = 16, *, order: str = "peak") -> Traced:
+    def trace(
+        self, origins: ArrayLike, directions: ArrayLike, k: int = 16, *, order: str = "peak"
+    ) -> RayHits:
         """:meth:`hits` as Warp arrays, differentiable on an active tape in the parameters (not in the rays)."""
         tape = active_tape()
         found, adjoint = self._trace(origins, directions, k, order, requires_grad=tape is not None)
@@ -185,7 +177,7 @@ class GaussianRays:
 
     def trace_with_adjoint(
         self, origins: ArrayLike, directions: ArrayLike, k: int = 16, *, order: str = "peak"
-    ) -> tuple[Traced, Callable[[], None]]:
+    ) -> tuple[RayHits, Callable[[], None]]:
         """:meth:`trace` without a tape: the hits, and the function that adds the parameters' gradients."""
         return self._trace(origins, directions, k, order, requires_grad=True)
 
@@ -195,7 +187,7 @@ class GaussianRays:
 
     def _trace(
         self, origins: ArrayLike, directions: ArrayLike, k: int, order: str, *, requires_grad: bool
-    ) -> tuple[Traced, Callable[[], None]]:
+    ) -> tuple[RayHits, Callable[[], None]]:
         start, toward = _pairs("origins", origins, "directions", directions)
         places = check_count("k", k)
         check_choice("order", order, ORDERS)
@@ -205,7 +197,7 @@ class GaussianRays:
         count, on = _rows(start, toward), self.device
         shape = (count, places)
         real = {"dtype": wp.float64, "device": on}
-        found = Traced(
+        found = RayHits(
             wp.full(shape, -1, dtype=int, device=on),
             wp.full(shape, np.inf, requires_grad=requires_grad, **real),
             wp.zeros(shape, requires_grad=requires_grad, **real),

@@ -92,12 +92,16 @@ class Prepared:
     """Gaussians projected for one camera, on the device: tile t may see ``ids[starts[t]:starts[t + 1]]``, near to
     far."""
 
-    camera: Camera
     view: View
     inputs: Parameters
     splats: wp.array
     ids: wp.array
     starts: wp.array
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the image."""
+        return int(self.view.height), int(self.view.width)
 
     @property
     def tiles(self) -> int:
@@ -234,7 +238,7 @@ class Rasterizer:
         project = projection.build_project(self.real)
         launch(project, n, [*inputs, view, self.blending.rules, span, keys, order, splats], device=device)
         ids, starts = _listed(span, keys, order, view)
-        return Prepared(cam, view, inputs, splats, ids, starts)
+        return Prepared(view, inputs, splats, ids, starts)
 
     def blend(
         self, prepared: Prepared, features: wp.array, background: ArrayLike | wp.array | None = None
@@ -271,11 +275,7 @@ class Rasterizer:
     def strongest(self, prepared: Prepared, top_k: int) -> tuple[wp.array, wp.array, wp.array, wp.array]:
         """The ``top_k`` largest blending weights of every pixel, front to back: Gaussian (-1 where fewer), weight and
         range of the peak [m], shape ``(H, W, K)`` each, and the sum of all weights ``(H, W)``."""
-        shape = (
-            prepared.camera.height,
-            prepared.camera.width,
-            check_count("top_k", top_k, most=MOST_WEIGHTS),
-        )
+        shape = *prepared.shape, check_count("top_k", top_k, most=MOST_WEIGHTS)
         out = (
             wp.full(shape, -1, dtype=int, device=self.device),
             wp.zeros(shape, dtype=self.real, device=self.device),
@@ -339,7 +339,7 @@ class Rasterizer:
     def _blend(
         self, prepared: Prepared, features: wp.array, background: wp.array, *, requires_grad: bool
     ) -> Image:
-        shape, channels = (prepared.camera.height, prepared.camera.width), features.shape[1]
+        shape, channels = prepared.shape, features.shape[1]
         real: dict[str, Any] = {"dtype": self.real, "device": self.device}
         image = Image(
             features=wp.empty((*shape, channels), requires_grad=requires_grad, **real),

@@ -114,7 +114,8 @@ def structure_from_motion(
     match, first_lens = True, cast(str | dict[str, Lens], FREE_MODEL if lens == "auto" else lens)
     if poses is not None:
         named = {name: named[name] for name in poses.cameras}
-        first_lens = _known_lenses(poses, named)
+        facts = {name: photo_facts(path) for name, path in named.items()}
+        first_lens = {n: c.of_size(n, facts[n].width, facts[n].height) for n, c in poses.cameras.items()}
         with _quiet(colmap):
             known = _known_model(colmap, poses, first_lens)
         match = not poses.depth and not known.num_points3D()
@@ -587,12 +588,6 @@ def read_known(folder: Path) -> dict[str, KnownCamera]:
         numbers = lens.fx, lens.fy, lens.cx, lens.cy, *lens.coefficients
         cameras[name] = KnownCamera(lens.model, (lens.width, lens.height), numbers, 0.0, poses[name])
     return cameras
-
-
-def _known_lenses(poses: KnownPoses, photos: Mapping[str, Path]) -> dict[str, Lens]:
-    """Lenses of photos whose poses are known, for the photos as stored."""
-    facts = {name: photo_facts(path) for name, path in photos.items()}
-    return {n: c.of_size(n, facts[n].width, facts[n].height) for n, c in poses.cameras.items()}
 
 
 def _known_model(colmap: ModuleType, poses: KnownPoses, lenses: Mapping[str, Lens]) -> Any:

@@ -189,7 +189,8 @@ def fuse_depth(
     # Open3D looks for blocks along every so many-th row and column, and refuses a map that shows none
     touched = 4
     for depth, camera in zip(depths, cameras, strict=True):
-        z = range_to_depth(np.where(np.isfinite(depth), depth, 0.0), camera)
+        x, y = slopes_of(camera)
+        z = np.where(np.isfinite(depth), depth, 0.0) / np.sqrt(1 + x**2 + y**2)  # along the optical axis
         z[(depth >= config.max_range_m) | ~_smooth(z, EDGE_TOLERANCE / camera.fx)] = 0.0
         if not (z[::touched, ::touched] > 0).any():
             continue
@@ -230,12 +231,6 @@ def _ordered(o3d: ModuleType, raw: Any) -> Any:
     return o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(vertices[order]), o3d.utility.Vector3iVector(faces.astype(np.int32))
     )
-
-
-def range_to_depth(distance: np.ndarray, camera: Camera) -> np.ndarray:
-    """Depth along the optical axis [m] of Euclidean ranges ``(H, W)`` in a pinhole image."""
-    x, y = slopes_of(camera)
-    return distance / np.sqrt(1 + x**2 + y**2)
 
 
 def _smooth(z: np.ndarray, tolerance: float) -> np.ndarray:
