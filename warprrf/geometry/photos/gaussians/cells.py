@@ -35,7 +35,6 @@ def occupancy(
     Args:
         points: the points that the planes' ``inliers`` index, shape ``(P, 3)`` [m].
         eyes, targets: lines of sight, from a camera to a point it sees, shape ``(L, 3)`` each [m].
-        config: size of the cells, margin, and what "well behind" means.
     """
     config = config or PlaneConfig()
     result = []

@@ -51,9 +51,6 @@ def densified(
 
     Args:
         rounds_left: how often this is done still, this time included.
-
-    Raises:
-        RuntimeError: if none would be left.
     """
     opacity, scales = opacity_and_scales(arrays)
     hits, seen, largest = arrays["hits"][:, 0], arrays["seen"][:, 0], scales.max(axis=1)

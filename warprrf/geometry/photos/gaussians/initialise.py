@@ -44,11 +44,7 @@ def initial_gaussians(
         normals: unit normals, shape ``(P, 3)``.
         planes: planes with occupied cells (see :func:`~warprrf.geometry.photos.gaussians.cells.occupancy`); cells that no camera
             sees are left out.
-        photos: that give colours.
         count: Gaussians wanted in all (about).
-
-    Raises:
-        ValueError: when nothing is there to start from.
     """
     free = np.ones(len(points), dtype=bool)
     for plane in planes:
@@ -149,14 +145,6 @@ def initialise(
 
     Args:
         sparse: posed cameras and points [m], those of held-out photos among them.
-        photos: that the Gaussians are fitted to.
-        config: settings.
-        seed: of the plane detection.
-        progress: called with ``"planes"``.
-        device: Warp device of the sweeps.
-
-    Raises:
-        ValueError: for fewer than three points.
     """
     report = progress or (lambda stage, done, total: None)
     report("planes", 0, 6)

@@ -83,7 +83,6 @@ def plain_surfaces(
     of sight end on what a mirror shows, shape ``(L,)`` bool.
 
     Args:
-        photos: of pinhole cameras, one at least.
         axes: three perpendicular directions of the room, unit rows, right-handed, shape ``(3, 3)``.
         sight: lines of sight, from eyes to points, shape ``(L, 3)`` each.
     """

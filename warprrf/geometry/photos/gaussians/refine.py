@@ -62,13 +62,8 @@ def refine(
     """Optimise Gaussians against photos.
 
     Args:
-        photos: with their cameras and masks.
         planes: detected planes; Gaussians on them are kept flat.
         checkpoint: file to continue from if it exists and to keep up to date; of the same arguments.
-
-    Raises:
-        ValueError: if a checkpoint is damaged.
-        RuntimeError: if the loss becomes NaN.
     """
     config = config or RefineConfig()
     run = _Refinement(photos, config, planes, resolve(device))

@@ -152,9 +152,7 @@ def level_planes(
     """Horizontal planes (z is up) that photos prove and ``planes`` lack: seats, table tops, platforms, soffits.
 
     Args:
-        points: sparse points; the sweep spans their extent.
         lines: lines of sight from cameras to points, shape ``(L, 3)`` each: what they cross is no surface.
-        cell_m: side of a cell.
         up: surfaces that face up; else those that face down.
     """
     low, high = np.percentile(points, [0.5, 99.5], axis=0)

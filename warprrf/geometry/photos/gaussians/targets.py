@@ -83,7 +83,6 @@ class Exposures:
     """Gains of photos.
 
     Args:
-        count: number of photos.
         fitted: whether gains are fitted; otherwise they stay at one.
     """
 

@@ -17,15 +17,7 @@ from warprrf.rows import distinct_rows, sums_of
 
 
 def range_maps(sparse: SparseModel, files: Mapping[str, DepthFile]) -> dict[str, tuple[Camera, np.ndarray]]:
-    """Cameras of about the size of their depth images, and Euclidean ranges [m], 0 where unknown; by photo.
-
-    Args:
-        sparse: cameras, and the lenses that photos and depth were taken with.
-        files: depth images, by photo.
-
-    Raises:
-        ValueError: if a file does not read, or has another shape than its photo.
-    """
+    """Cameras of about the size of their depth images, and Euclidean ranges [m], 0 where unknown; by photo."""
     found = {}
     views = 120  # most maps that are used, spread over all
     for name in spread((name for name in sparse.cameras if name in files), views):
@@ -49,11 +41,7 @@ def range_maps(sparse: SparseModel, files: Mapping[str, DepthFile]) -> dict[str,
 
 
 def with_points(sparse: SparseModel, files: Mapping[str, DepthFile]) -> SparseModel:
-    """``sparse``, in metres, with points of measured depth, each seen by three cameras or more.
-
-    Raises:
-        ValueError: if the maps contradict one another: their unit or the poses are wrong.
-    """
+    """``sparse``, in metres, with points of measured depth, each seen by three cameras or more."""
     maps = range_maps(sparse, files)
     points, colors = _cloud(maps, sparse.photos)
     seen = np.zeros((len(points), len(maps)), dtype=bool)

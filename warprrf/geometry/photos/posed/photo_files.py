@@ -36,9 +36,6 @@ def find_photos(photos: Photos) -> dict[str, Path]:
     A name is the path below the folder (or below the files' common folder), with forward slashes. Hidden files of a
     folder are left out: half-written ones, or another system's notes; and so are those that a workspace in it holds.
     ``NAME.mask.png`` is no photo but the mask of the photo ``NAME`` beside it (:func:`mask_beside`).
-
-    Raises:
-        ValueError: if the folder or files do not exist, too few photos are there, or a mask is of no photo.
     """
     if isinstance(photos, str | os.PathLike):
         root = Path(photos).absolute()
@@ -115,11 +112,7 @@ def opened(path: str | os.PathLike[str], argument: str = "photos", kind: str = "
 
 
 def photo_facts(path: Path) -> PhotoFacts:
-    """Size, orientation and camera of a photo, from its header.
-
-    Raises:
-        ValueError: if the header does not read, or the photo is stored mirrored.
-    """
+    """Size, orientation and camera of a photo, from its header."""
     with opened(path) as photo:
         exif = photo.getexif()
         width, height = photo.size
@@ -161,11 +154,7 @@ def mask_beside(photo: Path) -> Path | None:
 
 
 def check_photos(named: Mapping[str, Path]) -> None:
-    """Refuse photos that do not read as images, and masks of another size than their photo.
-
-    Raises:
-        ValueError: naming the files.
-    """
+    """Refuse photos that do not read as images, and masks of another size than their photo."""
     bad: list[str] = []
     for name, path in named.items():
         try:
@@ -184,11 +173,7 @@ def check_photos(named: Mapping[str, Path]) -> None:
 
 
 def match_names(argument: str, wanted: Iterable[str], names: Sequence[str]) -> list[str]:
-    """Full photo names of ``wanted``: each is a name, or a file name that only one of ``names`` has.
-
-    Raises:
-        ValueError: naming the entries that are no photo, or that several photos share.
-    """
+    """Full photo names of ``wanted``: each is a name, or a file name that only one of ``names`` has."""
     by_file: dict[str, list[str]] = {}
     for name in names:
         by_file.setdefault(name.rsplit("/", 1)[-1], []).append(name)
@@ -215,11 +200,7 @@ def match_names(argument: str, wanted: Iterable[str], names: Sequence[str]) -> l
 
 
 def open_photo(path: str | os.PathLike[str], mode: str) -> Any:
-    """A photo as it is stored, as a Pillow image of ``mode`` (``"RGB"`` or ``"L"``).
-
-    Raises:
-        ValueError: if the file does not read as an image.
-    """
+    """A photo as it is stored, as a Pillow image of ``mode`` (``"RGB"`` or ``"L"``)."""
     with opened(path) as photo:
         if photo.mode[0] in "IF":
             raise ValueError(f"its pixels have more than 8 bits ({photo.mode}); save it with 8")
@@ -227,20 +208,12 @@ def open_photo(path: str | os.PathLike[str], mode: str) -> Any:
 
 
 def read_photo(path: str | os.PathLike[str]) -> np.ndarray:
-    """A photo as it is stored, RGB in [0, 1], shape ``(H, W, 3)`` float32.
-
-    Raises:
-        ValueError: if the file does not read as an image.
-    """
+    """A photo as it is stored, RGB in [0, 1], shape ``(H, W, 3)`` float32."""
     return np.asarray(open_photo(path, "RGB"), dtype=np.float32) / 255
 
 
 def read_mask(photo: str | os.PathLike[str]) -> np.ndarray | None:
-    """Where ``photo`` is to be ignored, shape ``(H, W)`` bool, from the mask beside it; None without one.
-
-    Raises:
-        ValueError: if the mask does not read as an image.
-    """
+    """Where ``photo`` is to be ignored, shape ``(H, W)`` bool, from the mask beside it; None without one."""
     path = mask_beside(Path(photo))
     return None if path is None else np.asarray(open_photo(path, "L")) < 128
 

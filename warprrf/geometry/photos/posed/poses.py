@@ -66,11 +66,7 @@ class KnownCamera:
     depth: DepthFile | None = None
 
     def of_size(self, name: str, width: int, height: int) -> Lens:
-        """The lens of the photo ``name``, which may have fewer or more pixels than the lens is meant for.
-
-        Raises:
-            ValueError: if it has another shape.
-        """
+        """The lens of the photo ``name``, which may have fewer or more pixels than the lens is meant for."""
         own = self.size if all(self.size) else (width, height)
         if abs(width / own[0] / (height / own[1]) - 1) > 0.01:
             raise ValueError(
@@ -128,9 +124,6 @@ def match_photos(cameras: Iterable[str], photos: Iterable[str], *, warn: bool = 
     """Which of ``cameras`` is that of a photo, by photo name in the order of ``photos``; warns of cameras without a photo.
 
     A camera's photo has its name, or else alone ends as it does, or alone has its file name, with or without a suffix.
-
-    Raises:
-        ValueError: if fewer than three are left, or several cameras claim one photo.
     """
     cameras, photos = list(cameras), list(photos)
     tails: dict[str, list[str]] = {}
@@ -169,11 +162,7 @@ def match_photos(cameras: Iterable[str], photos: Iterable[str], *, warn: bool = 
 
 
 def read_depth(file: DepthFile) -> np.ndarray:
-    """Depth along the optical axis [m], 0 where unknown, shape ``(H, W)`` float32.
-
-    Raises:
-        ValueError: if the file does not read as such an image.
-    """
+    """Depth along the optical axis [m], 0 where unknown, shape ``(H, W)`` float32."""
     with opened(file.path, "depth", "a depth image") as picture:
         if picture.mode not in ("I;16", "I;16B", "I"):
             raise ValueError(f"got an image of mode {picture.mode}, expected grey of 16 bits")
@@ -183,11 +172,7 @@ def read_depth(file: DepthFile) -> np.ndarray:
 
 
 def find_depth(folder: Path, photos: Iterable[str]) -> dict[str, Path]:
-    """Depth images of ``photos`` in a folder: ``NAME.depth.png`` or ``NAME.png`` beside ``NAME.color.jpg`` or ``NAME.jpg``.
-
-    Raises:
-        ValueError: if it is no folder, or has fewer than three.
-    """
+    """Depth images of ``photos`` in a folder: ``NAME.depth.png`` or ``NAME.png`` beside ``NAME.color.jpg`` or ``NAME.jpg``."""
     if not folder.is_dir():
         raise ValueError(
             f"depth: {folder} is not a folder; expected one of PNG files named as the photos are"
@@ -272,12 +257,7 @@ def _whole(value: object) -> object:
 
 
 def _inside(folder: Path, name: object) -> Path:
-    """The file ``name`` of ``folder``.
-
-    Raises:
-        ValueError: if it lies outside.
-        FileNotFoundError: if it is not there.
-    """
+    """The file ``name`` of ``folder``."""
     check_type("depth_file_path", name, str)
     path = folder / str(name)
     if not path.resolve().is_relative_to(folder.resolve()):
@@ -288,11 +268,7 @@ def _inside(folder: Path, name: object) -> Path:
 
 
 def _inverse(camera_to_world: ArrayLike) -> np.ndarray:
-    """World to camera from camera to world, ``(4, 4)`` or its first three rows; rounded rotations are made exact.
-
-    Raises:
-        ValueError: if it is no rigid transform.
-    """
+    """World to camera from camera to world, ``(4, 4)`` or its first three rows; rounded rotations are made exact."""
     given = check_array("pose", camera_to_world, (None, 4))
     if len(given) not in (3, 4) or (len(given) == 4 and not np.allclose(given[3], [0, 0, 0, 1], atol=1e-6)):
         raise ValueError(f"pose: got {len(given)} rows, expected 4 of which the last is 0 0 0 1")

@@ -94,17 +94,13 @@ def structure_from_motion(
     a stopped run goes on where it was.
 
     Args:
-        photos: a folder, or a sequence of image files.
         workspace: folder for the feature database, the model and the undistorted photos; made if it is not there.
-        config: features, lens and pixels.
         poses: poses and lenses that are known; points are triangulated, where they and depth are not known too.
-        seed: seed of every random draw.
         progress: called as ``progress("features" | "comparing" | "matching" | "mapping" | "undistorting", done, total)``.
 
     Raises:
         ValueError: for photos that are missing, unreadable or too few, or when the photos overlap too little to be posed;
             the message names the files.
-        ImportError: if pycolmap is not installed.
     """
     config = config or ReconstructionConfig()
     lens, max_features = config.lens, config.max_features
@@ -573,11 +569,7 @@ def _fresh(folder: Path) -> Path:
 
 
 def read_known(folder: Path) -> dict[str, KnownCamera]:
-    """Lenses and poses of the photos of a COLMAP model, by name.
-
-    Raises:
-        ValueError: if the folder holds no readable model.
-    """
+    """Lenses and poses of the photos of a COLMAP model, by name."""
     colmap = load_colmap()
     with _quiet(colmap), naming(folder, "expected a COLMAP model"):
         model = _open_model(colmap, folder)

@@ -126,9 +126,6 @@ def align_to_known(sparse: SparseModel, known_positions: Mapping[str, ArrayLike]
     Args:
         known_positions: photo name (or its file name, where that is unique) to camera position (3,) [m].
 
-    Returns:
-        The transformed model; its ``scale_rms_m`` is the rms distance left at the surveyed cameras [m].
-
     Raises:
         ValueError: for fewer than three positions, positions on one line, a name that is no photo, or a surveyed
             photo that could not be posed.
@@ -171,11 +168,7 @@ Scale = float | tuple[str, str, float]
 
 
 def check_scale(scale: Scale, names: Sequence[str]) -> Scale:
-    """``scale`` with the full names of two of the photos ``names``.
-
-    Raises:
-        ValueError: for a distance or factor that is not positive, names of no photo, or twice the same.
-    """
+    """``scale`` with the full names of two of the photos ``names``."""
     if not isinstance(scale, (tuple, list)):
         return check_positive("scale", scale, "number of metres for each unit")
     if len(scale) != 3:
@@ -189,11 +182,7 @@ def check_scale(scale: Scale, names: Sequence[str]) -> Scale:
 
 
 def scaled(sparse: SparseModel, scale: Scale) -> SparseModel:
-    """``sparse`` in metres, axes as they are.
-
-    Raises:
-        ValueError: as :func:`check_scale`, for a photo without a pose, or cameras at one place.
-    """
+    """``sparse`` in metres, axes as they are."""
     scale = check_scale(scale, (*sparse.cameras, *sparse.unposed))
     if isinstance(scale, tuple):
         lost = [name for name in scale[:2] if name not in sparse.cameras]
@@ -261,9 +250,6 @@ def clean_points(sparse: SparseModel, worst_px: float = np.inf) -> np.ndarray:
 
     A point is an outlier when its mean distance to its neighbours exceeds the average of that figure over all points
     by 2.5 standard deviations (Rusu et al., "Towards 3D point cloud based object maps", 2008).
-
-    Args:
-        worst_px: reprojection error of a point that is kept [pixels].
     """
     min_track_length = 3  # photos that see a point which is kept
     keep = (sparse.reprojection_error <= worst_px) & (sparse.track_length >= min_track_length)

@@ -44,9 +44,6 @@ class Lens:
         fx, fy, cx, cy: focal lengths and principal point [pixels].
         coefficients: of the distortion: none; k1; k1, k2; k1, k2, p1, p2 (and k3 to k6); of the
             fisheye k1, k2, k3, k4.
-
-    Raises:
-        TypeError, ValueError: for another model, or numbers that are no lens.
     """
 
     model: Annotated[str, one_of(*COEFFICIENTS)]
@@ -109,9 +106,6 @@ def write_undistorted(source: Path, target: Path, lens: Lens, max_pixels: int) -
     """``source`` as the camera of :func:`pinhole_of` shows it, written to ``target``, its mask beside it.
 
     A photo that needs nothing is copied as it is. A pixel of a mask counts as ignored if any part of it is.
-
-    Raises:
-        ValueError: if a file does not read as an image, or is not of the lens's size.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     turns, mask, small = photo_facts(source).turns, mask_beside(source), _reduced(lens, max_pixels)
@@ -233,11 +227,7 @@ def choose_lens(colmap: ModuleType, model: Path, lens: str) -> Any:
 
 
 def lens_of(camera: Any) -> Lens:
-    """A COLMAP camera's lens.
-
-    Raises:
-        ValueError: for a model that is not known here.
-    """
+    """A COLMAP camera's lens."""
     kind = camera.model.name
     if kind not in COEFFICIENTS:
         raise ValueError(

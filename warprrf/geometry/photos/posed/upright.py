@@ -30,9 +30,7 @@ def upright(sparse: SparseModel, photo: Callable[[str], np.ndarray], *, seed: in
     What no photo proves is said in its ``guessed``.
 
     Args:
-        sparse: cameras and points, in metres or about.
         photo: reads the photo of a posed camera, ``(H, W, 3)`` in [0, 1], by its name; some are looked at.
-        seed: of the plane detection.
     """
     cameras = list(sparse.cameras.values())
     guessed = list(sparse.guessed)
@@ -86,7 +84,6 @@ def vertical_of_edges(
     """The vertical as a unit vector, shape ``(3,)``, and whether edges prove it; else it is :func:`held_up`.
 
     Args:
-        cameras: by photo.
         photo: reads a photo by its name, ``(H, W, 3)`` in [0, 1].
     """
     held = held_up(list(cameras.values()))

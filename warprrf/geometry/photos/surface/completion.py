@@ -51,7 +51,6 @@ def complete(
     """The mesh of ``patches`` with holes closed, borders straightened and islands in the air removed.
 
     Args:
-        patches: of the mesh, which is flattened onto them; patch k lies on ``planes[k]``.
         cameras, depths: what was seen: Euclidean range per pixel [m], 0 where unknown, each ``(height, width)``.
         planes: planes known beforehand; their occupied cells are evidence of their own.
 

@@ -135,7 +135,6 @@ def fuse_maps(
     """Mesh of depth maps with its planar patches, the largest first; and whether its holes were closed.
 
     Args:
-        views: pinhole cameras.
         depths: ranges [m], 0 where unknown, each of one of ``views``.
         planes: known beforehand; the mesh is snapped to them.
     """
@@ -173,11 +172,6 @@ def fuse_depth(
 
     Args:
         depths: Euclidean range per pixel [m], each ``(height, width)`` of its camera; inf, NaN or 0 where unknown.
-        cameras: pinhole cameras, one a depth map.
-        config: sizes and limits.
-
-    Raises:
-        ValueError: when no surface comes out.
     """
     config = config or SurfaceConfig()
     o3d = open3d()

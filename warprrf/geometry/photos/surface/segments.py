@@ -40,7 +40,6 @@ def with_segments(
         proved: pixels whose depth photos prove, same shape, bool.
         shown: pixels that may have a depth: what is not masked, same shape, bool.
         segment: of each pixel, as :func:`segments_of` numbers them, same shape.
-        view: pinhole camera of the depth map.
     """
     segment, rays = segment.ravel(), view.directions().reshape(-1, 3)
     inverse = np.where(depth.ravel() > 0, 1 / np.maximum(depth.ravel(), 1e-9), 0.0)
