@@ -234,14 +234,15 @@ class ZoneRays:
         return np.asarray(np.abs(share(ways, beside)))
 
     def _through_any(self, beside: Walls, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Field that arrives through walls over legs from ``begin`` to ``end`` (N, K, 3), complex, shape ``(N,)``."""
-        whole = np.ones(len(begin), complex)
+        """Field that arrives through some walls over legs from ``begin`` to ``end`` (N, K, 3), complex, shape ``(N,)``."""
+        whole, count = np.ones(len(begin), complex), np.zeros(len(begin), int)
         for k in range(begin.shape[1]):
             rows, slabs = beside.between(begin[:, k], end[:, k])
             own = np.zeros(len(begin), complex)
             own[rows] = beside.field(slabs)
+            count[rows] += slabs.count
             whole *= own
-        return whole
+        return np.where(count > 0, whole, 0.0)
 
     def _direct_share(self, ways: Ways, beside: Walls | None) -> np.ndarray:
         """That of line of sight, by rays over the zone's widest place."""
