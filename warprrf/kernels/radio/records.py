@@ -26,7 +26,8 @@ from warprrf.kernels.radio import slabs
 
 MIRROR, SCATTER, SLAB, EDGE, SOURCE = 1, 2, 4, 8, 16
 """Kinds of interactions, codes of ``sionna.rt.InteractionType`` as far as it has them: a mirror, a surface that scatters, a slab
-that is passed, an edge, an element that sends. 0 for none. What an edge does is in the power of its paths."""
+that is passed, an edge, an element that sends. 0 for none. No kernel here handles an edge: what it does is in the power of its
+paths, see :mod:`warprrf.rf.paths.edge_paths`."""
 EXCESS_COLUMN, MIRRORED_COLUMN, THROUGH_COLUMN = 0, 1, 2
 """Columns of a material's parameters behind those of its lobe weights: logarithms of epsilon_r - 1, of the mirrored share, and of
 the share let through."""

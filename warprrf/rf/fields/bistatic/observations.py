@@ -256,8 +256,8 @@ class Observation:
         return self._kept.get((materials.parameters.lobes, materials.parameters.reciprocal), components)
 
     def further(self, effects: Effects, materials: Materials) -> tuple[np.ndarray, np.ndarray]:
-        """What comes over more than one surface, by the group that scatters it last or sends it on: groups ``(C,)``, and
-        readings in units of the floor, shape ``(C, N)``."""
+        """What comes over more than one surface or through slabs, by the group that scatters it last or sends it on: groups
+        ``(C,)``, and readings in units of the floor, shape ``(C, N)``."""
         return self._kept.get((effects, materials), lambda: self._further(effects, materials))
 
     def _further(self, effects: Effects, materials: Materials) -> tuple[np.ndarray, np.ndarray]:
@@ -328,8 +328,8 @@ class Columns:
     """Readings of scattered light as sums over groups, or materials, in units of the floor: a table collapsed.
 
     Fits and merging ask for powers so often that evaluating every record would take ten times as long. What comes over more
-    than one surface follows the share that the last one scatters of even light; all else of it is held, what slabs let through
-    included: that is learned from single paths.
+    than one surface or through slabs follows the share that the last one scatters of even light; all else of it is held, what
+    slabs let through included: that is learned from single paths.
 
     Attributes:
         groups: that scatter straight from the transmitter, shape ``(A,)``.
