@@ -27,8 +27,9 @@ a time is held out, then a room at a time. Each row is fitted to the means of th
 means, from split halves, was frozen in benchmarks/results/measured_flat_noise.json before anything was fitted.
 
 Office: impulse responses of 24 links over 3 to 7 GHz on a floor of offices (repository github.com/buguen/pylayers, MIT licence, of
-which --source is a copy: data/meas/W1, data/struc/lay/WHERE1.lay, data/struc/furnitures/Furw1.ini). First and strong arrivals are
-compared with sharp paths of which nothing is fitted; then a receiver, two of the four, or one of two heights is held out.
+which --source is a copy: data/meas/W1, data/struc/lay/WHERE1.lay, data/struc/furnitures/Furw1.ini, data/ant/defant.vsh3). First
+and strong arrivals are compared with sharp paths of which nothing is fitted; then a receiver, two of the four, or one of two
+heights is held out.
 
 Hall: the paths between a transmitter and 45 places of a receiver at 60 GHz, with lengths, both directions and powers of pairs of
 beams, and the hall's plan. --source is a folder with two files that you fetch yourself (no licence is stated):

@@ -222,6 +222,10 @@ def antenna(folder: Path, frequency_hz: np.ndarray) -> np.ndarray:
     From its vector spherical harmonics of order 0, of which the horizon has the derivatives of Legendre polynomials at 0; a field
     of the root of 30 V is a gain of one, and a phase of -2 pi f tau is one that comes tau later.
     """
+    if not (folder / ANTENNA).is_file():
+        raise FileNotFoundError(
+            f"{folder}: there is no {ANTENNA}, which the repository github.com/buguen/pylayers holds"
+        )
     held = loadmat(folder / ANTENNA, simplify_cells=True)
     degree, order = held["Br.ind"].T
     known = np.linspace(held["fmin"], held["fmax"], len(held["Br.s3"])) * 1e9
