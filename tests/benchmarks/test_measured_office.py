@@ -141,7 +141,7 @@ def test_what_is_missing_or_of_another_place_is_named(source, tmp_path):
     ):
         office.responses(tmp_path / "nowhere")
     with pytest.raises(FileNotFoundError, match=r"there is no data.ant.defant\.vsh3, which the repository"):
-        office.antenna(tmp_path, F)
+        office.antenna(tmp_path / "nowhere", F)
     file = source / office.RESPONSES / "h1" / "P001.mat"
     savemat(file, {"Tx_position": "P001", "Tx_height": "120cm"})
     with pytest.raises(ValueError, match=r"P001\.mat: KeyError\('DECONV_DATA'\): expected"):
