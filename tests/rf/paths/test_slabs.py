@@ -278,6 +278,24 @@ def test_a_pane_beside_a_path_stops_no_more_of_its_zone_than_it_does(permittivit
     assert np.abs(10 * np.log10(found[1] / found[0])).max() < most_db
 
 
+def test_what_goes_through_a_pane_beside_a_path_adds_in_its_phase():
+    """Nearly at a right angle all of it has the field of one slab, over that of the same way in air."""
+    ends = np.array([[-6.0, 0.0, 1.4], [6.0, 0.0, 1.4]])
+    corners = np.array([[0, -50, -50], [0, -50, 1.35], [0, 50, 1.35], [0, 50, -50.0]])
+    wavelength_m = SPEED_OF_LIGHT / F
+    thick_m = 0.625 * wavelength_m / np.sqrt(20.0)  # what echoes within comes a quarter of a wave late
+    dense = Material.custom("dense", relative_permittivity=20.0, thickness_m=thick_m)
+    frame = SpectrumDataset.empty(transmitter=ends[0], frequency_hz=F, shape=(12, 24))
+    scene, share = Scene(Mesh(corners, pane(0)[1]), [dense], np.zeros(2, np.int32)), []
+    for most in (0, 1):
+        effects = Effects(mirrors=0, scatterings=0, transmissions=most, diffractions=0, residual=False)
+        share.append(BistaticField.prior(scene, frame, effects=effects).view(ends[1]).paths.share[0])
+    free, through = share[0], slab_transmission(1.0, dense.permittivity(F), thick_m, wavelength_m)[0]
+    through *= np.exp(2j * np.pi * thick_m / wavelength_m)
+    assert 0.2 < free < 0.9
+    assert share[1] == pytest.approx(abs(free + (1.0 - free) * through), rel=0.005)
+
+
 def test_what_passes_a_path_s_wall_is_the_same_however_it_is_drawn():
     """A screen of unknown material beside line of sight: as a solid it is no thicker than what is assumed of it."""
     corners = np.array([[0, -50, 0.1], [0, -50, 1.35], [0, 50, 1.35], [0, 50, 0.1]])

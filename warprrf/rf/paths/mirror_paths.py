@@ -261,7 +261,8 @@ class ZoneRays:
         field = free.astype(complex)
         if beside is not None:
             dark = np.flatnonzero(~free)
-            stops = np.stack([source[dark // len(_SAMPLES)], middle[dark], start[dark]], axis=1)
+            knee = self._past(start[dark], middle[dark])  # what lies at the middle is passed once
+            stops = np.stack([source[dark // len(_SAMPLES)], knee, start[dark]], axis=1)
             field[dark] = self._through_any(beside, stops[:, :2], stops[:, 1:])
         return np.asarray(field.reshape(count, len(_SAMPLES)).mean(axis=1))
 
