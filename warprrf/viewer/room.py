@@ -49,7 +49,7 @@ def learned(field: BistaticField, kind: str, progress: Progress | None = None) -
     """
     surface, p, tiles = field.surface, field.parameters, field.surface.tiles
     if kind == "uncertainty":
-        return field.gain_std_db(progress)[surface.cells.element[tiles.cell]]
+        return field.gain_std_db(progress)[surface.element[tiles.cell]]
     if kind == "roughness":
         height_m = field.wavelength_m / (4.0 * np.pi) * np.sqrt(np.maximum(-p.log_smooth, 0.0))
         return np.asarray(1e3 * height_m[surface.group[tiles.face]])

@@ -67,6 +67,11 @@ class Tiles:
         share /= share.sum(axis=1, keepdims=True)
         return np.einsum("tk,tki->ti", share, self.fan.triangles.mean(axis=1).reshape(-1, 5, 3))
 
+    @cached_property
+    def off_centre(self) -> np.ndarray:
+        """A place in each [m], on no wall that stands at a simple fraction of a square, shape ``(T, 3)``."""
+        return 0.875 * self.centre + 0.0739 * self.corners[:, 0] + 0.0511 * self.corners[:, 1]
+
     def middles(self, piece: np.ndarray, preferred: np.ndarray | None = None) -> np.ndarray:
         """Of each piece of the surface, ``piece`` (T,) of each tile, the tile nearest to its middle; one of those ``preferred``
         (T,), if it has any."""

@@ -175,8 +175,9 @@ class RayGrid:
     def tiles_met(self, hits: Hits) -> tuple[np.ndarray, np.ndarray]:
         """Which rays hit something, and the sides of tiles that they do."""
         s, ray = self.surface, np.flatnonzero(hits.face >= 0)
-        tile = s.cells.square_at(hits.face[ray], hits.points(ray))
-        return ray, tile + s.is_behind(hits.face[ray], hits.rays(ray)[1]) * len(s.tiles.face)
+        face, direction = hits.face[ray], hits.rays(ray)[1]
+        tile = s.tile_at(face, hits.points(ray), direction)
+        return ray, tile + s.is_behind(face, direction) * len(s.tiles.face)
 
     def _backend(self, count: int) -> str:
         """Embree is worth being loaded for a grid of rays, whether it is in use yet or not."""

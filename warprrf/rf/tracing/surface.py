@@ -30,6 +30,7 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.slabs import Walls
 from warprrf.rf.tracing.cells import ELEMENT_M, Cells, Tiles
 from warprrf.rf.tracing.groups import SHAPES, Colours, colour_groups, shape_groups
+from warprrf.rows import distinct_rows
 
 ELEMENTS = 30_000
 """Larger scenes have wider elements, so that there are about so many: light between them takes up to 50 kB each. The
@@ -53,6 +54,23 @@ ARRAYS = {
     "face_object": index_to("O", "F", -1),
 }
 """What the arrays of a :class:`Surface` must be: F faces, P patches, G groups, K looks, O objects."""
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What walls part of a surface.
+
+    Attributes:
+        element: of each cell, shape ``(X,)``.
+        parted: whether something stands between a cell's middle and that of one beside it, shape ``(X,)``.
+        middle: tile in the middle of each cell, shape ``(X,)``.
+        tree: of places in these tiles [m].
+    """
+
+    element: np.ndarray
+    parted: np.ndarray
+    middle: np.ndarray
+    tree: cKDTree
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,27 +151,69 @@ class Surface:
         """Its faces cut into pieces of single cells."""
         return self.cells.tiles(self.mesh)
 
+    @property
+    def element(self) -> np.ndarray:
+        """Element of each cell: those of ``cells``, apart where a wall stands between them, shape ``(X,)``."""
+        return self.parts.element
+
+    @cached_property
+    def parts(self) -> Parts:
+        """Its cells, and elements as far as walls do not part them."""
+        tiles, cell_m = self.tiles, float(np.sqrt(np.bincount(self.tiles.cell, self.tiles.area).max()))
+        middle = tiles.middles(tiles.cell)
+        face, tree = tiles.face[middle], cKDTree(tiles.off_centre[middle])
+        pair = tree.query_pairs(1.4 * cell_m, output_type="ndarray")
+        pair = pair[(np.ptp(self.patch[face[pair]], axis=1) == 0) & (self.patch[face[pair[:, 0]]] >= 0)]
+        free = np.ones(len(pair), bool)
+        for side in (1.0, -1.0)[: 1 + self.two_sided]:
+            above = tree.data + side * self._above_m * self.side_normal[face]
+            free &= self.mesh.visible(*above[pair.T], clearance=0.0)
+        near = pair[free & (np.ptp(self.cells.element[pair], axis=1) == 0)]
+        piece = np.where(self.patch[face] < 0, -1, components(len(face), near))
+        element = distinct_rows(np.column_stack([self.cells.element, piece]))[1]
+        parted = np.zeros(len(face), bool)
+        parted[pair[~free]] = True
+        return Parts(element, parted, middle, tree)
+
+    @property
+    def _above_m(self) -> float:
+        """How far above the surface it is asked what stands on it [m]."""
+        return 3.0 * self.position_error_m
+
+    def tile_at(self, face: np.ndarray, point: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Tile that rays of ``direction`` (N, 3) meet at ``point`` (N, 3) on ``face`` (N,). Where a wall stands between a point and
+        the middle of its cell, that of the next cell on the point's side of it."""
+        parts, tile = self.parts, self.cells.square_at(face, point)
+        own = np.flatnonzero(parts.parted[self.cells.cell[tile]])
+        start, middle = point[own], parts.tree.data[self.cells.cell[tile[own]]]
+        normal = self._above_m * self.mesh.face_normals[face[own]]
+        above = np.where((normal * direction[own]).sum(axis=1)[:, None] > 0, -normal, normal)
+        hidden = ~self.mesh.visible(start + above, middle + above, clearance=0.0)
+        own, start, above = own[hidden], start[hidden], above[hidden]
+        near = parts.tree.query(start, range(1, 25))[1] % len(parts.middle)
+        row, k = np.nonzero(self.patch[self.tiles.face[parts.middle[near]]] == self.patch[face[own]][:, None])
+        middle = parts.tree.data[near[row, k]]
+        seen = self.mesh.visible((start + above)[row], middle + above[row], clearance=0.0)
+        row, first = np.unique(row[seen], return_index=True)
+        tile[own[row]] = parts.middle[near[row, k[seen][first]]]
+        return tile
+
     @cached_property
     def element_area(self) -> np.ndarray:
         """Area of each element [m^2], shape ``(E,)``."""
-        return np.maximum(np.bincount(self.cells.element[self.tiles.cell], self.tiles.area), 1e-12)
+        return np.maximum(np.bincount(self.element[self.tiles.cell], self.tiles.area), 1e-12)
 
     @cached_property
     def element_group(self) -> np.ndarray:
         """Group of each element, shape ``(E,)`` int32."""
         found = np.zeros(len(self.element_area), np.int32)
-        found[self.cells.element[self.tiles.cell]] = self.group[self.tiles.face]
+        found[self.element[self.tiles.cell]] = self.group[self.tiles.face]
         return found
 
     @property
     def element_sides(self) -> int:
         """Number of elements' sides: two each, or that of a reconstructed surface which photos saw."""
         return (1 + self.two_sided) * len(self.element_area)
-
-    def side_met(self, cell: np.ndarray, face: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Side of an element that a ray of ``direction`` (N, 3) meets at ``cell`` and ``face``, (N,) each: second sides stand after
-        all the first ones, shape ``(N,)``."""
-        return self.cells.element[cell] + self.is_behind(face, direction) * len(self.element_area)
 
     def is_behind(self, face: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Whether rays of ``direction`` (N, 3) meet the second side of ``face`` (N,), shape ``(N,)`` bool."""
@@ -164,7 +224,7 @@ class Surface:
     @cached_property
     def tile_side(self) -> np.ndarray:
         """Side of an element that each side of a tile is of: first sides, then second ones, shape ``((1 + two_sided) T,)``."""
-        element = self.cells.element[self.cells.cell]
+        element = self.element[self.cells.cell]
         sides = range(1 + self.two_sided)
         return np.concatenate([element + side * len(self.element_area) for side in sides])
 

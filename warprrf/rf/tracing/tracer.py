@@ -85,17 +85,22 @@ class View:
     paths: MirrorPaths
     records: dict[str, Records] = field(repr=False)
     keeps: bool = True
-    _beams: Cache = field(init=False, repr=False, default_factory=lambda: Cache(1))
+    _kept: Cache = field(init=False, repr=False, default_factory=lambda: Cache(2))
 
     def beams(self, sigma_rad: float) -> np.ndarray:
         """Unit beam of a receiver's width for each path over the pixels, shape ``(L, H, W)`` float32."""
         grid = self.tracer.grid
         make = partial(unit_beams, self.paths.arrival, grid.shape, sigma_rad, device=grid.device)
-        return self._beams.get(sigma_rad, make) if self.keeps else make()
+        return self._kept.get(sigma_rad, make) if self.keeps else make()
 
     def cell(self, ray: np.ndarray) -> np.ndarray:
         """Surface cell that each ray of index ``ray`` (N,) meets, shape ``(N,)``; all must meet something."""
-        return self.tracer.cell(self.hits, ray)
+        return (self._kept.get("cells", self._cells) if self.keeps else self._cells())[ray]
+
+    def _cells(self) -> np.ndarray:
+        hit, found = np.flatnonzero(self.hits.face >= 0), np.full(len(self.hits.face), -1, np.int32)
+        found[hit] = self.tracer.surface.cells.cell[self.tracer.tile(self.hits, hit)]
+        return found
 
     @property
     def outward(self) -> np.ndarray:
@@ -341,7 +346,7 @@ class Tracer:
         times = self.grid.per_pixel / len(places)
         chosen = np.flatnonzero((rays.hits.face >= 0) & np.isin(rays.ray % self.grid.per_pixel, places))
         m = self.mirrored(most)
-        row, image = m.pairs(self.cell(rays.hits, chosen), rays.hits.face[chosen])
+        row, image = m.pairs(self.tile(rays.hits, chosen))
         before = m.before.take(image) if most else None
         return self.lit_by_images(rays, chosen[row], m.patch[image], before, times)[1]
 
@@ -365,12 +370,9 @@ class Tracer:
 
     def seen(self, rays: Rays) -> Records:
         """What rays see of elements."""
-        hits, s = rays.hits, self.surface
-        row = np.flatnonzero(hits.face >= 0)
-        _, direction, solid_angle = hits.rays(row)
-        side = s.side_met(self.cell(hits, row), hits.face[row], direction)
-        friis = (self.wavelength_m / (4.0 * np.pi)) ** 2
-        power = friis * solid_angle * self.grid.transmittance(hits.range_m[row])
+        row, tile = self.grid.tiles_met(rays.hits)
+        side, friis = self.surface.tile_side[tile], (self.wavelength_m / (4.0 * np.pi)) ** 2
+        power = friis * rays.hits.rays(row)[2] * self.grid.transmittance(rays.hits.range_m[row])
         own = Interactions.alike(side[:, None], np.zeros((len(row), 1, 3)), SOURCE)
         return self._records(rays, row, power, [own], 1)
 
@@ -471,9 +473,9 @@ class Tracer:
         found = grid.hit_along(start, onward, solid_angle * left)
         return Rays(found, rays.ray[ray], Interactions.of_mirrors(s.group[face], cosine))
 
-    def cell(self, hits: Hits, ray: np.ndarray) -> np.ndarray:
-        """Surface cell that rays of index ``ray`` (N,) hit, shape ``(N,)``."""
-        return self.surface.cells.at(hits.face[ray], hits.points(ray))
+    def tile(self, hits: Hits, ray: np.ndarray) -> np.ndarray:
+        """Tile of the surface that rays of index ``ray`` (N,) hit, shape ``(N,)``."""
+        return self.surface.tile_at(hits.face[ray], hits.points(ray), hits.rays(ray)[1])
 
     def adopted(self, view: View) -> View:
         """What :func:`view_of` found, as a view of this tracer."""
@@ -511,13 +513,13 @@ class MirroredLight:
     def __init__(self, tracer: Tracer, most: int = 0) -> None:
         s, grid, walls = tracer.surface, tracer.grid, tracer.walls(most) if most else None
         largest, tiles = np.abs(s.front_normal).argmax(axis=1), s.tiles
-        self._way = 2 * largest + (np.take_along_axis(s.front_normal, largest[:, None], axis=1)[:, 0] < 0)
-        self._pieces, own = np.unique(6 * tiles.cell + self._way[tiles.face], return_inverse=True)
+        way = 2 * largest + (np.take_along_axis(s.front_normal, largest[:, None], axis=1)[:, 0] < 0)
+        own = self._piece = np.unique(6 * tiles.cell + way[tiles.face], return_inverse=True)[1]
         # A tile that lies in part under something is asked about where it is open, and what is hidden counts for nothing.
         sides = tracer.reached(most).reshape(-1, len(own), 3)
         place, is_open = np.where(np.isnan(sides[0]), sides[-1], sides[0]), ~np.isnan(sides[:, :, 0])
         hidden = ~is_open.any(axis=0)
-        place[hidden] = tiles.centre[hidden]
+        place[hidden] = tiles.off_centre[hidden]
         tile, open_m2 = tiles.middles(own, ~hidden), tiles.area * is_open
         area = np.stack([np.bincount(own, one) for one in open_m2])
         centre, middle = place[tile], tiles.face[tile]
@@ -548,15 +550,15 @@ class MirroredLight:
         length = np.linalg.norm(way, axis=1)
         toward = way / np.maximum(length, 1e-12)[:, None]
         cos_in = np.maximum((toward * normal).sum(axis=1), 0.0)
-        face, cell = middle[piece], tiles.cell[tile[piece]]
-        ray, behind = s.side_met(cell, face, -normal), s.is_behind(face, -normal).astype(int)
+        behind = s.is_behind(middle[piece], -normal).astype(int)
+        ray = s.tile_side[tile[piece] + behind * len(tiles.face)]
         share = area[behind, piece] / np.maximum(np.bincount(s.tile_side, open_m2.ravel())[ray], 1e-12)
         power = share * cos_in / np.maximum(length, NEAREST_M) ** 2 * grid.transmittance(length)
         self.onto = replace(paths, power=power, ray=ray)
 
-    def pairs(self, cell: np.ndarray, face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of places of cells and faces, ``(N,)`` each, and images that light them, one for each pair."""
-        piece = np.searchsorted(self._pieces, 6 * cell + self._way[face])
+    def pairs(self, tile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of ``tile`` (N,), and images that light them, one for each pair."""
+        piece = self._piece[tile]
         first, end = self._first[piece], self._first[piece + 1]
         count = end - first
         within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)

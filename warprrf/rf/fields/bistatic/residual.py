@@ -114,7 +114,7 @@ def fit_residual(shares: Sequence[Shares], surface: Surface, *, quick: bool = Fa
     # Unknowns have unit variance a priori: elements and cells of single bounces, then of light that is sent on.
     deviations = ((0.5, 0.5), (1.0, 2.0))  # of elements and of cells of each from a gain of 1 [nepers]
     cell = np.arange(len(surface.cells))
-    member = csr_matrix((np.ones(len(cell)), (cell, surface.cells.element)))
+    member = csr_matrix((np.ones(len(cell)), (cell, surface.element)))
     gains = block_diag(
         [hstack([element * member, own * identity(len(cell))]) for element, own in deviations], format="csr"
     )

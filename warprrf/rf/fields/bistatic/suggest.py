@@ -95,7 +95,7 @@ class Sensitivity:
         for name, power in found.powers.items():
             ray, gain = found.records[name].ray, found.records[name].residual_row
             if 0 <= gain < learned:
-                parts.append((ray, elements * gain + s.cells.element[view.cell(ray)], power))
+                parts.append((ray, elements * gain + s.element[view.cell(ray)], power))
             elif name != SPECULAR:
                 # What mirrors show is taken for known, as line of sight is; so is what surfaces send on of another
                 # transmitter's light, whose gains are others.
