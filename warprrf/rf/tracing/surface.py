@@ -20,7 +20,7 @@ from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
 from warprrf.checks import Expected, check_arrays, check_number, index_to, lengths
 from warprrf.device import DeviceLike
-from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh, components, smoothed_normals
+from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh, components, smoothed_normals, vectors_across
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.scans import is_scan, scanned_patches
 from warprrf.geometry.splats.gaussians import gaussians_of
@@ -161,19 +161,42 @@ class Surface:
         """Its cells, and elements as far as walls do not part them."""
         tiles, cell_m = self.tiles, float(np.sqrt(np.bincount(self.tiles.cell, self.tiles.area).max()))
         middle = tiles.middles(tiles.cell)
-        face, tree = tiles.face[middle], cKDTree(tiles.off_centre[middle])
-        pair = tree.query_pairs(1.4 * cell_m, output_type="ndarray")
+        face, place = tiles.face[middle], tiles.off_centre[middle]
+        pair = cKDTree(place).query_pairs(1.4 * cell_m, output_type="ndarray")
         pair = pair[(np.ptp(self.patch[face[pair]], axis=1) == 0) & (self.patch[face[pair[:, 0]]] >= 0)]
-        free = np.ones(len(pair), bool)
-        for side in (1.0, -1.0)[: 1 + self.two_sided]:
-            above = tree.data + side * self._above_m * self.side_normal[face]
-            free &= self.mesh.visible(*above[pair.T], clearance=0.0)
-        near = pair[free & (np.ptp(self.cells.element[pair], axis=1) == 0)]
-        piece = np.where(self.patch[face] < 0, -1, components(len(face), near))
-        element = distinct_rows(np.column_stack([self.cells.element, piece]))[1]
-        parted = np.zeros(len(face), bool)
+        free, parted = self._see(place, face, pair), np.zeros(len(face), bool)
         parted[pair[~free]] = True
-        return Parts(element, parted, middle, tree)
+        # A cell in part under a cabinet is what of it is in the open.
+        near = 0.25 * place[parted, None] + 0.75 * tiles.corners[middle[parted], :4]
+        place[parted] = self._most_open(np.concatenate([place[parted, None], near], axis=1), face[parted])
+        again = parted[pair].any(axis=1)
+        free[again] = self._see(place, face, pair[again])
+        parted[pair[~free]] = True
+        linked = pair[free & (np.ptp(self.cells.element[pair], axis=1) == 0)]
+        piece = np.where(self.patch[face] < 0, -1, components(len(face), linked))
+        element = distinct_rows(np.column_stack([self.cells.element, piece]))[1]
+        return Parts(element.astype(np.int32), parted, middle, cKDTree(place))
+
+    def _sides(self, face: np.ndarray) -> list[np.ndarray]:
+        """Normals (N, 3) of the sides that faces (N,) have."""
+        return [sign * self.side_normal[face] for sign in (1.0, -1.0)[: 1 + self.two_sided]]
+
+    def _see(self, place: np.ndarray, face: np.ndarray, pair: np.ndarray) -> np.ndarray:
+        """Whether nothing stands on the surface between each ``pair`` (K, 2) of places (N, 3) on faces (N,), shape ``(K,)``."""
+        above = [place + self._above_m * normal for normal in self._sides(face)]
+        return np.all([self.mesh.visible(*at[pair.T], clearance=0.0) for at in above], axis=0)
+
+    def _most_open(self, places: np.ndarray, face: np.ndarray) -> np.ndarray:
+        """Of ``places`` (N, K, 3) on each of faces (N,) the one with most air above it, by three rays a side, shape ``(N, 3)``."""
+        room = np.zeros(places.shape[:2])
+        for normal in self._sides(face):
+            across, over = vectors_across(normal)
+            for turn in 2.0 * np.pi / 3.0 * np.arange(3):
+                toward = normal + np.cos(turn) * across + np.sin(turn) * over
+                start = (places + self._above_m * normal[:, None]).reshape(-1, 3)
+                hit = self.mesh.cast(start, np.repeat(toward, places.shape[1], axis=0))
+                room += np.minimum(hit.t, 10.0 * ELEMENT_M).reshape(room.shape)
+        return places[np.arange(len(face)), room.argmax(axis=1)]
 
     @property
     def _above_m(self) -> float:

@@ -519,7 +519,8 @@ class MirroredLight:
         sides = tracer.reached(most).reshape(-1, len(own), 3)
         place, is_open = np.where(np.isnan(sides[0]), sides[-1], sides[0]), ~np.isnan(sides[:, :, 0])
         hidden = ~is_open.any(axis=0)
-        place[hidden] = tiles.off_centre[hidden]
+        parted = s.parts.parted[tiles.cell[hidden], None]
+        place[hidden] = np.where(parted, s.parts.tree.data[tiles.cell[hidden]], tiles.centre[hidden])
         tile, open_m2 = tiles.middles(own, ~hidden), tiles.area * is_open
         area = np.stack([np.bincount(own, one) for one in open_m2])
         centre, middle = place[tile], tiles.face[tile]
