@@ -26,15 +26,15 @@ ANOTHER_MATERIAL = "doubled, of another material"
 
 
 @cache
-def room(law=None):
-    return rooms.plain().with_gaussians() if law is None else LAWS[law](room())
+def room(law=None, name="plain"):
+    return rooms.ROOMS[name]().with_gaussians() if law is None else LAWS[law](room(name=name))
 
 
 @cache
-def found(figure, law=None):
+def found(figure, law=None, name="plain"):
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore" if law == ANOTHER_MATERIAL else "error", "mesh: ")
-        return FIGURES[figure](room(law))
+        return FIGURES[figure](room(law, name))
 
 
 SAID_BY_ANOTHER = [
@@ -55,6 +55,18 @@ def test_nothing_changes(figure, law):
     assert total_change_db(now, before) < most_db(figure, law)
     if room(law).turned is not None and figure != "mirrors":
         assert rms_change_db(now, before) < max(0.3, most_db(figure, law))
+
+
+NO_SOLIDS = {ANOTHER_MATERIAL, *(f"in two sheets 1e{k} m apart" for k in (-5, -4)), "noise of 1e-3 m"}
+"""Laws by which a solid's faces are hidden behind sheets, or edges are lost."""
+
+
+@pytest.mark.parametrize("law", [law for law in EVERY if law not in NO_SOLIDS])
+@pytest.mark.parametrize("figure", ["mirrors", "exact", "bistatic"])
+def test_nothing_changes_behind_glass(figure, law):
+    """Slabs are as thick as they were, edges where they were: a table, a cabinet, walls and a pane."""
+    before, now = (found(figure, which, "behind glass") for which in (None, law))
+    assert total_change_db(now, before) < max(0.01, 2.0 * most_db(figure, law))
 
 
 @pytest.mark.filterwarnings("ignore:mesh")

@@ -10,9 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from unittest import mock
 
 import numpy as np
+import office
 from golden import make
 from places import LOBBY
 from radio_scenes import joined
@@ -21,6 +24,7 @@ from scipy.spatial.transform import Rotation
 import warprrf as wr
 from warprrf.geometry.splats.gaussians import discs_on_mesh
 from warprrf.rf import exact
+from warprrf.rf.exact import SINGLE
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.tracing import rays
 from warprrf.rf.tracing.model import Effects
@@ -41,6 +45,7 @@ class Room:
         turned: columns of a spectrum that the room was turned by about z; None if about another axis.
         rotation: that it was turned by.
         gaussians: on its surfaces.
+        behind: slabs on a path, and edges, that are modelled.
     """
 
     vertices: np.ndarray
@@ -53,6 +58,7 @@ class Room:
     turned: int | None = 0
     gaussians: wr.Gaussians | None = None
     rotation: Rotation = Rotation.identity()
+    behind: tuple[int, int] = (0, 0)
 
     @property
     def mesh(self) -> wr.Mesh:
@@ -124,7 +130,18 @@ def lobby() -> Room:
     )  # fmt: skip
 
 
-ROOMS = {"plain": plain, "l-shaped": l_shaped, "lobby": lobby}
+def behind_glass() -> Room:
+    """An L-shaped office with a room behind glass, a table and a cabinet; places on both sides of the glass."""
+    with TemporaryDirectory() as folder:
+        scene = wr.Scene.load(office.office(Path(folder)))
+    places = np.array([[7.23, 0.84, 1.22], [8.37, 1.73, 1.13], [4.21, 2.02, 1.41]])
+    return Room(
+        scene.mesh.vertices, scene.mesh.faces, scene.face_material, tuple(scene.materials), np.array([1.07, 5.93, 2.41]),
+        places, office.CARRIER_HZ, behind=(3, 1),
+    )  # fmt: skip
+
+
+ROOMS = {"plain": plain, "l-shaped": l_shaped, "lobby": lobby, "behind glass": behind_glass}
 
 
 def moved(
@@ -176,6 +193,18 @@ def scaled(factor: float) -> Change:
         return replace(moved(Rotation.identity(), factor)(room), frequency_hz=f / factor, materials=same)
 
     return change
+
+
+def mirrored(room: Room) -> Room:
+    """As seen in a mirror across x; without its Gaussians."""
+
+    def place(points: np.ndarray) -> np.ndarray:
+        return np.asarray(points, float) * [-1.0, 1.0, 1.0]
+
+    return replace(
+        room, vertices=place(room.vertices), faces=room.faces[:, ::-1], transmitter=place(room.transmitter),
+        receivers=place(room.receivers), gaussians=None, turned=None,
+    )  # fmt: skip
 
 
 def in_another_order(room: Room) -> Room:
@@ -271,6 +300,7 @@ EXACT: dict[str, Change] = {
     "turned askew": moved(Rotation.from_rotvec([0.4, -0.7, 0.9]), turn=None),
     "scaled by 2": scaled(2.0),
     "scaled by 0.1": scaled(0.1),
+    "mirrored": mirrored,
     "in another order": in_another_order,
     "reversed winding": reversed_winding,
     "mixed winding": lambda room: reversed_winding(room, 0.5),
@@ -295,19 +325,26 @@ LAWS = EXACT | ROUNDED
 
 
 def traced(room: Room) -> wr.Paths:
-    """Line of sight and mirror paths."""
-    return wr.trace_paths(room.scene, **room.link, mirror_order=2)
+    """Line of sight and mirror paths, and those through slabs and over edges."""
+    slabs, edges = room.behind
+    return wr.trace_paths(room.scene, **room.link, mirror_order=2, transmissions=slabs, diffractions=edges)
 
 
 def mirrors(room: Room) -> np.ndarray:
-    """Power of each receiver's paths, shape ``(R, 1, 1)``."""
+    """Power of each receiver's paths, shape ``(R, 1, 1)``; of each kind apart where there are slabs and edges, ``(3 R, 1, 1)``."""
     paths = traced(room)
-    return np.where(paths.valid, np.abs(paths.gain) ** 2, 0.0).sum(axis=1)[:, None, None]
+    power = np.where(paths.valid, np.abs(paths.gain) ** 2, 0.0)
+    if not any(room.behind):
+        return power.sum(axis=1)[:, None, None]
+    every = np.isin(paths.kind, ("los", "mirror")), paths.kind == "slab", paths.kind == "edge"
+    kinds = np.concatenate([(power * own).sum(axis=1) for own in every])
+    return kinds[kinds > 0, None, None]
 
 
 def simulated(room: Room) -> wr.SpectrumDataset:
     """Its spectra by the exact engine."""
-    return wr.simulate(room.scene, **room.link, shape=SHAPE, beam_sigma_rad=np.deg2rad(6.0))
+    effects = replace(SINGLE, transmissions=room.behind[0], diffractions=room.behind[1])
+    return wr.simulate(room.scene, **room.link, shape=SHAPE, beam_sigma_rad=np.deg2rad(6.0), effects=effects)
 
 
 @contextmanager
@@ -330,6 +367,14 @@ def rays_turned(rotation: Rotation) -> Iterator[None]:
         yield
 
 
+def known_field(room: Room) -> BistaticField:
+    """A field that takes every surface alike, with light of several bounces."""
+    effects = replace(EVERY_EFFECT, transmissions=room.behind[0], diffractions=room.behind[1])
+    grid = {"shape": SHAPE, "beam_sigma_rad": np.deg2rad(6.0), "floor": 1e-16}
+    ds = wr.SpectrumDataset.empty(transmitter=room.transmitter, frequency_hz=room.frequency_hz, **grid)
+    return BistaticField.prior(room.scene, ds, effects=effects)
+
+
 def images(room: Room, source: wr.RadioField | wr.SpectrumDataset) -> np.ndarray:
     """Spectra of a field, or of a data set, as the room stood before; shape ``(R, H, W)``."""
     known = isinstance(source, wr.SpectrumDataset)
@@ -348,9 +393,7 @@ def harmonic(room: Room) -> wr.RadioField:
 FIGURES: dict[str, Callable[[Room], np.ndarray]] = {
     "mirrors": mirrors,
     "exact": lambda room: images(room, simulated(room)),
-    "bistatic": lambda room: images(
-        room, BistaticField.prior(room.scene, simulated(room), effects=EVERY_EFFECT)
-    ),
+    "bistatic": lambda room: images(room, known_field(room)),
     "bistatic, fitted": lambda room: images(room, wr.RadioField.fit(room.scene, simulated(room))),
     "rf3dgs+": lambda room: images(room, harmonic(room)),
 }

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warprrf.geometry.mesh import Mesh, components, vectors_across
+from warprrf.geometry.mesh import Mesh, components, headings, vectors_across
 from warprrf.rows import Rows, distinct_rows
 
 LEAST_BEND_RAD = np.radians(1.0)
@@ -147,8 +147,7 @@ def _gaps(
     lies &= (normal[face] != 0).any(axis=1)
     piece, face = np.repeat(piece[lies], 2), np.repeat(face[lies], 2)
     toward = np.cross(normal[face], along[piece])
-    toward *= (np.arange(len(toward)) % 2 * 2.0 - 1.0)[:, None]
-    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    toward = headings(toward * (np.arange(len(toward)) % 2 * 2.0 - 1.0)[:, None])[0]
     goes_on = _depth(mesh, face, middle[piece], toward) > 4.0 * reach
     piece, face, toward = piece[goes_on], face[goes_on], toward[goes_on]
     u, v = vectors_across(along)

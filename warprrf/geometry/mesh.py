@@ -277,7 +277,10 @@ class Mesh:
         for own in np.split(np.argsort(part, kind="stable"), np.cumsum(np.bincount(part))[:-1]):
             share, most = LARGEST_HOLE
             size = float(np.linalg.norm(np.ptp(self.triangles[face[own]].reshape(-1, 3), axis=0)))
-            if len(own) > 3 and self._largest_hole(corner[own], face[own]) <= min(share * size, most):
+            # A face without area may close a seam, or only lie on an edge.
+            large = own[self.areas[face[own]] > 1e-9 * size**2]
+            holes = (self._largest_hole(corner[some], face[some]) for some in (own, large))
+            if len(large) > 3 and any(hole <= min(share * size, most) for hole in holes):
                 found[face[own]] = count
                 count += 1
         return found

@@ -1,7 +1,7 @@
 """What stands on a straight way and lets a wave through: slabs, found by rays.
 
-Two faces of one closed part, met one after the other and turned against each other, at most :data:`THICKEST_M` apart, are
-one slab of that thickness. Any other face is a sheet, at corners too: a slab as thick as its material is said to be. So a
+Two faces of one closed part, met one after the other and not at right angles, at most :data:`THICKEST_M` apart, are one slab
+of that thickness. Any other face is a sheet, at corners too: a slab as thick as its material is said to be. So a
 wall drawn as a sheet and the same wall drawn as a closed solid let the same through. The way is not bent.
 """
 
@@ -11,10 +11,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from warprrf.cache import cached_property
 from warprrf.device import DeviceLike
-from warprrf.geometry.mesh import Mesh, headings
+from warprrf.geometry.mesh import Mesh, components, headings
 from warprrf.rf.em.fresnel import slab_passage, slab_transmission
 from warprrf.rows import Rows
 
@@ -22,8 +23,9 @@ MOST_SLABS = 8
 """Most that may be asked for on one way: five partitions stand between the ends of links on a floor of offices."""
 THICKEST_M = 1.0
 """Thicker solids are taken to be hollow, a cabinet's or a room's: two sheets."""
-AGAINST = -0.1
-"""Largest cosine between the normals of faces that are turned against each other: at right angles rounding must not decide."""
+ALIKE = 0.1
+"""Least cosine between the normals, taken along the way, by which a slab is entered and left: at right angles rounding must not
+decide."""
 
 
 @dataclass(frozen=True)
@@ -126,8 +128,12 @@ class Walls:
 
     @cached_property
     def _part(self) -> np.ndarray:
-        """Closed part of each face, that of the face at its place for a repeat, -1 for none."""
-        return self.mesh.closed_part_of[self.mesh.first_at_place]
+        """Closed part of each face, that of the face at its place for a repeat, -1 for none; parts that fill one box are one, as
+        copies that lie micrometres apart."""
+        parts, part = self.mesh.closed_parts, self.mesh.closed_part_of[self.mesh.first_at_place]
+        boxes = cKDTree(np.array([p.bounds.ravel() for p in parts]).reshape(-1, 6))
+        label = components(len(parts), boxes.query_pairs(self.clearance_m, output_type="ndarray"))
+        return np.append(label, -1)[part]
 
     def between(self, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, Slabs]:
         """Which of the ways from ``start`` to ``end``, (N, 3) or (3,), arrive, and the slabs that those pass."""
@@ -181,7 +187,11 @@ class Walls:
             again = again[self._part[face[again]] == self._part[before[again]]]
             r, k = row[again], place[again]
             apart = (t[again] - slabs.range_m[r, k]) * slabs.cosine[r, k]
-            back = (apart <= THICKEST_M) & (_dot(normal[face[again]], normal[before[again]]) < AGAINST)
+            along, left, entered = direction[row[again]], normal[face[again]], normal[before[again]]
+            alike = _dot(left, entered) * np.sign(
+                _dot(left, along) * _dot(entered, along)
+            )  # however they are wound
+            back = (apart <= THICKEST_M) & (alike > ALIKE)
             slabs.thickness_m[r[back], k[back]] = apart[back]
             out = np.zeros(len(row), bool)
             out[again[back]] = True
