@@ -59,6 +59,8 @@ def _rooms(place: Place, edits: tuple[Edit, ...]) -> str:
     changed = rooms.ROOMS[room]().with_gaussians()
     for law in laws:
         changed = rooms.LAWS[law](changed)
+    if changed.gaussians is None and figure == "rf3dgs+":
+        raise Unfit("has no Gaussians")
     with rooms.rays_turned(changed.rotation) if figure == "exact" else contextlib.nullcontext():
         now = rooms.FIGURES[figure](changed)
     before = _before(room, figure)
