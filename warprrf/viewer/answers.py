@@ -190,14 +190,14 @@ def nearest_path(each: Sequence[np.ndarray], origin: np.ndarray, direction: np.n
 def reading_errors(field: RadioField, readings: Readings, progress: Progress | None = None) -> np.ndarray:
     """What ``field`` predicts over what was read [dB], shape ``(N,)``; NaN where nothing was, or both are below the floor.
 
-    The gain of a measuring chain is not known: each chain's median error is taken off.
+    The gain of a measuring chain is not known: each chain's median error is taken off. The air is that of the readings.
 
     Raises:
         ValueError: for azimuths or delays that count from an unknown zero, or a place that ``field`` does not hold at.
     """
     if not readings.zero_known:
         raise ValueError("readings: their azimuths or delays count from an unknown zero, expected known ones")
-    power, steady = np.empty((2, len(readings)))
+    field, (power, steady) = field.with_gas(readings.air), np.empty((2, len(readings)))
     ends = np.column_stack([readings.transmitters, readings.receivers])
     links, own = np.unique(ends, axis=0, return_inverse=True)
     for k, link in enumerate(links):
