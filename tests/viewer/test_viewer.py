@@ -1,5 +1,6 @@
 """The page in a real browser: it opens, what is dragged is answered, and nothing grows."""
 
+import dataclasses
 import io
 import resource
 import shutil
@@ -17,6 +18,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 
 import warprrf as wr
+from warprrf.cache import Cache
 from warprrf.viewer import answers
 
 CHROMIUM = (shutil.which("chromium"), shutil.which("chromedriver"))
@@ -141,6 +143,24 @@ def test_at_another_carrier_fields_are_carried_over_and_not_compared_with_what_w
     assert f"expected that of what was measured, {make.CARRIER_HZ / 1e9:g} GHz" in viewer.message
     viewer._channel.carrier.value = make.CARRIER_HZ / 1e9
     assert viewer.wait().frequency_hz == make.CARRIER_HZ and "carried over" not in viewer.message
+
+
+def test_what_was_measured_under_another_transmitter_is_not_compared_with(viewer, monkeypatch):
+    ds, field = viewer.subject.spectra, viewer.subject.field
+    viewer.receiver, other = ds.receivers[0], ds.transmitter + [0.4, 0.9, -0.3]
+    viewer._transmitters[0].position = other
+    viewer.refresh()
+    viewer.wait()
+    assert [image[0] for image in viewer._channel.images] == ["spectrum"]
+    assert "one transmitter at 1.10, 1.30, 2.40 m" in viewer._channel.spectra.content
+    viewer._transmitters[0].position = ds.transmitter
+    viewer.refresh()
+    viewer.wait()
+    assert [image[0] for image in viewer._channel.images][1:] == ["truth", "spectrum less truth"]
+    wanted = [float(button.label.split()[0]) for button in _survey(viewer, "errors").listed]
+    monkeypatch.setattr(viewer, "_fields", Cache(1))
+    monkeypatch.setattr(viewer.subject, "field", dataclasses.replace(field, transmitter=other))
+    assert [float(button.label.split()[0]) for button in _survey(viewer, "errors").listed] == wanted
 
 
 def test_the_map_lies_on_the_floor_with_its_scale(viewer):

@@ -104,9 +104,13 @@ class Channel:
             return [], ""
         index, truth, note = answers.measured_here(ds, found.receiver), None, ""
         if ds is not None and index is not None:
+            off = [np.linalg.norm(p.transmitter - ds.transmitter) for p in found.paths]
             same = abs(ds.frequency_hz - found.frequency_hz) < 0.5 * answers.CARRIER_STEP_HZ
-            truth = ds[index] if same else None
-            note = "" if same else f"What was measured here is of {ds.frequency_hz / 1e9:g} GHz."
+            if same and len(off) == 1 and off[0] <= answers.AT_M:
+                truth = ds[index]
+            else:
+                place = ", ".join(f"{x:.2f}" for x in ds.transmitter)
+                note = f"Measured here: {ds.frequency_hz / 1e9:g} GHz, one transmitter at {place} m."
         known = [s.path_gain_db for s in (spectrum, truth) if s is not None]
         top = max(float(image.max()) for image in known)
         low = top - float(self.range_db.value)

@@ -660,11 +660,8 @@ def _cfr(
     field: RadioField, f: np.ndarray, max_paths: int | None, options: Any, part: Part
 ) -> dict[str, np.ndarray]:
     """Each receiver's paths and then its response, in single precision: paths of many would fill the memory."""
-    found = [
-        frequency_response(paths, f, **options).astype(np.complex64)
-        for receiver in part[0]
-        for paths in _paths(field, max_paths, (receiver[None], part[1]))
-    ]
+    every = (field._trace_paths(receiver, part[1], max_paths) for receiver in part[0])
+    found = [frequency_response(paths, f, **options).astype(np.complex64) for paths in every]
     return {"cfr": np.stack(found)}
 
 
