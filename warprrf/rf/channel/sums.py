@@ -50,7 +50,7 @@ class PairLengths:
             receiving elements see, from their centre [m], shape ``(1, P, 3)``, or ``(N, P, 3)`` if every transmitting
             element is a source of its own.
         extra: Length to add for transmitting elements [m], shape ``(N, P)``.
-        scale: Factor of amplitudes for transmitting elements, shape ``(N, P)``, or ``(1, 1)`` for one.
+        scale: Factor of amplitudes for transmitting elements, shape ``(N, P)`` or ``(N, 1)``.
         spherical: Whether waves are.
     """
 
@@ -84,8 +84,7 @@ class PairLengths:
     def between(self, m: slice, n: slice) -> PairLengths:
         """Those of receiving elements ``m`` and transmitting ones ``n``."""
         target = self.target if self.separable else self.target[n]
-        scale = self.scale if len(self.scale) == 1 else self.scale[n]
-        return replace(self, place=self.place[m], target=target, extra=self.extra[n], scale=scale)
+        return replace(self, place=self.place[m], target=target, extra=self.extra[n], scale=self.scale[n])
 
 
 @dataclass(frozen=True)
@@ -261,7 +260,7 @@ def plane_lengths(paths: PathArrays, sending: np.ndarray, receiving: np.ndarray)
         place=receiving,
         target=np.ascontiguousarray(paths.arrival)[None],
         extra=-(sending @ paths.departure.T),
-        scale=np.ones((1, 1)),
+        scale=np.ones((len(sending), 1)),
         spherical=False,
     )
 
