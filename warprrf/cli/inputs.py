@@ -127,9 +127,12 @@ TAKEN = {
 """Options by the kind of file that they say something of, and what the library calls those that are passed on."""
 
 
-def read_measured(words: Sequence[str], args: argparse.Namespace, others: bool = False) -> list[Any]:
+def read_measured(
+    words: Sequence[str], args: argparse.Namespace, others: bool = False, frequency_hz: float | None = None
+) -> list[Any]:
     """What files hold: spectra (NetCDF, or NPZ of the arguments of ``from_spectra``), readings (CSV), spectra of arrays
-    (a folder as NeRF2 has it); behind each file its own settings. With ``others`` the names of other files stay."""
+    (a folder as NeRF2 has it); behind each file its own settings. With ``others`` the names of other files stay.
+    ``frequency_hz`` is the carrier where none is given."""
     files: list[tuple[str, list[str]]] = []
     for word in words:
         if "=" in word and files and not Path(word).exists():
@@ -143,6 +146,8 @@ def read_measured(words: Sequence[str], args: argparse.Namespace, others: bool =
     kinds = [_kind(existing(path), others) for path, _ in files]
     unused = [name for name in unused if not any(name in TAKEN[kind] for kind in kinds)]
     refuse(args, unused, "no file is given that it could be of")
+    if args.frequency is None:
+        args.frequency = frequency_hz
     own = [parser.parse_args(settings) for _, settings in files]
     found = []
     for kind, (path, _), said in zip(kinds, files, own, strict=True):

@@ -446,10 +446,8 @@ def _locate(args: argparse.Namespace, out: Output) -> None:
       warprrf locate field.safetensors horn.csv --noise-floor-db -150 --receive-pattern 10 --azimuth unknown
     """
     field = wr.RadioField.load(existing(args.field), device=args.device)
-    if args.frequency is None:
-        args.frequency = field.frequency_hz
     measured = []
-    for one in read_measured(args.measurements, args, others=True):
+    for one in read_measured(args.measurements, args, others=True, frequency_hz=field.frequency_hz):
         if isinstance(one, Path):
             ds = load_spectra(one)
             if args.receiver is None and len(ds) != 1:

@@ -70,12 +70,14 @@ def _render(args: argparse.Namespace, out: Output) -> None:
         field, place = load_field(source, args), np.array(args.receiver, dtype=np.float64)
         if args.array is None:
             spectrum = field.spectrum(place, args.transmitter)
+            name, gain = "total path gain", spectrum.total_path_gain
         else:
             spectrum = _array_spectrum(field, place, args)
+            name, gain = "strongest direction", spectrum.path_gain.max()
         _write_spectrum(spectrum, Path(args.out))
-        total = 10.0 * np.log10(max(float(np.sum(spectrum.path_gain, dtype=np.float64)), 1e-300))
-        text = f"{args.out}: total path gain {total:.2f} dB at {' '.join(f'{x:g}' for x in args.receiver)}"
-        out.result(text, files=[args.out], total_path_gain_db=total)
+        db = 10.0 * np.log10(max(gain, 1e-300))
+        text = f"{args.out}: {name} {db:.2f} dB at {' '.join(f'{x:g}' for x in args.receiver)}"
+        out.result(text, files=[args.out], **{f"{name.replace(' ', '_')}_db": db})
         return
     if args.position is None or args.look_at is None:
         raise ValueError("--position and --look-at: both are needed to draw Gaussians, three numbers each")
@@ -281,14 +283,16 @@ def _twin(args: argparse.Namespace, out: Output) -> None:
                 f"{group.lobe_error_db:.2f}",
             ]
         )
-    errors = {name: getattr(twin, f"{name}_error_db") for name in ("scattering", "mirror", "lobe")}
+    figures = {
+        name: getattr(twin, name) for name in ("scattering_error_db", "mirror_error_db", "lobe_error_db")
+    }
+    scattered, mirrored, lobes = figures.values()
     lines = [
         aligned(rows),
         f"\n{twin.xml}: {len(twin.groups)} materials; rms errors of the projection over area: scattered power "
-        f"{errors['scattering']:.2f} dB, mirrored power {errors['mirror']:.2f} dB, lobes {errors['lobe']:.2f} dB",
+        f"{scattered:.2f} dB, mirrored power {mirrored:.2f} dB, lobes {lobes:.2f} dB",
         *(f"left out: {line}" for line in twin.left_out),
     ]
-    figures = {f"{name}_error_db": value for name, value in errors.items()}
     out.result(
         "\n".join(lines), files=[args.out], materials=len(twin.groups), **figures, left_out=twin.left_out
     )
