@@ -146,6 +146,8 @@ def _weights(power: ArrayLike, values: ArrayLike, name: str) -> tuple[np.ndarray
     v = check_array(name, values, finite=False)
     if p.shape != v.shape or p.ndim == 0:
         raise ValueError(f"power: got shape {p.shape} for {name} of shape {v.shape}, expected the same")
+    if p.shape[-1] == 0:
+        p, v = np.zeros((2, *p.shape[:-1], 1))
     positive = p > 0
     if not np.isfinite(v[positive]).all():
         raise ValueError(f"{name}: got NaN or infinite ones where there is power")
