@@ -326,6 +326,8 @@ def test_the_walk_through_is_what_the_library_gives_for_the_same_files(tmp_path)
         "map {tmp}/f.safetensors -o {tmp}/m.nc --cell 1.5 --bounds 0.2 0.2 4.7 3.2 --power-dbm 7",
     ):
         run(words, tmp_path)
+    for words in ("evaluate {tmp}/f.safetensors {tmp}/s.nc", "map {tmp}/f.safetensors -o {tmp}/n.nc"):
+        assert cli.main([*words.format(tmp=tmp_path).split(), "--device", "cuda:99"]) == 2
     figures = json.loads((tmp_path / "figures.json").read_text())
     assert set(figures) == {"bistatic", "nearest", "idw", "constant", "mean"}
     assert {row["receivers_fitted_on"] for row in figures.values()} == {0}

@@ -492,7 +492,7 @@ def _evaluate(args: argparse.Namespace, out: Output) -> None:
     """
     from warprrf.rf.spectra import lookups, metrics
 
-    field = wr.RadioField.load(existing(args.field))
+    field = wr.RadioField.load(existing(args.field), device=args.device)
     dataset = load_spectra(args.spectra)
     there = int(np.count_nonzero(dataset.role == "train"))
     count = min(max(len(field.fitted_on), 1), there)
@@ -554,8 +554,7 @@ def _relevance(args: argparse.Namespace, out: Output) -> None:
     receivers = None if args.receivers is None else read_receivers(args.receivers)
     if args.spectra is not None:
         dataset = load_spectra(args.spectra)
-        measured = {"transmitter": dataset.transmitter, "frequency_hz": float(dataset.frequency_hz)}
-        given = {name: measured[name] if value is None else value for name, value in given.items()}
+        given = {name: getattr(dataset, name) if value is None else value for name, value in given.items()}
         receivers = dataset.receivers if receivers is None else receivers
     if receivers is None:
         raise ValueError("--receivers: none given, expected positions, or --spectra with some")
