@@ -356,7 +356,7 @@ def _sum_rates(
     return rates
 
 
-Rays = tuple[np.ndarray | None, np.ndarray, np.ndarray]
+Rays = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def rays_of_users(sources: Source | Iterable[Source], tx: Codebook) -> list[Rays]:
@@ -373,34 +373,34 @@ def rays_of_users(sources: Source | Iterable[Source], tx: Codebook) -> list[Rays
 
 
 def rays_of(source: Source, tx: Codebook) -> Iterator[Rays]:
-    """Departure (None if it does not matter), arrival and power of what reaches each receiver of ``source``."""
+    """Departure (arrival, if it does not matter), arrival and power of what reaches each receiver of ``source``."""
     pattern = tx.array.pattern
     directed = tx.array.elements > 1 or not (isinstance(pattern, str) and pattern == "isotropic")
     if isinstance(source, PathArrays):
         for paths in source.each():
-            kept = paths.select(np.flatnonzero(paths.power > 0))
-            departure = kept.departure
+            kept = paths.select(paths.power > 0)
+            departure = kept.departure if directed else kept.arrival
             if directed and not np.isfinite(departure).all():
                 raise ValueError("source: got paths without a departure angle, expected one with a tx_array")
-            yield departure if directed else None, kept.arrival, kept.power
+            yield departure, kept.arrival, kept.power
     elif isinstance(source, Spectrum):
         power = np.asarray(source.path_gain, np.float64)
         positive = power > 0
-        departure = None
+        departure = arrival = pixel_directions(source.shape)
         if directed:
             if source.aod is None:
                 raise ValueError("source: got a spectrum without aod, expected departures with a tx_array")
             positive &= np.isfinite(source.aod).all(axis=-1)
-            departure = directions_from_angles(source.aod[positive][:, 0], source.aod[positive][:, 1])
-        yield departure, pixel_directions(source.shape)[positive], power[positive]
+            departure = directions_from_angles(source.aod[..., 0], source.aod[..., 1])
+        yield departure[positive], arrival[positive], power[positive]
     else:
         raise TypeError(f"source: got {type(source).__name__}, expected a Spectrum or Paths")
 
 
 def _pair_gains(rays: Rays, tx: Codebook, rx: Codebook) -> np.ndarray:
     departure, arrival, power = rays
-    if departure is None:
-        return rx.power(arrival, power)[:, None] * squared(tx.weights[:, 0])
+    if tx.array.elements == 1:
+        return rx.power(arrival, power * tx.array.gain(departure))[:, None] * squared(tx.weights[:, 0])
     if rx.array.elements == 1:
         return tx.power(departure, power * rx.array.gain(arrival))[None] * squared(rx.weights[:, :1])
     total = np.zeros((len(rx), len(tx)))

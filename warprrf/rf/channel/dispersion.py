@@ -119,8 +119,8 @@ def _first_fall(weight: np.ndarray, tau: np.ndarray, level: float) -> float:
     if np.isnan(weight).any():
         return float("nan")
     tau, weight = tau[weight > 0], weight[weight > 0]
-    tau = tau - tau.min(initial=np.inf)
-    longest = tau.max(initial=0.0)
+    tau = tau - tau.min()
+    longest = tau.max()
     # |R| cannot fall below the strongest weight less all others; of delays nearer than that even the squares are zero.
     if longest < 1e-150 or 2.0 * weight.max() - 1.0 > level:
         return float("inf")

@@ -133,7 +133,7 @@ class PathArrays:
             TypeError: for paths of one receiver.
         """
         one = self.row(receiver)
-        return one.select(np.flatnonzero(one.valid))
+        return one.select(one.valid)
 
     def row(self, receiver: int) -> Self:
         """The paths of one of several receivers, padded as they are.
@@ -163,10 +163,8 @@ class PathArrays:
 
     def each(self) -> Iterator[Self]:
         """The paths of one receiver after another, without padding."""
-        if self.batched:
-            yield from (self[k] for k in range(len(self.gain)))
-        else:
-            yield self.select(np.flatnonzero(self.valid))
+        several = self.as_several()
+        yield from (several[k] for k in range(len(several.gain)))
 
     def select(self, chosen: slice | np.ndarray) -> Self:
         """Paths ``chosen`` of one receiver: indices in any order, or a mask ``(L,)``.

@@ -63,9 +63,6 @@ def transmit_covariance(
         for part in chunks(len(power), tx.elements):
             toward = arrival[part]
             received = squared(book.array.response(toward, 1.0) @ own) * book.array.gain(toward)
-            if departure is None:  # a single isotropic element
-                total += (received * power[part]).sum()
-                continue
             away = departure[part]
             transmitted = tx.response(away, 1.0) * np.sqrt(received * power[part] * tx.gain(away))[:, None]
             total += transmitted.conj().T @ transmitted

@@ -304,7 +304,7 @@ def _links(
         amplitude = _amplitudes(chosen, tx, rx)
         if diffuse == "random_phase":
             turns = np.zeros(len(own.gain))
-            turns[scattered] = random_turns(own.select(np.flatnonzero(scattered)), seed)
+            turns[scattered] = random_turns(own.select(scattered), seed)
             amplitude = amplitude * carrier_phase(-1.0, turns[index])
         if wave == "plane":
             groups = [(np.arange(len(index)), plane_lengths(chosen, *places))]

@@ -111,5 +111,5 @@ def links_of(paths: Paths, shape: tuple[int, int], sigma: float, device: Any = N
     sharp = np.flatnonzero(~rough)
     beam = best_beam_gain(image, np.zeros(len(sharp), int), toward[sharp], power[sharp], sigma, device)
     timed = np.isfinite(tau)
-    spread = delay_spread(power[timed], tau[timed])[1] if timed.any() else np.nan
+    spread = delay_spread(power[timed], tau[timed])[1]
     return Links(*(np.array([x], float) for x in (power.sum(), power.max(initial=0.0), spread, beam[0])))
