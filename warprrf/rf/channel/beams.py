@@ -181,7 +181,7 @@ def steering_codebook(
 
 
 Source = PathArrays | Spectrum
-"""Where predicted power comes from and how much: :class:`Paths` of one receiver or several, or a :class:`Spectrum`."""
+"""Where predicted power comes from and how much: :class:`Paths` or a :class:`Spectrum` of one receiver or several."""
 Noise: TypeAlias = Annotated[float, positive("share of the transmitted power")]
 Ends = End | Codebook
 """Beams of one end: those given, an array's DFT codebook, an antenna as it stands, or a single isotropic element."""
@@ -214,7 +214,7 @@ def beam_gains(source: Source, tx_array: Ends = None, rx_array: Ends = None) -> 
     """
     tx, rx = codebook_of("tx_array", tx_array), codebook_of("rx_array", rx_array)
     found = [_pair_gains(rays, tx, rx) for rays in rays_of(source, tx)]
-    return np.stack(found) if isinstance(source, PathArrays) and source.batched else found[0]
+    return np.stack(found) if source.batched else found[0]
 
 
 @checked
@@ -228,7 +228,7 @@ def select_beams(
     single element.
 
     Args:
-        source: A :class:`Spectrum`, or :class:`Paths` of one receiver or several.
+        source: A :class:`Spectrum` or :class:`Paths` of one receiver or several.
         tx_array: Transmitting :class:`PlanarArray`, whose DFT codebook is searched, or a :class:`Codebook`; a single
             isotropic element by default.
         rx_array: Of the receiver, likewise.
@@ -245,7 +245,7 @@ def select_beams(
         gains = _pair_gains(rays, tx, rx)
         best = np.argsort(-gains, axis=None, kind="stable")[:count]
         rows.append((best % len(tx), best // len(tx), gains.ravel()[best]))
-    if not (isinstance(source, PathArrays) and source.batched):
+    if not source.batched:
         return BeamChoice(*rows[0])
     return BeamChoice(*(np.stack(column) for column in zip(*rows, strict=True)))
 
@@ -279,7 +279,7 @@ def select_beams_multiuser(
     theirs, until nobody's change raises the sum (a local optimum: with one user the best pair).
 
     Args:
-        sources: A sequence of spectra or paths, one a user, or paths of several receivers.
+        sources: A sequence of spectra or paths, one a user, or those of several receivers.
         tx_array, rx_array: as for :func:`select_beams`; all users have the same array.
         noise: Noise power of a user over the total transmitted power [linear].
 
@@ -383,6 +383,9 @@ def rays_of(source: Source, tx: Codebook) -> Iterator[Rays]:
             if directed and not np.isfinite(departure).all():
                 raise ValueError("source: got paths without a departure angle, expected one with a tx_array")
             yield departure, kept.arrival, kept.power
+    elif isinstance(source, Spectrum) and source.batched:
+        for k in range(len(source.path_gain)):
+            yield from rays_of(source[k], tx)
     elif isinstance(source, Spectrum):
         power = np.asarray(source.path_gain, np.float64)
         positive = power > 0

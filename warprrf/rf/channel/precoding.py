@@ -42,7 +42,7 @@ def transmit_covariance(
     It takes 16 U N^2 bytes: 4 MB for four users of 256 elements.
 
     Args:
-        sources: A sequence of spectra or paths, one a user, or paths of several receivers; a single one is one user.
+        sources: A sequence of spectra or paths, one a user, or those of several receivers; a single one is one user.
         tx_array: Transmitting :class:`PlanarArray`, or a :class:`Codebook`, whose array counts.
         rx_array: The users' array or codebook; a single isotropic element by default.
         rx: Index of the beam that each user receives with, shape ``(U,)``; needed where there are several.
