@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import re
 import resource
 import shutil
 import time
@@ -174,6 +175,23 @@ def test_the_map_lies_on_the_floor_with_its_scale(viewer):
     low, high = viewer.subject.mesh.bounds
     np.testing.assert_allclose(handle.position[:2], 0.5 * (low + high)[:2], atol=0.5)
     assert "total path gain [dB] at " in viewer._survey.legend.content
+
+
+def test_a_map_with_places_that_nothing_reaches_has_its_scale(viewer, monkeypatch):
+    dark = dataclasses.replace(
+        viewer.subject.field,
+        effects=wr.Effects(mirrors=0, scatterings=0, transmissions=0, diffractions=0, residual=False),
+    )
+    monkeypatch.setattr(viewer, "_fields", Cache(1))
+    monkeypatch.setattr(viewer.subject, "field", dark)
+    viewer._survey.height.value = 1.5
+    gain = dark.radio_map(1.5, 0.5).total_path_gain
+    assert (gain == 0.0).any() and (gain > 0.0).any()
+    _survey(viewer, "map")
+    low = 10.0 * np.log10(np.percentile(gain[gain > 0.0], 2.0, method="lower"))
+    high = 10.0 * np.log10(np.percentile(gain[gain > 0.0], 2.0, method="higher"))
+    shown = re.search(r"<span>(\S+) </span>", viewer._survey.legend.content)
+    assert low - 0.05 <= float(shown[1]) <= high + 0.05
 
 
 def test_places_to_measure_next_are_those_that_the_field_suggests(viewer):

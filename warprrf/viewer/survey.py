@@ -138,7 +138,8 @@ class Survey:
         )
         quantity = next(name for name, text in QUANTITIES.items() if text == self._quantity.value)
         value = found.plot_values(quantity)
-        low, high = (float(np.nanpercentile(value, q)) for q in (2, 98))
+        known = value[np.isfinite(value)]
+        low, high = np.percentile(known, (2.0, 98.0)) if len(known) else (0.0, 1.0)
         picture = pictures.coloured(value, low, high)[::-1]
         seen = np.where(np.isnan(value), 0, 255).astype(np.uint8)[::-1]
         width, height = found.cell_m * value.shape[1], found.cell_m * value.shape[0]
