@@ -141,11 +141,9 @@ def read_measured(
             files.append((word, []))
     parser = Parser(prog=" ".join(sys.argv[1:2]), add_help=False, allow_abbrev=False)
     add_measured_options(parser)
-    unused = [name for name in vars(parser.parse_args([])) if getattr(args, name) is not None]
-    unused += ["train"] if getattr(args, "train", None) is not None else []
     kinds = [_kind(existing(path), others) for path, _ in files]
-    unused = [name for name in unused if not any(name in TAKEN[kind] for kind in kinds)]
-    refuse(args, unused, "no file is given that it could be of")
+    names = {*vars(parser.parse_args([])), "train"}.difference(*(TAKEN[kind] for kind in kinds))
+    refuse(args, sorted(names), "no file is given that it could be of")
     if args.frequency is None:
         args.frequency = frequency_hz
     own = [parser.parse_args(settings) for _, settings in files]
@@ -291,7 +289,7 @@ def read_scale(words: Sequence[str]) -> float | tuple[str, str, float]:
 def refuse(args: argparse.Namespace, flags: Sequence[str], reason: str) -> None:
     """Raise for options among ``flags`` that were given and would change nothing."""
     for flag in flags:
-        if getattr(args, flag) is not None:
+        if getattr(args, flag, None) is not None:
             raise ValueError(f"--{flag.replace('_', '-')}: got {getattr(args, flag)!r}, but {reason}")
 
 

@@ -106,8 +106,7 @@ def _array_spectrum(field: Any, place: np.ndarray, args: argparse.Namespace) -> 
 
 def _write_spectrum(spectrum: wr.Spectrum, path: Path) -> None:
     if path.suffix.lower() == ".npz":
-        arrays = {"path_gain": spectrum.path_gain, "delay_s": spectrum.delay_s, "aod": spectrum.aod}
-        write_arrays(path, {name: array for name, array in arrays.items() if array is not None})
+        write_arrays(path, {n: array for n, array in vars(spectrum).items() if isinstance(array, np.ndarray)})
     elif path.suffix.lower() == ".png":
         figure = require("matplotlib.figure", extra="plots").Figure(figsize=(8.0, 4.2), layout="constrained")
         spectrum.plot(ax=figure.add_subplot())

@@ -245,9 +245,7 @@ def select_beams(
         gains = _pair_gains(rays, tx, rx)
         best = np.argsort(-gains, axis=None, kind="stable")[:count]
         rows.append((best % len(tx), best // len(tx), gains.ravel()[best]))
-    if not source.batched:
-        return BeamChoice(*rows[0])
-    return BeamChoice(*(np.stack(column) for column in zip(*rows, strict=True)))
+    return BeamChoice(*(np.stack(c) if source.batched else c[0] for c in zip(*rows, strict=True)))
 
 
 @checked

@@ -338,8 +338,6 @@ class RadioField(ABC):
             ValueError: as for :meth:`spectra`, for a ``max_paths`` below 1, and for a store without one.
         """
         ends = self.check_positions(receivers, transmitter)
-        if ends.single and store is None and client is None:  # in a hurry
-            return self._trace_paths(ends.receivers[0], ends.transmitters[0], max_paths)
         batch, work = Batch("paths", ends, store, client, progress), partial(_paths, self, max_paths)
         if store is None:
             found: dict[int, Paths] = {}

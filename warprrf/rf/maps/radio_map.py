@@ -302,10 +302,7 @@ def _places(x: np.ndarray, y: np.ndarray, height: float, ground: np.ndarray | No
 
 def _centres(mesh: Mesh, cell: float, bounds: Any) -> tuple[np.ndarray, np.ndarray]:
     """Centres of the cells along x and y [m]."""
-    if bounds is None:
-        low, high = mesh.bounds[0][:2], mesh.bounds[1][:2]
-    else:
-        low, high = check_array("bounds", bounds, (4,)).reshape(2, 2)
+    low, high = mesh.bounds[:, :2] if bounds is None else check_array("bounds", bounds, (4,)).reshape(2, 2)
     if not (low < high).all():
         raise ValueError(f"bounds: got {bounds!r}, expected lowest x and y, then higher x and y")
     counts = np.maximum(np.ceil((high - low) / cell - 1e-6), 1.0)
