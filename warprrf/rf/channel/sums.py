@@ -270,7 +270,7 @@ def spherical_lengths(paths: PathArrays, sending: np.ndarray, receiving: np.ndar
     the way as it does: right to first order in the elements' places, but for the waves' bend across the edge."""
     tx, rx, bounces = _ends(paths)
     points = points_along(tx, paths.vertices, rx)
-    last, length = points[np.arange(len(points)), bounces], length_along(points, bounces)
+    last, length = points[np.arange(len(points)), bounces], length_along(points)
     toward = (last - rx) / np.linalg.norm(last - rx, axis=1, keepdims=True)
     # The image lies ``length`` away along the arrival; its array is mirrored at every turn of the way.
     mirrored = np.einsum("pij,nj->npi", _mirrorings(points, paths.interactions), sending)
@@ -302,7 +302,7 @@ def _ends(paths: PathArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _mirrorings(points: np.ndarray, interactions: np.ndarray) -> np.ndarray:
     """What mirrors and edges do to directions, shape ``(P, 3, 3)``: a product of reflections; slabs do nothing."""
     legs = np.diff(points, axis=1)
-    legs = legs / np.linalg.norm(legs, axis=2, keepdims=True)
+    legs = legs / np.maximum(np.linalg.norm(legs, axis=2, keepdims=True), 1e-300)
     turned = np.broadcast_to(np.eye(3), (len(points), 3, 3))
     turns = np.isin(interactions, (MIRROR, EDGE))
     for k in range(turns.shape[1]):
