@@ -108,7 +108,7 @@ class PathArrays:
 
     @property
     def length_m(self) -> np.ndarray:
-        """Unfolded length [m]; NaN where padded."""
+        """Unfolded length, with what slabs delay [m]; NaN where padded."""
         return self.tau * SPEED_OF_LIGHT
 
     @property
