@@ -116,6 +116,8 @@ def test_spectrum_is_taken_as_powers_at_its_pixels():
     assert len(wr.channel.select_beams_multiuser(two, tx, rx, noise=1e-9).tx) == 2
     alone = wr.channel.select_beams(wr.Spectrum(path_gain=gain), rx_array=rx)
     assert alone.rx[0] == best and alone.tx[0] == 0
+    for one in (wr.Antenna("isotropic"), wr.PlanarArray(1, 1, pattern=wr.Antenna("isotropic"))):
+        assert wr.channel.select_beams(wr.Spectrum(path_gain=gain), one, rx).gain == alone.gain
     with pytest.raises(ValueError, match="source: got a spectrum without aod"):
         wr.channel.select_beams(wr.Spectrum(path_gain=gain), tx, rx)
 
