@@ -19,6 +19,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 
 import warprrf as wr
+from warprrf import cli
 from warprrf.cache import Cache
 from warprrf.viewer import answers
 
@@ -108,6 +109,27 @@ def test_moving_the_receiver_answers_for_where_it_is(viewer):
     found = viewer.wait()
     np.testing.assert_array_equal(found.receiver, RECEIVER)
     assert "path gain" in viewer.message and found.spectrum.total_path_gain > 0
+
+
+def test_where_nothing_arrives_no_gain_is_made_up(tmp_path, capsys):
+    dark = dataclasses.replace(
+        make.bistatic(),
+        effects=wr.Effects(mirrors=0, scatterings=0, transmissions=0, diffractions=0, residual=False),
+    )
+    place = next(p for p in make.places(40) if dark.links(p).total_path_gain == 0.0)
+    asked = answers.Asked(dark.frequency_hz, 0, 0, 0)
+    assert answers.answer(dark, place, [dark.transmitter], asked).total_db == -np.inf
+    dark.save(tmp_path / "dark.safetensors")
+    words = [
+        "render",
+        str(tmp_path / "dark.safetensors"),
+        "--receiver",
+        *map(str, place),
+        "-o",
+        str(tmp_path / "s.npz"),
+    ]
+    assert cli.main([*words, "--json"]) == 0
+    assert '"total_path_gain_db": null' in capsys.readouterr().out  # as those of a map
 
 
 def test_what_is_shown_is_saved_as_one_page_and_as_a_picture(viewer, tmp_path):

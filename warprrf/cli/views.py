@@ -24,6 +24,7 @@ from warprrf.cli.inputs import (
 from warprrf.cli.output import Output, aligned
 from warprrf.device import require
 from warprrf.files import write_arrays, write_atomically
+from warprrf.rf.spectra.spectrum import pixel_directions, to_db
 
 
 def add_render(add: Add) -> None:
@@ -75,7 +76,7 @@ def _render(args: argparse.Namespace, out: Output) -> None:
             spectrum = _array_spectrum(field, place, args)
             name, gain = "strongest direction", spectrum.path_gain.max()
         _write_spectrum(spectrum, Path(args.out))
-        db = 10.0 * np.log10(max(gain, 1e-300))
+        db = float(to_db(gain))
         text = f"{args.out}: {name} {db:.2f} dB at {' '.join(f'{x:g}' for x in args.receiver)}"
         out.result(text, files=[args.out], **{f"{name.replace(' ', '_')}_db": db})
         return
@@ -95,8 +96,6 @@ def _render(args: argparse.Namespace, out: Output) -> None:
 def _array_spectrum(field: Any, place: np.ndarray, args: argparse.Namespace) -> wr.Spectrum:
     if field.model != "bistatic":
         raise ValueError(f"--array: got model {field.model}, which knows no phases; expected bistatic")
-    from warprrf.rf.spectra.spectrum import pixel_directions
-
     azimuth, elevation = np.radians(args.facing)
     rows, columns = args.array
     array = wr.PlanarArray(rows, columns, orientation=(azimuth, -elevation, 0.0))

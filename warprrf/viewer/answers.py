@@ -20,7 +20,7 @@ from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import angle_deg, psnr, strongest_direction, unit_image
 from warprrf.rf.spectra.readings import Readings, fading_db, path_weights
-from warprrf.rf.spectra.spectrum import Spectrum, directions_from_angles
+from warprrf.rf.spectra.spectrum import Spectrum, directions_from_angles, to_db
 
 Source = RadioField | Scene | Mesh
 AT_M = 0.005
@@ -50,12 +50,9 @@ class Answer:
 
     @property
     def total_db(self) -> float:
-        """Path gain of everything that arrives [dB]."""
-        if self.spectrum is not None:
-            total = self.spectrum.total_path_gain
-        else:
-            total = sum(float(p.power.sum()) for p in self.paths)
-        return 10.0 * float(np.log10(max(total, 1e-300)))
+        """Path gain of everything that arrives [dB]; minus infinity of nothing."""
+        each = [p.power.sum() for p in self.paths] if self.spectrum is None else self.spectrum.path_gain
+        return float(to_db(np.sum(each, dtype=np.float64)))
 
 
 @dataclass(frozen=True)
