@@ -273,7 +273,7 @@ def test_the_carrier_has_one_name():
     assert {word for word in words if re.search("carrier|freq|hertz|ghz", word)} == {"--frequency"}
 
 
-def test_sample_render_and_suggest_say_what_the_library_says(tmp_path):
+def test_sample_render_and_suggest_say_what_the_library_says(tmp_path, capsys):
     run("sample {scene} -o {tmp}/r.csv -n 5 --height 1 1.5 --clearance 0.5 --seed 3", tmp_path)
     expected = wr.sample_receivers(wr.Scene.load(SCENE), 5, z=(1, 1.5), clearance=0.5, seed=3)
     np.testing.assert_allclose(read_receivers([f"{tmp_path}/r.csv"]), expected, rtol=1e-11)
@@ -288,6 +288,7 @@ def test_sample_render_and_suggest_say_what_the_library_says(tmp_path):
     array = wr.PlanarArray(4, 2, orientation=(np.pi / 6, -np.pi / 3, 0.0))
     heard = field.array_spectrum(place, array, pixel_directions(field.shape))
     np.testing.assert_allclose(np.load(tmp_path / "s.npz")["path_gain"], heard, rtol=1e-5)
+    assert f"strongest direction {10 * np.log10(heard.max()):.2f} dB" in capsys.readouterr().out
     turned = np.array([[90.0, 0.0], [-90.0, 0.0], [180.0, 20.0]])
     np.savetxt(tmp_path / "c.csv", np.column_stack([np.tile(place, (3, 1)), turned]), delimiter=",")
     run("suggest {tmp}/f.safetensors {tmp}/c.csv -n 2 --receive-pattern 10 -o {tmp}/next.csv", tmp_path)
@@ -295,6 +296,15 @@ def test_sample_render_and_suggest_say_what_the_library_says(tmp_path):
     best = field.suggest(np.tile(place, (3, 1)), 2, arrival=arrival, receive_pattern=wr.horn(np.radians(10)))
     chosen = np.loadtxt((tmp_path / "next.csv").read_text().splitlines()[1:], delimiter=",")
     np.testing.assert_allclose(chosen[:, 3:], turned[best])
+
+
+def test_locate_takes_spectra_which_name_their_carrier(tmp_path, capsys):
+    field, ds = make.bistatic(), make.spectra()
+    field.save(tmp_path / "f.safetensors")
+    ds.save(tmp_path / "s.nc")
+    run("locate {tmp}/f.safetensors {tmp}/s.nc --receiver 4 -o {tmp}/at.json", tmp_path)
+    said = json.loads((tmp_path / "at.json").read_text())["position"]
+    np.testing.assert_allclose(said, field.locate(ds.subset([4])).position, atol=1e-6)
 
 
 def test_help_of_fit_names_every_option_of_its_models(capsys):
@@ -316,6 +326,8 @@ def test_the_walk_through_is_what_the_library_gives_for_the_same_files(tmp_path)
         "map {tmp}/f.safetensors -o {tmp}/m.nc --cell 1.5 --bounds 0.2 0.2 4.7 3.2 --power-dbm 7",
     ):
         run(words, tmp_path)
+    for words in ("evaluate {tmp}/f.safetensors {tmp}/s.nc", "map {tmp}/f.safetensors -o {tmp}/n.nc"):
+        assert cli.main([*words.format(tmp=tmp_path).split(), "--device", "cuda:99"]) == 2
     figures = json.loads((tmp_path / "figures.json").read_text())
     assert set(figures) == {"bistatic", "nearest", "idw", "constant", "mean"}
     assert {row["receivers_fitted_on"] for row in figures.values()} == {0}

@@ -17,6 +17,7 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.paths.trace import trace_paths
 from warprrf.rf.relevance.model import full_field
 from warprrf.rf.simulate import simulate
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -99,6 +100,27 @@ def test_off_is_off_and_files_say_which(scene, dry, humid, tmp_path):
     np.testing.assert_array_equal(again.path_gain[::-1], on.path_gain)
     on.save(tmp_path / "on.nc")
     assert SpectrumDataset.load(tmp_path / "on.nc").air == thick == on.subset([1, 0]).air
+
+
+def test_a_slab_delays_waves_but_is_no_longer_way_through_air():
+    """A pane of 5 cm makes the path 6 cm longer in time, not in space; nor do paths given the air later, or other frequencies."""
+    pane = np.array([[0.0, -2.0, -2.0], [0.0, 2.0, -2.0], [0.0, 2.0, 2.0], [0.0, -2.0, 2.0]])
+    scene = RadioScene(
+        Mesh(pane, [[0, 1, 2], [0, 2, 3]]), np.zeros(2, int), [SlabMaterial("pane", 5.0, 0.0, 0.05)]
+    )
+    ends = {
+        "transmitter": [-1.0, 0.1, 0.2],
+        "receivers": [[1.5, -0.2, 0.0], [2.0, 0.0, 0.1]],
+        "frequency_hz": F,
+    }
+    off, on = (trace_paths(scene, **ends, mirror_order=0, transmissions=1, gas=gas) for gas in (False, True))
+    length_m = np.linalg.norm(np.subtract(ends["receivers"], ends["transmitter"]), axis=1, keepdims=True)
+    assert (off.kind == "slab").all() and (off.length_m > length_m + 0.05).all()
+    np.testing.assert_allclose(on.power, off.power * passed(length_m), rtol=1e-9)
+    np.testing.assert_allclose(off[0].with_gas(True).gain, on[0].gain, rtol=1e-9)
+    other = np.abs(on.cfr([F - 1e9]) / off.cfr([F - 1e9])).reshape(2, 1) ** 2
+    loss = AIR.attenuation_db_per_m(F - 1e9) * length_m
+    np.testing.assert_allclose(-10.0 * np.log10(other), loss, rtol=1e-9)
 
 
 def test_sionnas_paths_lose_by_their_delay(tmp_path):

@@ -7,6 +7,7 @@ import pytest
 from golden import make
 
 import warprrf as wr
+from warprrf.rf.em.absorption import Air
 from warprrf.rf.fields.bistatic.suggest import OWN, SHARED
 from warprrf.viewer import answers, room
 from warprrf.viewer.subject import Subject
@@ -107,6 +108,10 @@ def test_readings_made_of_a_fields_own_paths_have_no_error_but_the_one_put_in(fi
     np.testing.assert_allclose(answers.reading_errors(field, readings), wrong, atol=1e-6)
     unknown = dataclasses.replace(readings, chain=["a", "a"])
     np.testing.assert_allclose(answers.reading_errors(field, unknown), [2.5, -2.5], atol=1e-6)
+    wet = field.with_gas(Air(water_vapour_g_m3=30.0))
+    power = np.array([wet.paths(place).power.sum() for place in places])
+    damp = dataclasses.replace(readings, power=power, air=wet.air)
+    np.testing.assert_allclose(answers.reading_errors(field, damp), 0.0, atol=1e-6)
     quiet = wr.Readings(field.transmitter, places, power, field.frequency_hz, [1e-20, 10 * power[1]])
     assert np.isnan(answers.reading_errors(field, quiet)).tolist() == [False, True]
 

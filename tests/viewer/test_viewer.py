@@ -1,6 +1,8 @@
 """The page in a real browser: it opens, what is dragged is answered, and nothing grows."""
 
+import dataclasses
 import io
+import re
 import resource
 import shutil
 import time
@@ -17,6 +19,8 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 
 import warprrf as wr
+from warprrf import cli
+from warprrf.cache import Cache
 from warprrf.viewer import answers
 
 CHROMIUM = (shutil.which("chromium"), shutil.which("chromedriver"))
@@ -107,6 +111,27 @@ def test_moving_the_receiver_answers_for_where_it_is(viewer):
     assert "path gain" in viewer.message and found.spectrum.total_path_gain > 0
 
 
+def test_where_nothing_arrives_no_gain_is_made_up(tmp_path, capsys):
+    dark = dataclasses.replace(
+        make.bistatic(),
+        effects=wr.Effects(mirrors=0, scatterings=0, transmissions=0, diffractions=0, residual=False),
+    )
+    place = next(p for p in make.places(40) if dark.links(p).total_path_gain == 0.0)
+    asked = answers.Asked(dark.frequency_hz, 0, 0, 0)
+    assert answers.answer(dark, place, [dark.transmitter], asked).total_db == -np.inf
+    dark.save(tmp_path / "dark.safetensors")
+    words = [
+        "render",
+        str(tmp_path / "dark.safetensors"),
+        "--receiver",
+        *map(str, place),
+        "-o",
+        str(tmp_path / "s.npz"),
+    ]
+    assert cli.main([*words, "--json"]) == 0
+    assert '"total_path_gain_db": null' in capsys.readouterr().out  # as those of a map
+
+
 def test_what_is_shown_is_saved_as_one_page_and_as_a_picture(viewer, tmp_path):
     viewer.save(tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text()
@@ -143,6 +168,24 @@ def test_at_another_carrier_fields_are_carried_over_and_not_compared_with_what_w
     assert viewer.wait().frequency_hz == make.CARRIER_HZ and "carried over" not in viewer.message
 
 
+def test_what_was_measured_under_another_transmitter_is_not_compared_with(viewer, monkeypatch):
+    ds, field = viewer.subject.spectra, viewer.subject.field
+    viewer.receiver, other = ds.receivers[0], ds.transmitter + [0.4, 0.9, -0.3]
+    viewer._transmitters[0].position = other
+    viewer.refresh()
+    viewer.wait()
+    assert [image[0] for image in viewer._channel.images] == ["spectrum"]
+    assert "one transmitter at 1.10, 1.30, 2.40 m" in viewer._channel.spectra.content
+    viewer._transmitters[0].position = ds.transmitter
+    viewer.refresh()
+    viewer.wait()
+    assert [image[0] for image in viewer._channel.images][1:] == ["truth", "spectrum less truth"]
+    wanted = [float(button.label.split()[0]) for button in _survey(viewer, "errors").listed]
+    monkeypatch.setattr(viewer, "_fields", Cache(1))
+    monkeypatch.setattr(viewer.subject, "field", dataclasses.replace(field, transmitter=other))
+    assert [float(button.label.split()[0]) for button in _survey(viewer, "errors").listed] == wanted
+
+
 def test_the_map_lies_on_the_floor_with_its_scale(viewer):
     viewer._survey.height.value = 1000.0
     _survey(viewer, "map")
@@ -154,6 +197,23 @@ def test_the_map_lies_on_the_floor_with_its_scale(viewer):
     low, high = viewer.subject.mesh.bounds
     np.testing.assert_allclose(handle.position[:2], 0.5 * (low + high)[:2], atol=0.5)
     assert "total path gain [dB] at " in viewer._survey.legend.content
+
+
+def test_a_map_with_places_that_nothing_reaches_has_its_scale(viewer, monkeypatch):
+    dark = dataclasses.replace(
+        viewer.subject.field,
+        effects=wr.Effects(mirrors=0, scatterings=0, transmissions=0, diffractions=0, residual=False),
+    )
+    monkeypatch.setattr(viewer, "_fields", Cache(1))
+    monkeypatch.setattr(viewer.subject, "field", dark)
+    viewer._survey.height.value = 1.5
+    gain = dark.radio_map(1.5, 0.5).total_path_gain
+    assert (gain == 0.0).any() and (gain > 0.0).any()
+    _survey(viewer, "map")
+    low = 10.0 * np.log10(np.percentile(gain[gain > 0.0], 2.0, method="lower"))
+    high = 10.0 * np.log10(np.percentile(gain[gain > 0.0], 2.0, method="higher"))
+    shown = re.search(r"<span>(\S+) </span>", viewer._survey.legend.content)
+    assert low - 0.05 <= float(shown[1]) <= high + 0.05
 
 
 def test_places_to_measure_next_are_those_that_the_field_suggests(viewer):

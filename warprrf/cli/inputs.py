@@ -127,9 +127,12 @@ TAKEN = {
 """Options by the kind of file that they say something of, and what the library calls those that are passed on."""
 
 
-def read_measured(words: Sequence[str], args: argparse.Namespace, others: bool = False) -> list[Any]:
+def read_measured(
+    words: Sequence[str], args: argparse.Namespace, others: bool = False, frequency_hz: float | None = None
+) -> list[Any]:
     """What files hold: spectra (NetCDF, or NPZ of the arguments of ``from_spectra``), readings (CSV), spectra of arrays
-    (a folder as NeRF2 has it); behind each file its own settings. With ``others`` the names of other files stay."""
+    (a folder as NeRF2 has it); behind each file its own settings. With ``others`` the names of other files stay.
+    ``frequency_hz`` is the carrier where none is given."""
     files: list[tuple[str, list[str]]] = []
     for word in words:
         if "=" in word and files and not Path(word).exists():
@@ -138,11 +141,11 @@ def read_measured(words: Sequence[str], args: argparse.Namespace, others: bool =
             files.append((word, []))
     parser = Parser(prog=" ".join(sys.argv[1:2]), add_help=False, allow_abbrev=False)
     add_measured_options(parser)
-    unused = [name for name in vars(parser.parse_args([])) if getattr(args, name) is not None]
-    unused += ["train"] if getattr(args, "train", None) is not None else []
     kinds = [_kind(existing(path), others) for path, _ in files]
-    unused = [name for name in unused if not any(name in TAKEN[kind] for kind in kinds)]
-    refuse(args, unused, "no file is given that it could be of")
+    names = {*vars(parser.parse_args([])), "train"}.difference(*(TAKEN[kind] for kind in kinds))
+    refuse(args, sorted(names), "no file is given that it could be of")
+    if args.frequency is None:
+        args.frequency = frequency_hz
     own = [parser.parse_args(settings) for _, settings in files]
     found = []
     for kind, (path, _), said in zip(kinds, files, own, strict=True):
@@ -286,7 +289,7 @@ def read_scale(words: Sequence[str]) -> float | tuple[str, str, float]:
 def refuse(args: argparse.Namespace, flags: Sequence[str], reason: str) -> None:
     """Raise for options among ``flags`` that were given and would change nothing."""
     for flag in flags:
-        if getattr(args, flag) is not None:
+        if getattr(args, flag, None) is not None:
             raise ValueError(f"--{flag.replace('_', '-')}: got {getattr(args, flag)!r}, but {reason}")
 
 

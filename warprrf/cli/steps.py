@@ -446,10 +446,8 @@ def _locate(args: argparse.Namespace, out: Output) -> None:
       warprrf locate field.safetensors horn.csv --noise-floor-db -150 --receive-pattern 10 --azimuth unknown
     """
     field = wr.RadioField.load(existing(args.field), device=args.device)
-    if args.frequency is None:
-        args.frequency = field.frequency_hz
     measured = []
-    for one in read_measured(args.measurements, args, others=True):
+    for one in read_measured(args.measurements, args, others=True, frequency_hz=field.frequency_hz):
         if isinstance(one, Path):
             ds = load_spectra(one)
             if args.receiver is None and len(ds) != 1:
@@ -494,7 +492,7 @@ def _evaluate(args: argparse.Namespace, out: Output) -> None:
     """
     from warprrf.rf.spectra import lookups, metrics
 
-    field = wr.RadioField.load(existing(args.field))
+    field = wr.RadioField.load(existing(args.field), device=args.device)
     dataset = load_spectra(args.spectra)
     there = int(np.count_nonzero(dataset.role == "train"))
     count = min(max(len(field.fitted_on), 1), there)
@@ -556,8 +554,7 @@ def _relevance(args: argparse.Namespace, out: Output) -> None:
     receivers = None if args.receivers is None else read_receivers(args.receivers)
     if args.spectra is not None:
         dataset = load_spectra(args.spectra)
-        measured = {"transmitter": dataset.transmitter, "frequency_hz": float(dataset.frequency_hz)}
-        given = {name: measured[name] if value is None else value for name, value in given.items()}
+        given = {name: getattr(dataset, name) if value is None else value for name, value in given.items()}
         receivers = dataset.receivers if receivers is None else receivers
     if receivers is None:
         raise ValueError("--receivers: none given, expected positions, or --spectra with some")

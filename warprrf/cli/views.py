@@ -24,6 +24,7 @@ from warprrf.cli.inputs import (
 from warprrf.cli.output import Output, aligned
 from warprrf.device import require
 from warprrf.files import write_arrays, write_atomically
+from warprrf.rf.spectra.spectrum import pixel_directions, to_db
 
 
 def add_render(add: Add) -> None:
@@ -70,12 +71,14 @@ def _render(args: argparse.Namespace, out: Output) -> None:
         field, place = load_field(source, args), np.array(args.receiver, dtype=np.float64)
         if args.array is None:
             spectrum = field.spectrum(place, args.transmitter)
+            name, gain = "total path gain", spectrum.total_path_gain
         else:
             spectrum = _array_spectrum(field, place, args)
+            name, gain = "strongest direction", spectrum.path_gain.max()
         _write_spectrum(spectrum, Path(args.out))
-        total = 10.0 * np.log10(max(float(np.sum(spectrum.path_gain, dtype=np.float64)), 1e-300))
-        text = f"{args.out}: total path gain {total:.2f} dB at {' '.join(f'{x:g}' for x in args.receiver)}"
-        out.result(text, files=[args.out], total_path_gain_db=total)
+        db = float(to_db(gain))
+        text = f"{args.out}: {name} {db:.2f} dB at {' '.join(f'{x:g}' for x in args.receiver)}"
+        out.result(text, files=[args.out], **{f"{name.replace(' ', '_')}_db": db})
         return
     if args.position is None or args.look_at is None:
         raise ValueError("--position and --look-at: both are needed to draw Gaussians, three numbers each")
@@ -93,8 +96,6 @@ def _render(args: argparse.Namespace, out: Output) -> None:
 def _array_spectrum(field: Any, place: np.ndarray, args: argparse.Namespace) -> wr.Spectrum:
     if field.model != "bistatic":
         raise ValueError(f"--array: got model {field.model}, which knows no phases; expected bistatic")
-    from warprrf.rf.spectra.spectrum import pixel_directions
-
     azimuth, elevation = np.radians(args.facing)
     rows, columns = args.array
     array = wr.PlanarArray(rows, columns, orientation=(azimuth, -elevation, 0.0))
@@ -104,8 +105,7 @@ def _array_spectrum(field: Any, place: np.ndarray, args: argparse.Namespace) -> 
 
 def _write_spectrum(spectrum: wr.Spectrum, path: Path) -> None:
     if path.suffix.lower() == ".npz":
-        arrays = {"path_gain": spectrum.path_gain, "delay_s": spectrum.delay_s, "aod": spectrum.aod}
-        write_arrays(path, {name: array for name, array in arrays.items() if array is not None})
+        write_arrays(path, {n: array for n, array in vars(spectrum).items() if isinstance(array, np.ndarray)})
     elif path.suffix.lower() == ".png":
         figure = require("matplotlib.figure", extra="plots").Figure(figsize=(8.0, 4.2), layout="constrained")
         spectrum.plot(ax=figure.add_subplot())
@@ -281,14 +281,16 @@ def _twin(args: argparse.Namespace, out: Output) -> None:
                 f"{group.lobe_error_db:.2f}",
             ]
         )
-    errors = {name: getattr(twin, f"{name}_error_db") for name in ("scattering", "mirror", "lobe")}
+    figures = {
+        name: getattr(twin, name) for name in ("scattering_error_db", "mirror_error_db", "lobe_error_db")
+    }
+    scattered, mirrored, lobes = figures.values()
     lines = [
         aligned(rows),
         f"\n{twin.xml}: {len(twin.groups)} materials; rms errors of the projection over area: scattered power "
-        f"{errors['scattering']:.2f} dB, mirrored power {errors['mirror']:.2f} dB, lobes {errors['lobe']:.2f} dB",
+        f"{scattered:.2f} dB, mirrored power {mirrored:.2f} dB, lobes {lobes:.2f} dB",
         *(f"left out: {line}" for line in twin.left_out),
     ]
-    figures = {f"{name}_error_db": value for name, value in errors.items()}
     out.result(
         "\n".join(lines), files=[args.out], materials=len(twin.groups), **figures, left_out=twin.left_out
     )

@@ -317,7 +317,7 @@ def together(paths: Paths) -> Paths:
     jones, gain, kept = paths.jones.copy(), paths.gain.copy(), np.full(len(paths.gain), True)
     mirrors = (paths.interactions == MIRROR).sum(axis=1)
     # In space: at the boundary fields are continuous however late a slab makes one of them.
-    length_m = length_along(points_along(tx, paths.vertices, rx), (paths.interactions > 0).sum(axis=1))
+    length_m = length_along(points_along(tx, paths.vertices, rx))
     quadrature = 1.125  # wavelengths of detour at which the two are, so that nothing jumps
     for k in np.flatnonzero(paths.kind == "edge"):
         near = (paths.kind != "edge") & (mirrors == mirrors[k])

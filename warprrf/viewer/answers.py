@@ -20,7 +20,7 @@ from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import angle_deg, psnr, strongest_direction, unit_image
 from warprrf.rf.spectra.readings import Readings, fading_db, path_weights
-from warprrf.rf.spectra.spectrum import Spectrum, directions_from_angles
+from warprrf.rf.spectra.spectrum import Spectrum, directions_from_angles, to_db
 
 Source = RadioField | Scene | Mesh
 AT_M = 0.005
@@ -50,12 +50,9 @@ class Answer:
 
     @property
     def total_db(self) -> float:
-        """Path gain of everything that arrives [dB]."""
-        if self.spectrum is not None:
-            total = self.spectrum.total_path_gain
-        else:
-            total = sum(float(p.power.sum()) for p in self.paths)
-        return 10.0 * float(np.log10(max(total, 1e-300)))
+        """Path gain of everything that arrives [dB]; minus infinity of nothing."""
+        each = [p.power.sum() for p in self.paths] if self.spectrum is None else self.spectrum.path_gain
+        return float(to_db(np.sum(each, dtype=np.float64)))
 
 
 @dataclass(frozen=True)
@@ -190,14 +187,14 @@ def nearest_path(each: Sequence[np.ndarray], origin: np.ndarray, direction: np.n
 def reading_errors(field: RadioField, readings: Readings, progress: Progress | None = None) -> np.ndarray:
     """What ``field`` predicts over what was read [dB], shape ``(N,)``; NaN where nothing was, or both are below the floor.
 
-    The gain of a measuring chain is not known: each chain's median error is taken off.
+    The gain of a measuring chain is not known: each chain's median error is taken off. The air is that of the readings.
 
     Raises:
         ValueError: for azimuths or delays that count from an unknown zero, or a place that ``field`` does not hold at.
     """
     if not readings.zero_known:
         raise ValueError("readings: their azimuths or delays count from an unknown zero, expected known ones")
-    power, steady = np.empty((2, len(readings)))
+    field, (power, steady) = field.with_gas(readings.air), np.empty((2, len(readings)))
     ends = np.column_stack([readings.transmitters, readings.receivers])
     links, own = np.unique(ends, axis=0, return_inverse=True)
     for k, link in enumerate(links):

@@ -138,7 +138,8 @@ class Survey:
         )
         quantity = next(name for name, text in QUANTITIES.items() if text == self._quantity.value)
         value = found.plot_values(quantity)
-        low, high = (float(np.nanpercentile(value, q)) for q in (2, 98))
+        known = value[np.isfinite(value)]
+        low, high = np.percentile(known, (2.0, 98.0)) if len(known) else (0.0, 1.0)
         picture = pictures.coloured(value, low, high)[::-1]
         seen = np.where(np.isnan(value), 0, 255).astype(np.uint8)[::-1]
         width, height = found.cell_m * value.shape[1], found.cell_m * value.shape[0]
@@ -152,7 +153,8 @@ class Survey:
             position=(float(found.x.mean()), float(found.y.mean()), floor), wxyz=(0.0, 1.0, 0.0, 0.0),
             visible="map" not in self._page.hidden,
         )  # fmt: skip
-        title = f"{self._quantity.value} at {found.height_m:g} m"
+        several = ", of the first transmitter" if len(self._transmitters()) > 1 else ""
+        title = f"{self._quantity.value} at {found.height_m:g} m{several}"
         self._explain(title, pictures.colour_bar(low, high, ""), "map")
 
     def candidates(self, field: BistaticField) -> np.ndarray:
@@ -201,7 +203,8 @@ class Survey:
 
     def _spectrum_errors(self, truth: SpectrumDataset, field: RadioField, progress: Progress) -> None:
         _check_carrier(field, truth)
-        found = evaluate(truth, lambda at: field.spectrum(at), progress=progress)  # fitted ones are marked
+        predict = partial(field.spectrum, transmitter=truth.transmitter)
+        found = evaluate(truth, predict, progress=progress)  # fitted ones are marked
         psnr, fitted = found["per_receiver"]["psnr_db"], field.was_fitted_on(truth)
         worst = np.argsort(psnr)[:WORST]
         labels = [f"{psnr[k]:.1f} dB{' (fitted)' if fitted[k] else ''}" for k in worst]

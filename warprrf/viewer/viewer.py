@@ -19,9 +19,8 @@ from warprrf.checks import check_array
 from warprrf.files import write_bytes
 from warprrf.viewer import answers, pictures
 from warprrf.viewer.answers import Answer
-from warprrf.viewer.channel import Channel
+from warprrf.viewer.channel import Channel, Rays
 from warprrf.viewer.page import Page
-from warprrf.viewer.rays import Rays
 from warprrf.viewer.room import Room
 from warprrf.viewer.subject import Subject
 from warprrf.viewer.survey import Survey

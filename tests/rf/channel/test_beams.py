@@ -1,5 +1,6 @@
 """Beams: codebooks keep power, a beam steered along its direction gains N, choices follow the paths and the users."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -108,8 +109,15 @@ def test_spectrum_is_taken_as_powers_at_its_pixels():
     along = pixel_directions(shape)[5, 3]
     best = np.abs(wr.channel.dft_codebook(rx).amplitude(along[None])[:, 0]).argmax()
     assert chosen.rx[0] == best
+    two = wr.Spectrum.stack([spectrum, dataclasses.replace(spectrum, path_gain=gain[::-1], aod=aod[::-1])])
+    together = wr.channel.select_beams(two, tx, rx, count=3)
+    for k, row in enumerate(together.gain):
+        np.testing.assert_array_equal(row, wr.channel.select_beams(two[k], tx, rx, count=3).gain)
+    assert len(wr.channel.select_beams_multiuser(two, tx, rx, noise=1e-9).tx) == 2
     alone = wr.channel.select_beams(wr.Spectrum(path_gain=gain), rx_array=rx)
     assert alone.rx[0] == best and alone.tx[0] == 0
+    for one in (wr.Antenna("isotropic"), wr.PlanarArray(1, 1, pattern=wr.Antenna("isotropic"))):
+        assert wr.channel.select_beams(wr.Spectrum(path_gain=gain), one, rx).gain == alone.gain
     with pytest.raises(ValueError, match="source: got a spectrum without aod"):
         wr.channel.select_beams(wr.Spectrum(path_gain=gain), tx, rx)
 

@@ -82,6 +82,8 @@ def test_all_measures_of_several_receivers():
             assert np.isnan(value[2]), name
         alone = getattr(los.dispersion(), name)
         assert value[0] == pytest.approx(float(alone), rel=1e-12)
+    for name, value in vars(both[2].dispersion()).items():
+        assert value == 0 if name == "path_gain" else np.isnan(value), name
     only = los.select([0]).dispersion()
     assert only.k_factor == np.inf and only.delay_spread_s == 0 and only.coherence_bandwidth_hz == np.inf
 

@@ -184,6 +184,8 @@ def test_what_no_material_can_hold_is_said(field, tmp_path):
     )
     slabs, edges = wr.interop.write_twin(passing, tmp_path / "passing").left_out
     assert "10.00 dB" in slabs and "edges" in edges
+    (air,) = wr.interop.write_twin(field.with_gas(True), tmp_path / "air").left_out
+    assert "absorption by the air, 0.00525 dB/m" in air
     alike = replace(field, parameters=replace(field.parameters, reciprocal=True))
     assert "reciprocity" in wr.interop.write_twin(alike, tmp_path / "alike").left_out[0]
 

@@ -23,9 +23,9 @@ EVERYTHING = Effects(mirrors=2, scatterings=2, residual=False)
 PLACES = RECEIVERS[[0, 1, 3, 5, 9]]
 
 
-def prior(scene, effects):
+def prior(scene, effects, transmitter=TX):
     known = SpectrumDataset.empty(
-        transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA, floor=1e-16
+        transmitter=transmitter, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA, floor=1e-16
     )
     return BistaticField.prior(scene, known, effects=effects)
 
@@ -193,6 +193,17 @@ def test_pictures_show_every_quantity(found, tmp_path):
         ax = found.plot(quantity)
         shown = np.asarray(ax.images[0].get_array().filled(np.nan))
         np.testing.assert_allclose(shown, found.plot_values(quantity), equal_nan=True)
+
+
+def test_height_above_ground_is_the_same_whatever_the_ground_s_own(scene, whole):
+    down = np.array([0.0, 0.0, -100.0])
+    mesh = Mesh(scene.mesh.vertices + down, scene.mesh.faces)
+    sunk = prior(replace(scene, mesh=mesh), EVERYTHING, TX + down)
+    asked = {"height": 1.2, "cell": 1.0, "above_ground": True}
+    known, found = whole.radio_map(**asked), sunk.radio_map(**asked)
+    np.testing.assert_allclose(found.best_path_gain, known.best_path_gain, rtol=1e-3)
+    with pytest.raises(ValueError, match=r"height: got 3.5 m, expected 0 to 3 m"):
+        sunk.radio_map(**asked | {"height": 3.5})
 
 
 @pytest.mark.parametrize(

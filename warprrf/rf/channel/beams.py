@@ -181,7 +181,7 @@ def steering_codebook(
 
 
 Source = PathArrays | Spectrum
-"""Where predicted power comes from and how much: :class:`Paths` of one receiver or several, or a :class:`Spectrum`."""
+"""Where predicted power comes from and how much: :class:`Paths` or a :class:`Spectrum` of one receiver or several."""
 Noise: TypeAlias = Annotated[float, positive("share of the transmitted power")]
 Ends = End | Codebook
 """Beams of one end: those given, an array's DFT codebook, an antenna as it stands, or a single isotropic element."""
@@ -214,7 +214,7 @@ def beam_gains(source: Source, tx_array: Ends = None, rx_array: Ends = None) -> 
     """
     tx, rx = codebook_of("tx_array", tx_array), codebook_of("rx_array", rx_array)
     found = [_pair_gains(rays, tx, rx) for rays in rays_of(source, tx)]
-    return np.stack(found) if isinstance(source, PathArrays) and source.batched else found[0]
+    return np.stack(found) if source.batched else found[0]
 
 
 @checked
@@ -228,7 +228,7 @@ def select_beams(
     single element.
 
     Args:
-        source: A :class:`Spectrum`, or :class:`Paths` of one receiver or several.
+        source: A :class:`Spectrum` or :class:`Paths` of one receiver or several.
         tx_array: Transmitting :class:`PlanarArray`, whose DFT codebook is searched, or a :class:`Codebook`; a single
             isotropic element by default.
         rx_array: Of the receiver, likewise.
@@ -245,9 +245,7 @@ def select_beams(
         gains = _pair_gains(rays, tx, rx)
         best = np.argsort(-gains, axis=None, kind="stable")[:count]
         rows.append((best % len(tx), best // len(tx), gains.ravel()[best]))
-    if not (isinstance(source, PathArrays) and source.batched):
-        return BeamChoice(*rows[0])
-    return BeamChoice(*(np.stack(column) for column in zip(*rows, strict=True)))
+    return BeamChoice(*(np.stack(c) if source.batched else c[0] for c in zip(*rows, strict=True)))
 
 
 @checked
@@ -279,7 +277,7 @@ def select_beams_multiuser(
     theirs, until nobody's change raises the sum (a local optimum: with one user the best pair).
 
     Args:
-        sources: A sequence of spectra or paths, one a user, or paths of several receivers.
+        sources: A sequence of spectra or paths, one a user, or those of several receivers.
         tx_array, rx_array: as for :func:`select_beams`; all users have the same array.
         noise: Noise power of a user over the total transmitted power [linear].
 
@@ -356,7 +354,7 @@ def _sum_rates(
     return rates
 
 
-Rays = tuple[np.ndarray | None, np.ndarray, np.ndarray]
+Rays = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def rays_of_users(sources: Source | Iterable[Source], tx: Codebook) -> list[Rays]:
@@ -373,34 +371,36 @@ def rays_of_users(sources: Source | Iterable[Source], tx: Codebook) -> list[Rays
 
 
 def rays_of(source: Source, tx: Codebook) -> Iterator[Rays]:
-    """Departure (None if it does not matter), arrival and power of what reaches each receiver of ``source``."""
-    pattern = tx.array.pattern
-    directed = tx.array.elements > 1 or not (isinstance(pattern, str) and pattern == "isotropic")
+    """Departure (arrival, if it does not matter), arrival and power of what reaches each receiver of ``source``."""
+    directed = tx.array.elements > 1 or tx.array.element.pattern != "isotropic"
     if isinstance(source, PathArrays):
         for paths in source.each():
-            kept = paths.select(np.flatnonzero(paths.power > 0))
-            departure = kept.departure
+            kept = paths.select(paths.power > 0)
+            departure = kept.departure if directed else kept.arrival
             if directed and not np.isfinite(departure).all():
                 raise ValueError("source: got paths without a departure angle, expected one with a tx_array")
-            yield departure if directed else None, kept.arrival, kept.power
+            yield departure, kept.arrival, kept.power
+    elif isinstance(source, Spectrum) and source.batched:
+        for k in range(len(source.path_gain)):
+            yield from rays_of(source[k], tx)
     elif isinstance(source, Spectrum):
         power = np.asarray(source.path_gain, np.float64)
         positive = power > 0
-        departure = None
+        departure = arrival = pixel_directions(source.shape)
         if directed:
             if source.aod is None:
                 raise ValueError("source: got a spectrum without aod, expected departures with a tx_array")
             positive &= np.isfinite(source.aod).all(axis=-1)
-            departure = directions_from_angles(source.aod[positive][:, 0], source.aod[positive][:, 1])
-        yield departure, pixel_directions(source.shape)[positive], power[positive]
+            departure = directions_from_angles(source.aod[..., 0], source.aod[..., 1])
+        yield departure[positive], arrival[positive], power[positive]
     else:
         raise TypeError(f"source: got {type(source).__name__}, expected a Spectrum or Paths")
 
 
 def _pair_gains(rays: Rays, tx: Codebook, rx: Codebook) -> np.ndarray:
     departure, arrival, power = rays
-    if departure is None:
-        return rx.power(arrival, power)[:, None] * squared(tx.weights[:, 0])
+    if tx.array.elements == 1:
+        return rx.power(arrival, power * tx.array.gain(departure))[:, None] * squared(tx.weights[:, 0])
     if rx.array.elements == 1:
         return tx.power(departure, power * rx.array.gain(arrival))[None] * squared(rx.weights[:, :1])
     total = np.zeros((len(rx), len(tx)))

@@ -119,8 +119,8 @@ def _first_fall(weight: np.ndarray, tau: np.ndarray, level: float) -> float:
     if np.isnan(weight).any():
         return float("nan")
     tau, weight = tau[weight > 0], weight[weight > 0]
-    tau = tau - tau.min(initial=np.inf)
-    longest = tau.max(initial=0.0)
+    tau = tau - tau.min()
+    longest = tau.max()
     # |R| cannot fall below the strongest weight less all others; of delays nearer than that even the squares are zero.
     if longest < 1e-150 or 2.0 * weight.max() - 1.0 > level:
         return float("inf")
@@ -146,6 +146,8 @@ def _weights(power: ArrayLike, values: ArrayLike, name: str) -> tuple[np.ndarray
     v = check_array(name, values, finite=False)
     if p.shape != v.shape or p.ndim == 0:
         raise ValueError(f"power: got shape {p.shape} for {name} of shape {v.shape}, expected the same")
+    if p.shape[-1] == 0:
+        p, v = np.zeros((2, *p.shape[:-1], 1))
     positive = p > 0
     if not np.isfinite(v[positive]).all():
         raise ValueError(f"{name}: got NaN or infinite ones where there is power")

@@ -108,8 +108,17 @@ class PathArrays:
 
     @property
     def length_m(self) -> np.ndarray:
-        """Unfolded length [m]; NaN where padded."""
+        """Unfolded length, with what slabs delay [m]; NaN where padded."""
         return self.tau * SPEED_OF_LIGHT
+
+    @property
+    def air_m(self) -> np.ndarray:
+        """Length over which air absorbs [m], without what slabs delay, as far as the ends are known; NaN where padded."""
+        through = (self.interactions == SLAB).any(axis=-1)
+        if self.transmitter is None or self.receiver is None or not through.any():
+            return self.length_m
+        points = points_along(self.transmitter, self.vertices, self.receiver)
+        return np.where(through, length_along(points), self.length_m)
 
     @property
     def arrival(self) -> np.ndarray:
@@ -133,7 +142,7 @@ class PathArrays:
             TypeError: for paths of one receiver.
         """
         one = self.row(receiver)
-        return one.select(np.flatnonzero(one.valid))
+        return one.select(one.valid)
 
     def row(self, receiver: int) -> Self:
         """The paths of one of several receivers, padded as they are.
@@ -163,10 +172,8 @@ class PathArrays:
 
     def each(self) -> Iterator[Self]:
         """The paths of one receiver after another, without padding."""
-        if self.batched:
-            yield from (self[k] for k in range(len(self.gain)))
-        else:
-            yield self.select(np.flatnonzero(self.valid))
+        several = self.as_several()
+        yield from (several[k] for k in range(len(several.gain)))
 
     def select(self, chosen: slice | np.ndarray) -> Self:
         """Paths ``chosen`` of one receiver: indices in any order, or a mask ``(L,)``.
@@ -199,7 +206,7 @@ class PathArrays:
         carrier = self.carrier_hz
         change = 0.0 if air is None else air.attenuation_db_per_m(carrier)
         change -= 0.0 if self.air is None else self.air.attenuation_db_per_m(carrier)
-        loss = 10.0 ** (-change * np.nan_to_num(self.length_m) / 20.0)
+        loss = 10.0 ** (-change * np.nan_to_num(self.air_m) / 20.0)
         return replace(turned(self, loss), air=air)
 
     @property
@@ -246,7 +253,7 @@ class PathArrays:
         """
         bounces = np.isfinite(vertices[..., 0]).sum(axis=1)
         points = points_along(transmitter, vertices, receiver)
-        last, length = points[np.arange(len(points)), bounces], length_along(points, bounces)
+        last, length = points[np.arange(len(points)), bounces], length_along(points)
         tau = (length if excess_m is None else length + excess_m) / SPEED_OF_LIGHT
         theta_r, phi_r = angles_from_directions(last - receiver)
         theta_t, phi_t = angles_from_directions(points[:, 1] - transmitter)
@@ -309,18 +316,15 @@ def turned(paths: P, turn: np.ndarray) -> P:
 
 
 def points_along(transmitter: np.ndarray, vertices: np.ndarray, receiver: np.ndarray) -> np.ndarray:
-    """Paths from end to end [m], shape ``(L, depth + 2, 3)``: the receiver follows the last point, then NaN or zero."""
-    count = len(vertices)
-    start = np.broadcast_to(transmitter, (count, 1, 3))
-    points = np.concatenate([start, vertices, np.zeros((count, 1, 3))], axis=1)
-    points[np.arange(count), np.isfinite(vertices[..., 0]).sum(axis=1) + 1] = receiver
-    return points
+    """Paths from end to end [m], shape ``(..., depth + 2, 3)``: past the last point is the receiver."""
+    shape = (*vertices.shape[:-2], 1, 3)
+    start, end = (np.broadcast_to(np.asarray(e)[..., None, None, :], shape) for e in (transmitter, receiver))
+    return np.concatenate([start, np.where(np.isfinite(vertices), vertices, end), end], axis=-2)
 
 
-def length_along(points: np.ndarray, bounces: np.ndarray) -> np.ndarray:
-    """Length from end to end [m], shape ``(L,)``, of paths along ``points`` as of :func:`points_along`, with ``bounces`` (L,)."""
-    steps = np.linalg.norm(np.diff(points, axis=1), axis=2)
-    return np.where(np.arange(steps.shape[1]) <= bounces[:, None], steps, 0.0).sum(axis=1)
+def length_along(points: np.ndarray) -> np.ndarray:
+    """Length from end to end [m], shape ``(...)``, of paths along ``points`` as of :func:`points_along`."""
+    return np.asarray(np.linalg.norm(np.diff(points, axis=-2), axis=-1).sum(axis=-1))
 
 
 def _columns(parts: Sequence[PathArrays]) -> dict[str, list[np.ndarray]]:

@@ -42,7 +42,7 @@ def transmit_covariance(
     It takes 16 U N^2 bytes: 4 MB for four users of 256 elements.
 
     Args:
-        sources: A sequence of spectra or paths, one a user, or paths of several receivers; a single one is one user.
+        sources: A sequence of spectra or paths, one a user, or those of several receivers; a single one is one user.
         tx_array: Transmitting :class:`PlanarArray`, or a :class:`Codebook`, whose array counts.
         rx_array: The users' array or codebook; a single isotropic element by default.
         rx: Index of the beam that each user receives with, shape ``(U,)``; needed where there are several.
@@ -63,9 +63,6 @@ def transmit_covariance(
         for part in chunks(len(power), tx.elements):
             toward = arrival[part]
             received = squared(book.array.response(toward, 1.0) @ own) * book.array.gain(toward)
-            if departure is None:  # a single isotropic element
-                total += (received * power[part]).sum()
-                continue
             away = departure[part]
             transmitted = tx.response(away, 1.0) * np.sqrt(received * power[part] * tx.gain(away))[:, None]
             total += transmitted.conj().T @ transmitted

@@ -113,7 +113,7 @@ def frequency_response(
         gridded = method == "grid" or (method == "auto" and even and many)
         h = np.zeros((*one.ports, len(f)), dtype=complex)
         for index, ports, job in one.jobs():
-            h[ports] += _response(job, f, one.absorption(f), one.tau[index] * SPEED_OF_LIGHT, gridded)
+            h[ports] += _response(job, f, one.absorption(f), one.air_m[index], gridded)
         if amplitude == "friis":
             h = h * (one.carrier_hz / f)
         found.append(h if one.shift_s == 0.0 else h * carrier_phase(-f, one.shift_s))
@@ -215,6 +215,7 @@ class _Link:
     Attributes:
         index: Which of the receiver's paths are summed, P of them.
         tau: Their delays [s], shape ``(P,)``.
+        air_m: Their lengths in air [m], shape ``(P,)``.
         amplitude: Between elements at the arrays' centres, shape ``(Kr, Kt, P)``, K polarisations at either end.
         lengths: What elements' places add, for groups of paths (indices into the P).
         shift_s: Delay that counts as zero.
@@ -223,6 +224,7 @@ class _Link:
 
     index: np.ndarray
     tau: np.ndarray
+    air_m: np.ndarray
     amplitude: np.ndarray
     lengths: list[tuple[np.ndarray, PairLengths]]
     shift_s: float
@@ -304,7 +306,7 @@ def _links(
         amplitude = _amplitudes(chosen, tx, rx)
         if diffuse == "random_phase":
             turns = np.zeros(len(own.gain))
-            turns[scattered] = random_turns(own.select(np.flatnonzero(scattered)), seed)
+            turns[scattered] = random_turns(own.select(scattered), seed)
             amplitude = amplitude * carrier_phase(-1.0, turns[index])
         if wave == "plane":
             groups = [(np.arange(len(index)), plane_lengths(chosen, *places))]
@@ -318,6 +320,7 @@ def _links(
         yield _Link(
             index=index,
             tau=chosen.tau,
+            air_m=chosen.air_m,
             amplitude=amplitude,
             lengths=groups,
             shift_s=float(chosen.tau.min()) if normalize_delays and len(index) else 0.0,

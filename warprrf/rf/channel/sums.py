@@ -50,7 +50,7 @@ class PairLengths:
             receiving elements see, from their centre [m], shape ``(1, P, 3)``, or ``(N, P, 3)`` if every transmitting
             element is a source of its own.
         extra: Length to add for transmitting elements [m], shape ``(N, P)``.
-        scale: Factor of amplitudes for transmitting elements, shape ``(N, P)``, or ``(1, 1)`` for one.
+        scale: Factor of amplitudes for transmitting elements, shape ``(N, P)`` or ``(N, 1)``.
         spherical: Whether waves are.
     """
 
@@ -84,8 +84,7 @@ class PairLengths:
     def between(self, m: slice, n: slice) -> PairLengths:
         """Those of receiving elements ``m`` and transmitting ones ``n``."""
         target = self.target if self.separable else self.target[n]
-        scale = self.scale if len(self.scale) == 1 else self.scale[n]
-        return replace(self, place=self.place[m], target=target, extra=self.extra[n], scale=scale)
+        return replace(self, place=self.place[m], target=target, extra=self.extra[n], scale=self.scale[n])
 
 
 @dataclass(frozen=True)
@@ -261,7 +260,7 @@ def plane_lengths(paths: PathArrays, sending: np.ndarray, receiving: np.ndarray)
         place=receiving,
         target=np.ascontiguousarray(paths.arrival)[None],
         extra=-(sending @ paths.departure.T),
-        scale=np.ones((1, 1)),
+        scale=np.ones((len(sending), 1)),
         spherical=False,
     )
 
@@ -271,7 +270,7 @@ def spherical_lengths(paths: PathArrays, sending: np.ndarray, receiving: np.ndar
     the way as it does: right to first order in the elements' places, but for the waves' bend across the edge."""
     tx, rx, bounces = _ends(paths)
     points = points_along(tx, paths.vertices, rx)
-    last, length = points[np.arange(len(points)), bounces], length_along(points, bounces)
+    last, length = points[np.arange(len(points)), bounces], length_along(points)
     toward = (last - rx) / np.linalg.norm(last - rx, axis=1, keepdims=True)
     # The image lies ``length`` away along the arrival; its array is mirrored at every turn of the way.
     mirrored = np.einsum("pij,nj->npi", _mirrorings(points, paths.interactions), sending)
@@ -303,7 +302,7 @@ def _ends(paths: PathArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _mirrorings(points: np.ndarray, interactions: np.ndarray) -> np.ndarray:
     """What mirrors and edges do to directions, shape ``(P, 3, 3)``: a product of reflections; slabs do nothing."""
     legs = np.diff(points, axis=1)
-    legs = legs / np.linalg.norm(legs, axis=2, keepdims=True)
+    legs = legs / np.maximum(np.linalg.norm(legs, axis=2, keepdims=True), 1e-300)
     turned = np.broadcast_to(np.eye(3), (len(points), 3, 3))
     turns = np.isin(interactions, (MIRROR, EDGE))
     for k in range(turns.shape[1]):

@@ -338,8 +338,6 @@ class RadioField(ABC):
             ValueError: as for :meth:`spectra`, for a ``max_paths`` below 1, and for a store without one.
         """
         ends = self.check_positions(receivers, transmitter)
-        if ends.single and store is None and client is None:  # in a hurry
-            return self._trace_paths(ends.receivers[0], ends.transmitters[0], max_paths)
         batch, work = Batch("paths", ends, store, client, progress), partial(_paths, self, max_paths)
         if store is None:
             found: dict[int, Paths] = {}
@@ -660,11 +658,8 @@ def _cfr(
     field: RadioField, f: np.ndarray, max_paths: int | None, options: Any, part: Part
 ) -> dict[str, np.ndarray]:
     """Each receiver's paths and then its response, in single precision: paths of many would fill the memory."""
-    found = [
-        frequency_response(paths, f, **options).astype(np.complex64)
-        for receiver in part[0]
-        for paths in _paths(field, max_paths, (receiver[None], part[1]))
-    ]
+    every = (field._trace_paths(receiver, part[1], max_paths) for receiver in part[0])
+    found = [frequency_response(paths, f, **options).astype(np.complex64) for paths in every]
     return {"cfr": np.stack(found)}
 
 

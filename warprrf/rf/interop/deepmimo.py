@@ -116,12 +116,10 @@ def write_deepmimo(
 
 
 def _matrices(paths: Paths, coefficient: np.ndarray, max_paths: int | None) -> dict[str, np.ndarray]:
-    count = int(paths.valid.sum(axis=1).max(initial=0))
-    if max_paths is not None:
-        count = min(count, max_paths)
-    count = max(count, 1)  # an empty matrix does not load
-    if paths.gain.shape[1] == 0:
+    if paths.gain.shape[1] == 0:  # an empty matrix does not load
         raise ValueError("paths: got none for any receiver, expected at least one path")
+    most = int(paths.valid.sum(axis=1).max())
+    count = max(min(most, max_paths or most), 1)
     strength = np.where(paths.valid, np.abs(coefficient), -1.0)
     order = np.argsort(-strength, axis=1, kind="stable")[:, :count]
 

@@ -341,6 +341,9 @@ def _left_out(field: BistaticField, half_spaces: Sequence[str]) -> tuple[str, ..
         )
     if p.log_gain != 0.0:
         found.append(f"common gain of {NEPER * p.log_gain:.2f} dB: multiply the twin's path gain by it")
+    if field.air is not None:
+        loss = field.air.attenuation_db_per_m(field.frequency_hz)
+        found.append(f"absorption by the air, {loss:.3g} dB/m: give it to simulate as gas")
     if field.effects.transmissions and p.log_through.any():
         share = NEPER * np.sqrt(np.mean(p.log_through**2))
         found.append(

@@ -94,14 +94,10 @@ def best_beam_gain(
     beam, density = beam_operator(shape, sigma, device), 4.0 * np.pi / pixel_solid_angles(shape)[:, None]
     gain = np.moveaxis(beam(np.moveaxis(diffuse, 0, -1)), -1, 0) * density
     best = gain.reshape(count, -1).max(axis=1)
-    order = np.argsort(receiver, kind="stable")
-    first = np.searchsorted(receiver[order], np.arange(count + 1))
-    for r in range(count):
-        own = order[first[r] : first[r + 1]]
-        if len(own):
-            to = arrival[own]
-            sharp = directivity(sigma, to @ to.T) @ power[own]
-            best[r] = max(best[r], (sharp + gain[r][pixel_of(to, shape)]).max())
+    for r in np.unique(receiver):
+        to, own = arrival[receiver == r], power[receiver == r]
+        sharp = directivity(sigma, to @ to.T) @ own
+        best[r] = max(best[r], (sharp + gain[r][pixel_of(to, shape)]).max())
     return best
 
 
@@ -115,5 +111,5 @@ def links_of(paths: Paths, shape: tuple[int, int], sigma: float, device: Any = N
     sharp = np.flatnonzero(~rough)
     beam = best_beam_gain(image, np.zeros(len(sharp), int), toward[sharp], power[sharp], sigma, device)
     timed = np.isfinite(tau)
-    spread = delay_spread(power[timed], tau[timed])[1] if timed.any() else np.nan
+    spread = delay_spread(power[timed], tau[timed])[1]
     return Links(*(np.array([x], float) for x in (power.sum(), power.max(initial=0.0), spread, beam[0])))

@@ -263,9 +263,9 @@ def radio_map(
     check_positions(
         mesh, source, np.zeros((0, 3)), wavelength_m, known=field.transmitter, device=field.device
     )
-    low, high = mesh.bounds
-    if not (0.0 if o.above_ground else low[2]) < height < high[2]:
-        raise ValueError(f"height: got {height!r} m, expected {low[2]:.3g} to {high[2]:.3g} m")
+    low, high = mesh.bounds[:, 2] - (mesh.bounds[0, 2] if o.above_ground else 0.0)
+    if not low < height < high:
+        raise ValueError(f"height: got {height!r} m, expected {low:.3g} to {high:.3g} m")
     x, y = _centres(mesh, cell, o.bounds)
     across, along = np.meshgrid(x, y)
     ground = ground_height(mesh, across, along, device=field.device) if o.above_ground else None
@@ -302,10 +302,7 @@ def _places(x: np.ndarray, y: np.ndarray, height: float, ground: np.ndarray | No
 
 def _centres(mesh: Mesh, cell: float, bounds: Any) -> tuple[np.ndarray, np.ndarray]:
     """Centres of the cells along x and y [m]."""
-    if bounds is None:
-        low, high = mesh.bounds[0][:2], mesh.bounds[1][:2]
-    else:
-        low, high = check_array("bounds", bounds, (4,)).reshape(2, 2)
+    low, high = mesh.bounds[:, :2] if bounds is None else check_array("bounds", bounds, (4,)).reshape(2, 2)
     if not (low < high).all():
         raise ValueError(f"bounds: got {bounds!r}, expected lowest x and y, then higher x and y")
     counts = np.maximum(np.ceil((high - low) / cell - 1e-6), 1.0)

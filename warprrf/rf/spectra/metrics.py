@@ -204,7 +204,8 @@ def evaluate(
         UserWarning: if there are any: their scores say how well they were learned by heart.
 
     Raises:
-        ValueError: if a prediction has another shape than the truth, or holds NaN, infinite or negative path gain.
+        ValueError: if a prediction has another shape than the truth, or holds NaN, infinite or negative path gain; for a field
+            of another carrier.
     """
     count = len(test.receivers)
     if count == 0:
@@ -291,6 +292,11 @@ def _asked_alike(predict: Callable[[np.ndarray], Any], test: SpectrumDataset) ->
     owner: Any = getattr(predict, "__self__", None)
     if not hasattr(owner, "on_grid") or getattr(predict, "__name__", "") != "spectrum":
         return predict
+    of, told = test.frequency_hz / 1e9, owner.frequency_hz / 1e9
+    if abs(of / told - 1.0) > 1e-3:
+        raise ValueError(
+            f"test: got {of:g} GHz, expected {told:g}; field.at_frequency(hz) is of another carrier"
+        )
     spectrum: Callable[..., Any] = owner.on_grid(test.shape).spectrum
     same_m = 1e-3  # a transmitter this near is the same one
     if np.linalg.norm(owner.transmitter - test.transmitter) <= same_m:

@@ -462,6 +462,11 @@ class Spectrum:
         """Rows and columns."""
         return self.path_gain.shape[-2], self.path_gain.shape[-1]
 
+    @property
+    def batched(self) -> bool:
+        """Whether the arrays are those of several receivers."""
+        return self.path_gain.ndim > 2
+
     @classmethod
     def stack(cls, spectra: Sequence[Spectrum]) -> Spectrum:
         """Spectra of several receivers as one; floor and range are those of the first.
@@ -476,7 +481,7 @@ class Spectrum:
 
     def __getitem__(self, receiver: int) -> Spectrum:
         """The spectrum of one of several receivers."""
-        if self.path_gain.ndim == 2:
+        if not self.batched:
             raise TypeError("spectrum: it is of one receiver, which has no index")
         own: dict[str, Any] = {n: None if a is None else a[receiver] for n, a in self._arrays().items()}
         return replace(self, **own)
@@ -502,7 +507,7 @@ class Spectrum:
             ImportError: if matplotlib is missing.
             ValueError: for spectra of several receivers.
         """
-        if self.path_gain.ndim > 2:
+        if self.batched:
             raise ValueError(f"spectrum: got {len(self.path_gain)} receivers, expected one: spectrum[0]")
         pyplot = _device.require("matplotlib.pyplot", extra="plots")
         if ax is None:

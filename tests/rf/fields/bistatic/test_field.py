@@ -91,6 +91,8 @@ def test_a_field_is_scored_under_the_transmitter_of_the_spectra(scene, data):
         > 100
     )
     assert evaluate(there, lambda rx: field.spectrum(rx))["psnr_db"] < 40
+    with pytest.raises(ValueError, match=r"test: got 140 GHz, expected 300; field.at_frequency"):
+        evaluate(replace(there, frequency_hz=140e9), field.spectrum)
 
 
 def test_a_fit_to_many_keeps_no_records_and_is_the_same(scene, data, field, monkeypatch):

@@ -64,6 +64,16 @@ def test_what_is_said_of_the_place_does_not_count(scene, field):
     np.testing.assert_array_equal(field.locate(one).position, field.locate(elsewhere).position)
 
 
+def test_a_transmitter_may_stand_at_a_place_of_the_map(field):
+    places = next(iter(maps_of(field, [field.transmitter]).values())).places
+    other = places[np.linalg.norm(places - [1.2, 3.2, 1.2], axis=1).argmin()]
+    read = wr.SpectrumDataset.from_spectra(
+        receivers=UNSEEN[:1], transmitter=other, frequency_hz=field.frequency_hz, floor=field.floor,
+        path_gain=field.spectrum(UNSEEN[:1], other).path_gain, beam_sigma_rad=field.beam_sigma_rad,
+    )  # fmt: skip
+    assert np.linalg.norm(field.locate(read).position - UNSEEN[0]) < 0.05
+
+
 def test_powers_that_hold_absorption_are_looked_for_with_it(field):
     air = wr.Air(pressure_hpa=30_000.0, water_vapour_g_m3=100.0)
     humid = field.with_gas(air)

@@ -100,7 +100,7 @@ def maps_of(
     progress: Progress | None = None,
 ) -> dict[bytes, FieldMap]:
     """Maps of a :class:`BistaticField` by transmitter; ``store`` and ``progress`` as for :meth:`RadioField.spectra`."""
-    places = lattice(bistatic.mesh, bistatic.transmitter, bistatic.device)
+    places = lattice(bistatic.mesh, bistatic.transmitter, np.stack(transmitters), bistatic.device)
     every = np.tile(places, (len(transmitters), 1)), np.repeat(transmitters, len(places), axis=0)
     batch = Batch("map", Ends.of(*every), store, None, progress)
     found = batch.gather(
@@ -115,14 +115,14 @@ def maps_of(
     }
 
 
-def lattice(mesh: Mesh, transmitter: np.ndarray, device: Any, spacing_m: float = SPACING_M) -> np.ndarray:
-    """Places in the air of ``transmitter`` (3,), off surfaces, ``spacing_m`` apart [m], shape ``(P, 3)``."""
+def lattice(mesh: Mesh, known: np.ndarray, transmitters: np.ndarray, device: Any) -> np.ndarray:
+    """Places in the air of ``known`` (3,), off surfaces and ``transmitters`` (T, 3), shape ``(P, 3)`` [m]."""
     clearance_m = 0.1
     low, high = mesh.bounds
-    axes = [np.arange(a + 0.5 * spacing_m, b, spacing_m) for a, b in zip(low, high, strict=True)]
+    axes = [np.arange(a + 0.5 * SPACING_M, b, SPACING_M) for a, b in zip(low, high, strict=True)]
     every = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    far = np.linalg.norm(every - transmitter, axis=1) > clearance_m
-    return every[far][is_free(mesh, every[far], transmitter, clearance_m=clearance_m, device=device)]
+    far = (np.linalg.norm(every[:, None] - transmitters, axis=2) > clearance_m).all(axis=1)
+    return every[far][is_free(mesh, every[far], known, clearance_m=clearance_m, device=device)]
 
 
 def _mapped(bistatic: Any, part: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:

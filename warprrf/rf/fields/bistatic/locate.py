@@ -41,7 +41,7 @@ def as_data(field: Any, measured: Any) -> list[Measured]:
         TypeError, ValueError: naming ``measured``.
     """
     if isinstance(measured, Spectrum):
-        if measured.path_gain.ndim != 2:
+        if measured.batched:
             raise ValueError(
                 f"measured: got {len(measured.path_gain)} spectra, expected that of one receiver"
             )
