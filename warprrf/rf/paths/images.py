@@ -136,7 +136,11 @@ class MirrorImages:
             tick(1.0)
 
     def candidates(
-        self, points: np.ndarray, order: int, tick: Callable[[float], None] = lambda share: None
+        self,
+        points: np.ndarray,
+        order: int,
+        tick: Callable[[float], None] = lambda share: None,
+        first: np.ndarray | None = None,
     ) -> Ways:
         """Ways of ``order`` reflections whose points lie in the boxes of their patches, by point; nothing is cast.
 
@@ -144,12 +148,16 @@ class MirrorImages:
             points: Where the chains end [m], shape ``(N, 3)``.
             order: Reflections, at least 1.
             tick: Called now and then with the share of the search that is behind.
+            first: Patches that may come first, by default all.
         """
         parts = [(np.zeros(0, int), np.zeros((0, order), np.int32), np.zeros((0, order, 3)))]
         if len(points) and len(self.patches):
             ends, kept = _Ends(points, self.device), self._keep(order)
             known = min(order, len(kept) - 1)
-            for chains, share in self._descendants(kept[known], order - known, ends.middle, ends.radius):
+            begun = (
+                kept[known] if first is None else kept[known].take(np.isin(kept[known].patch[:, 0], first))
+            )
+            for chains, share in self._descendants(begun, order - known, ends.middle, ends.radius):
                 if len(chains):
                     parts.append(self._unfolded(chains, ends))
                 tick(share)

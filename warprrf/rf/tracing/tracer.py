@@ -524,7 +524,11 @@ class MirroredLight:
         tile, open_m2 = tiles.middles(own, ~hidden), tiles.area * is_open
         area = np.stack([np.bincount(own, one) for one in open_m2])
         centre, middle = place[tile], tiles.face[tile]
-        ways = tracer.images.candidates(centre, 1)
+        shown = None
+        if walls is None:  # else what is behind some mirrors too
+            clear = s.mesh.visible(tracer.transmitter, tiles.off_centre, clearance=s.position_error_m)
+            shown = np.unique(s.patch[tiles.face[clear]])
+        ways = tracer.images.candidates(centre, 1, first=shown)
         # Light must come from in front of the piece, of either side if it has two, and not from its own patch.
         face = middle[ways.row]
         normal = s.front_normal[face]
