@@ -348,11 +348,9 @@ class RadioField(ABC):
             return found[0] if ends.single else Paths.stack([found[k] for k in sorted(found)])
         if max_paths is None:
             raise ValueError("max_paths: got None with a store, expected how many paths it has room for")
-        source = ends.transmitters if len(ends.groups()) > 1 else ends.transmitters[0]
-        known = encoded({"receiver": ends.receivers, "transmitter": source}, PATH_VARIABLES)
         attributes = attributes_of(self.frequency_hz, self.air) | self._known_by(batch, max_paths)
         attributes["single_receiver"] = int(ends.single)
-        batch.gather(partial(_path_arrays, work, max_paths), PATH_VARIABLES, known, attributes)
+        batch.gather(partial(_path_arrays, work, max_paths), PATH_VARIABLES, {}, attributes)
         return Paths.load(store)
 
     def cfr(
