@@ -434,6 +434,8 @@ class Spectrum:
         floor: Noise floor N0 added before taking decibels [linear].
         range_db: Lowest and highest value of the data set's dB images [dB].
         std_db: Standard deviation of the dB image per pixel [dB], shape ``(H, W)``; None where it is not known.
+        attributes: What else is known: ``transmitter``, ``frequency_hz``, ``beam_sigma_rad``, those of the air. Of several
+            receivers that were stacked a list each.
     """
 
     __repr__ = one_line
@@ -472,6 +474,7 @@ class Spectrum:
         each, several = check_items("spectra", spectra, Spectrum, 1), dict[str, Any]()
         for name, first in each[0]._arrays().items():
             several[name] = None if first is None else np.stack([getattr(one, name) for one in each])
+        several["attributes"] = {n: [one.attributes.get(n) for one in each] for n in each[0].attributes}
         return replace(each[0], **several)
 
     def __getitem__(self, receiver: int) -> Spectrum:
@@ -479,6 +482,7 @@ class Spectrum:
         if self.path_gain.ndim == 2:
             raise TypeError("spectrum: it is of one receiver, which has no index")
         own: dict[str, Any] = {n: None if a is None else a[receiver] for n, a in self._arrays().items()}
+        own["attributes"] = {n: a[receiver] if isinstance(a, list) else a for n, a in self.attributes.items()}
         return replace(self, **own)
 
     def _arrays(self) -> dict[str, Any]:

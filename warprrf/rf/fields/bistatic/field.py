@@ -368,14 +368,10 @@ class BistaticField(RadioField):
     def _seen(self, view: View, uncertainty: bool) -> Spectrum:
         gains = self.path_gains(view)
         image = spectra_of(gains, self._beam)[0]
-        delay, aod = strongest(gains, image, self.beam_sigma_rad)
-        spectrum = Spectrum(
-            path_gain=image.astype(np.float32),
-            delay_s=delay,
-            aod=aod,
-            floor=self.floor,
-            range_db=self.range_db,
-        )
+        known = {"transmitter": view.tracer.transmitter, "frequency_hz": self.frequency_hz}
+        known |= {"beam_sigma_rad": self.beam_sigma_rad} | ({} if self.air is None else self.air.attributes)
+        arrays = image.astype(np.float32), *strongest(gains, image, self.beam_sigma_rad)
+        spectrum = Spectrum(*arrays, self.floor, self.range_db, attributes=known)
         return replace(spectrum, std_db=self._std_db(view, image)) if uncertainty else spectrum
 
     def paths(
