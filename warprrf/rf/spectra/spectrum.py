@@ -428,7 +428,7 @@ class Spectrum:
     """The spatial spectrum of one receiver, arrays ``(H, W)``, or of several, arrays ``(R, H, W)``.
 
     Attributes:
-        path_gain: Path gain per pixel [linear], shape ``(H, W)``.
+        path_gain: Path gain per pixel [linear], shape ``(H, W)``; NaN where not measured.
         delay_s: Delay of the pixel's strongest path [s], shape ``(H, W)``; NaN where empty.
         aod: Its zenith and azimuth of departure at the transmitter [rad], shape ``(H, W, 2)``; NaN where empty.
         floor: Noise floor N0 added before taking decibels [linear].
@@ -450,7 +450,7 @@ class Spectrum:
 
     def __post_init__(self) -> None:
         """Check shapes and values; ValueError or TypeError names the field."""
-        shape = check_array("path_gain", self.path_gain, (..., None, None)).shape
+        shape = check_array("path_gain", self.path_gain, (..., None, None), finite=False).shape
         for name, value in self._arrays().items():
             if value is not None:
                 least = 0.0 if name != "aod" else None
