@@ -257,11 +257,15 @@ def test_line_of_sight_path_is_exact(room, truth):
     assert not (truth.paths(BLOCKED).kind == "los").any()
 
 
-def test_phase_and_delay_of_a_path_follow_from_its_vertices(truth):
-    paths = truth.paths(BLOCKED)
+@pytest.mark.parametrize(("line_of_sight", "receiver"), [(None, BLOCKED), ("explicit", VISIBLE)])
+def test_phase_and_delay_of_a_path_follow_from_its_vertices(room, truth, line_of_sight, receiver):
+    paths = field_with(room, truth.layers, line_of_sight=line_of_sight).paths(receiver)
+    paths = paths.select(paths.kind == "diffuse")
     point = paths.vertices[:, 0]
-    length = np.linalg.norm(point - TRANSMITTER, axis=1) + np.linalg.norm(point - BLOCKED, axis=1)
+    length = np.linalg.norm(point - TRANSMITTER, axis=1) + np.linalg.norm(point - receiver, axis=1)
     assert paths.tau == pytest.approx(length / LIGHT, rel=1e-12)
+    out = (point - TRANSMITTER) / np.linalg.norm(point - TRANSMITTER, axis=1, keepdims=True)
+    np.testing.assert_allclose(paths.departure, out, atol=1e-6)
     turned = paths.gain * np.exp(2j * np.pi * np.mod(FREQUENCY * paths.tau, 1.0))
     assert np.abs(np.angle(turned)).max() < 1e-6
 

@@ -329,10 +329,10 @@ class HarmonicField(RadioField):
         elif friis > 0 and self.options.model == "rf3dgs+":
             direct = near_line_of_sight(receiver, source, self.shape, self.beam_sigma_rad)
         toward = receiver - source
-        delay = np.where(direct, np.linalg.norm(toward) / SPEED_OF_LIGHT, delay)
-        angles = np.where(direct[..., None], np.stack(angles_from_directions(toward)), angles)
-        spectrum = Spectrum(power.astype(np.float32), delay, angles, self.floor, self.range_db)
-        return View(spectrum, receiver, source, point, friis, beam)
+        soonest = np.where(direct, np.linalg.norm(toward) / SPEED_OF_LIGHT, delay)
+        aod = np.where(direct[..., None], np.stack(angles_from_directions(toward)), angles)
+        spectrum = Spectrum(power.astype(np.float32), soonest, aod, self.floor, self.range_db)
+        return View(spectrum, receiver, source, point, delay, angles, friis, beam)
 
     def _channels(self, seen: Transport) -> tuple[np.ndarray, np.ndarray]:
         """Learned delay [s] and vector of departure; NaN where a ray meets nothing or nothing was learned."""
