@@ -71,8 +71,7 @@ class Room:
             if own.any():
                 groups += [name] * (name not in groups)
                 group[own] = groups.index(name)
-        none: dict[str, Any] = {"face_object": np.full(len(parent), -1, np.int32), "object_names": ()}
-        return cls(cut, group, tuple(map(Called, groups)), **none | objects_of(geometry, parent))
+        return cls(cut, group, tuple(map(Called, groups)), **objects_of(geometry, parent))
 
 
 def edited(surface: Surface, room: Room, **slabs: np.ndarray) -> tuple[Surface, np.ndarray]:
