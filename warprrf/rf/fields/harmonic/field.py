@@ -30,9 +30,18 @@ from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.cache import Cache
-from warprrf.checks import Expected, Positive, check_array, check_arrays, checked, one_line, within
+from warprrf.checks import (
+    Expected,
+    Positive,
+    check_array,
+    check_arrays,
+    check_type,
+    checked,
+    one_line,
+    within,
+)
 from warprrf.device import DeviceLike, Progress
-from warprrf.geometry.mesh import GeometryLike, Mesh
+from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.splats.gaussians import Gaussians, discs_on_mesh, gaussians_of
 from warprrf.geometry.splats.rasterizer import Parameters, Rasterizer
 from warprrf.kernels.radio import harmonics as _kernels
@@ -348,17 +357,13 @@ def _geometry(geometry: GeometryLike | Gaussians) -> tuple[Gaussians, Mesh | Non
     if isinstance(geometry, Gaussians):
         return geometry, None
     gaussians = gaussians_of(geometry)
-    mesh = geometry if isinstance(geometry, Mesh) else getattr(geometry, "mesh", None)
-    if gaussians is None and mesh is not None:
-        gaussians = discs_on_mesh(mesh)
-    if not isinstance(gaussians, Gaussians):
-        raise TypeError(
-            f"geometry: got {type(geometry).__name__}, expected a Reconstruction (or anything with .gaussians and "
-            ".mesh), a Scene or a Mesh"
-        )
+    if gaussians is None:
+        mesh = as_mesh(geometry, "geometry")
+        return discs_on_mesh(mesh), mesh
+    check_type("geometry.gaussians", gaussians, Gaussians)
     if len(gaussians) == 0:
         raise ValueError("geometry: got no Gaussians, expected at least one")
-    return gaussians, mesh
+    return gaussians, getattr(geometry, "mesh", None) if getattr(geometry, "has_mesh", True) else None
 
 
 def _train(
