@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from radio_scenes import box_mesh, joined
-from trimesh.remesh import subdivide_to_size
+from trimesh.remesh import subdivide, subdivide_to_size
 
 import warprrf as wr
 from warprrf.geometry.mesh import Mesh
@@ -161,6 +161,17 @@ def test_a_room_is_one_though_fragments_lie_beside_it():
     mesh = joined(box_mesh(LOW, HIGH, inward=True), fragment)[0]
     check_positions(mesh, TX, np.zeros((0, 3)), WAVELENGTH)
     assert is_free(mesh, np.array([AIR, TX])).all()
+
+
+def test_a_room_whose_walls_have_two_sheets_is_one():
+    """As where an exporter writes a wall's other side in finer faces: no place in it was free, unless one was known to be."""
+    whole = room()
+    vertices, faces = subdivide(whole.vertices, whole.faces)
+    mesh = joined((whole.vertices, whole.faces), (vertices, faces[:, ::-1]))[0]
+    places = np.random.default_rng(3).uniform(LOW + 0.05, HIGH - 0.05, (200, 3))
+    held = ((places > CUPBOARD[0]) & (places < CUPBOARD[1])).all(axis=1)
+    for known in (TX, None):
+        np.testing.assert_array_equal(is_free(mesh, places, known), ~held)
 
 
 def test_a_room_of_solid_walls_has_its_air_between_them():

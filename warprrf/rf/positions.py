@@ -433,6 +433,8 @@ def _rooms(mesh: Mesh) -> list[int]:
             rest[np.argsort(-mesh.areas[mesh.distinct_faces[rest]], kind="stable")][:samples]
         ]
         places, area, part = mesh.triangles[rest].mean(axis=1), mesh.areas[rest], mesh.closed_parts[k]
+        off = part.distance(places) > WALL_CLEARANCE_M  # what covers it is neither in it nor beside it
+        places, area = places[off], area[off]
         held, left = area[holds(part, places)].sum(), area.sum()
         # a tenth of a surface's area beside it is nothing to speak of
         fragments = left <= 0.1 * part.areas.sum() and not _is_amid(part, places)
