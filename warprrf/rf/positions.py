@@ -428,10 +428,9 @@ def _rooms(mesh: Mesh) -> list[int]:
     for k in sorted(range(len(volume)), key=lambda k: -volume[k]):
         if volume[k] < least:
             break
-        rest = np.flatnonzero(~np.isin(mesh.closed_part_of[mesh.distinct_faces], [*rooms, k]))
-        rest = mesh.distinct_faces[
-            rest[np.argsort(-mesh.areas[mesh.distinct_faces[rest]], kind="stable")][:samples]
-        ]
+        rest = mesh.distinct_faces
+        rest = rest[~np.isin(mesh.closed_part_of[rest], [*rooms, k])]
+        rest = rest[np.argsort(-mesh.areas[rest], kind="stable")][:samples]
         places, area, part = mesh.triangles[rest].mean(axis=1), mesh.areas[rest], mesh.closed_parts[k]
         off = part.distance(places) > WALL_CLEARANCE_M  # what covers it is neither in it nor beside it
         places, area = places[off], area[off]

@@ -62,7 +62,7 @@ class Room:
         patches = None if isinstance(geometry, Surface) else getattr(geometry, "patches", None)
         mesh = patches.mesh if isinstance(patches, PlanarPatches) else as_mesh(geometry, "geometry")
         material, names = named_faces(geometry, mesh)
-        once = np.flatnonzero(mesh.first_at_place == np.arange(len(mesh.faces)))
+        once = mesh.distinct_faces
         cut, group, parent = _lying_on(surface, Mesh(mesh.vertices, mesh.faces[once]))
         parent, groups = once[parent], list(surface.group_names)
         label = np.full(len(parent), len(names)) if material is None else material[parent]

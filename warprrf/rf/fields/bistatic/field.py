@@ -547,8 +547,9 @@ class BistaticField(RadioField):
         """Standard deviation of the dB image per pixel (H, W); see :mod:`warprrf.rf.fields.bistatic.uncertainty`."""
         if self.errors is None:
             raise ValueError(
-                f"uncertainty: no receiver was held out of this field's fit to {self.report.get('receivers', 0)}, so its "
-                "error is not known; fit whole spectra of four or more, without quick=True"
+                f"uncertainty: no receiver was held out of this field's fit to {self.report.get('receivers', 0)}, or it was "
+                "edited, or is of another carrier since, so its error is not known; fit whole spectra of four or more, without "
+                "quick=True"
             )
         rows = np.unique(self.material, return_index=True)[1]
         lit = materials_of(view.tracer, self.parameters, self.effects)
