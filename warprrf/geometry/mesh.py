@@ -283,6 +283,22 @@ class Mesh:
         return found
 
     @cached_property
+    def like_normals(self) -> np.ndarray:
+        """:attr:`face_normals`, those of one connected part on one side of it, however its faces are wound, where it has two sides,
+        shape ``(F, 3)``."""
+        corner, count = self.welded_faces, len(self.faces)
+        pairs = self.distinct_faces[edge_pairs(corner[self.distinct_faces])]
+        along = corner.astype(np.int64) * (corner.max() + 1) + np.roll(corner, -1, axis=1)
+        a, b = along[pairs.T]
+        other = (a[:, :, None] == b[:, None]).any(
+            axis=(1, 2)
+        )  # wound otherwise: both run along their edge alike
+        side = np.column_stack([pairs[:, 0], pairs[:, 1] + count * other])
+        side = np.concatenate([side, (side + count) % (2 * count)])
+        label = components(2 * count, side).reshape(2, count)
+        return np.where((label[0] > label[1])[:, None], -self.face_normals, self.face_normals)
+
+    @cached_property
     def closed_parts(self) -> list[Mesh]:
         """The parts of :attr:`closed_part_of`, each a mesh of its own."""
         order = np.argsort(self.closed_part_of, kind="stable")

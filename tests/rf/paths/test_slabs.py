@@ -54,8 +54,14 @@ pytestmark = pytest.mark.filterwarnings("ignore:28 GHz")  # that diffraction is 
 
 SHEET = room(pane(1.0))
 thick = replace(GLASS, thickness_m=0.3)  # said of a solid, it does not count
+CORNERS, FACES = box_mesh([1.0, -6.0, 0.001], [1.01, 6.0, 6.0])
+EAST = Mesh(CORNERS, FACES).face_normals[:, :1] > 0.5
+AGAIN, PART = joined(FLOOR, (CORNERS, FACES), (CORNERS, FACES[:, ::-1]))
 WALLS = {
-    "solid": room(box_mesh([1.0, -6.0, 0.001], [1.01, 6.0, 6.0]), thick),
+    "solid": room((CORNERS, FACES), thick),
+    "solid, wound either way": room((CORNERS, np.where(EAST, FACES[:, ::-1], FACES)), thick),
+    "solid, doubled": Scene(AGAIN, [FLOORING, thick], np.minimum(PART, 1)),
+    "solid, doubled of another material": Scene(AGAIN, [FLOORING, thick], PART % 2),
     "turned": room((pane(1.0)[0], pane(1.0)[1][:, ::-1])),
     "doubled": room((pane(1.0)[0], np.concatenate([pane(1.0)[1], pane(1.0)[1][:, ::-1]]))),
     "cut up": room(

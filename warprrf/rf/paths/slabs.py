@@ -12,7 +12,6 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from warprrf.cache import cached_property
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh, headings
 from warprrf.rf.em.fresnel import slab_passage, slab_transmission
@@ -124,11 +123,6 @@ class Walls:
         found[met] = 0.5 * (te + tm) * np.exp(-2j * np.pi / self.wavelength_m * longer)
         return np.asarray(found.prod(axis=1))
 
-    @cached_property
-    def _part(self) -> np.ndarray:
-        """Closed part of each face, that of the face at its place for a repeat, -1 for none."""
-        return self.mesh.closed_part_of[self.mesh.first_at_place]
-
     def between(self, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, Slabs]:
         """Which of the ways from ``start`` to ``end``, (N, 3) or (3,), arrive, and the slabs that those pass."""
         start, end = (np.ascontiguousarray(a) for a in np.broadcast_arrays(start, end))
@@ -164,7 +158,7 @@ class Walls:
         slabs of all rays so far. ``known`` are faces and ranges of what is met first."""
         row, slabs = np.arange(len(start)), Slabs.none(len(start), self.most)
         gone, last, count = np.zeros(len(start)), np.full(len(start), -1), np.zeros(len(start), int)
-        normal = self.mesh.face_normals
+        part, first, normal = self.mesh.closed_part_of, self.mesh.first_at_place, self.mesh.like_normals
         while len(row):
             if known is None:
                 hit = self.mesh.cast(
@@ -174,11 +168,10 @@ class Walls:
             else:
                 (face, t), known = known, None
             met = (face >= 0) & (t < limit[row])
-            face = np.where(met, face, -1)
+            face = np.where(met, first[face], -1)
             cosine = np.abs(_dot(normal[face], direction[row]))
             before, place = last[row], count[row] - 1
-            again = np.flatnonzero(met & (before >= 0) & (self._part[face] >= 0))
-            again = again[self._part[face[again]] == self._part[before[again]]]
+            again = np.flatnonzero(met & (before >= 0) & (part[face] >= 0) & (part[face] == part[before]))
             r, k = row[again], place[again]
             apart = (t[again] - slabs.range_m[r, k]) * slabs.cosine[r, k]
             back = (apart <= THICKEST_M) & (_dot(normal[face[again]], normal[before[again]]) < AGAINST)
