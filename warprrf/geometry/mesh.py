@@ -246,21 +246,21 @@ class Mesh:
     def is_closed(self) -> bool:
         """Whether every edge, after welding, belongs to an even number of faces.
 
-        Faces whose corners fall together and repeats of a face (wound alike) are left out: they open nothing.
+        Faces whose corners fall together and repeats of a face are left out: they open and close nothing.
         """
-        faces = self.welded_faces
-        first, second, third = faces.T
-        faces = faces[(first != second) & (second != third) & (third != first)]
-        lowest = faces.argmin(axis=1)[:, None]
-        faces = np.take_along_axis(faces, (lowest + np.arange(3)) % 3, axis=1)
-        faces = faces[distinct_rows(faces)[0]]
-        edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        return len(edges) > 0 and bool((distinct_rows(edges)[2] % 2 == 0).all())
+        face = self._cornered
+        return len(face) > 0 and self._largest_hole(self.welded_faces[face], face) == 0.0
 
     @cached_property
     def distinct_faces(self) -> np.ndarray:
         """Faces of which no earlier one has the same three corners, however wound, shape ``(K,)``."""
         return np.unique(self.first_at_place)
+
+    @cached_property
+    def _cornered(self) -> np.ndarray:
+        """Those of :attr:`distinct_faces` whose corners do not fall together."""
+        corner = self.welded_faces[self.distinct_faces]
+        return self.distinct_faces[(corner != np.roll(corner, 1, axis=1)).all(axis=1)]
 
     @cached_property
     def closed_part_of(self) -> np.ndarray:
@@ -269,9 +269,7 @@ class Mesh:
         A connected part is closed, and so has an inside, if all its edges belong to an even number of faces, or if its
         holes are small, as a scan's (:data:`LARGEST_HOLE`). A sheet has none, nor has a room with a doorway.
         """
-        corner = self.welded_faces[self.distinct_faces]
-        flat = (corner == np.roll(corner, 1, axis=1)).any(axis=1)
-        face, corner = self.distinct_faces[~flat], corner[~flat]
+        face, corner = self._cornered, self.welded_faces[self._cornered]
         found, count = np.full(len(self.faces), -1), 0
         part = components(len(corner), edge_pairs(corner))
         for own in np.split(np.argsort(part, kind="stable"), np.cumsum(np.bincount(part))[:-1]):
@@ -287,12 +285,10 @@ class Mesh:
         """:attr:`face_normals`, those of one connected part on one side of it, however its faces are wound, where it has two sides,
         shape ``(F, 3)``."""
         corner, count = self.welded_faces, len(self.faces)
-        pairs = self.distinct_faces[edge_pairs(corner[self.distinct_faces])]
+        pairs = edge_pairs(corner, self._cornered)
         along = corner.astype(np.int64) * (corner.max() + 1) + np.roll(corner, -1, axis=1)
         a, b = along[pairs.T]
-        other = (a[:, :, None] == b[:, None]).any(
-            axis=(1, 2)
-        )  # wound otherwise: both run along their edge alike
+        other = (a[:, :, None] == b[:, None]).any(axis=(1, 2))  # wound so: both run along their edge alike
         side = np.column_stack([pairs[:, 0], pairs[:, 1] + count * other])
         side = np.concatenate([side, (side + count) % (2 * count)])
         label = components(2 * count, side).reshape(2, count)
