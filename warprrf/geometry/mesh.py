@@ -228,12 +228,23 @@ class Mesh:
         return max(near, float(step[count % 2 == 1].max(initial=0.0)))
 
     @cached_property
+    def weld_m(self) -> float:
+        """How near to each other vertices are one [m]: 1e-6 of the box's half diagonal."""
+        return max(2.0 * self.rounding_m, 0.5e-6 * float(np.linalg.norm(np.ptp(self.bounds, axis=0))))
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """Position of each index of :attr:`welded_faces` [m]."""
+        place = np.zeros((int(self.welded_faces.max()) + 1, 3))
+        place[self.welded_faces.reshape(-1)[::-1]] = self.triangles.reshape(-1, 3)[::-1]
+        return place
+
+    @cached_property
     def welded_faces(self) -> np.ndarray:
-        """Faces with vertices at one place (to 1e-6 of the box's half diagonal) given one index, shape ``(F, 3)``."""
+        """Faces with vertices at one place (:attr:`weld_m`) given one index, shape ``(F, 3)``."""
         first, index, _ = distinct_rows(self.vertices)
         point = self.vertices[first]
-        reach = max(2.0 * self.rounding_m, 0.5e-6 * float(np.linalg.norm(np.ptp(self.bounds, axis=0))))
-        near = cKDTree(point - self.center).query_pairs(reach, output_type="ndarray")
+        near = cKDTree(point - self.center).query_pairs(self.weld_m, output_type="ndarray")
         return components(len(point), near)[index][self.faces]
 
     @cached_property
@@ -248,8 +259,8 @@ class Mesh:
 
         Faces whose corners fall together and repeats of a face are left out: they open and close nothing.
         """
-        face = self._cornered
-        return len(face) > 0 and self._largest_hole(self.welded_faces[face], face) == 0.0
+        corner = self.welded_faces[self._cornered]
+        return len(corner) > 0 and self._largest_hole(corner) == 0.0
 
     @cached_property
     def distinct_faces(self) -> np.ndarray:
@@ -275,7 +286,7 @@ class Mesh:
         for own in np.split(np.argsort(part, kind="stable"), np.cumsum(np.bincount(part))[:-1]):
             share, most = LARGEST_HOLE
             size = float(np.linalg.norm(np.ptp(self.triangles[face[own]].reshape(-1, 3), axis=0)))
-            if len(own) > 3 and self._largest_hole(corner[own], face[own]) <= min(share * size, most):
+            if len(own) > 3 and self._largest_hole(corner[own]) <= min(share * size, most):
                 found[face[own]] = count
                 count += 1
         return found
@@ -301,7 +312,7 @@ class Mesh:
         starts = np.searchsorted(self.closed_part_of[order], np.arange(self.closed_part_of.max() + 2))
         return [Mesh(self.vertices, self.faces[order[a:b]]) for a, b in pairwise(starts)]
 
-    def _largest_hole(self, corner: np.ndarray, face: np.ndarray) -> float:
+    def _largest_hole(self, corner: np.ndarray) -> float:
         """Diagonal of the box around the largest border of faces with the welded vertices ``corner`` (K, 3) [m]."""
         edge = np.sort(corner[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         first, _, count = distinct_rows(edge)
@@ -313,12 +324,10 @@ class Mesh:
         order = np.argsort(index.reshape(-1), kind="stable") // 2
         first = np.cumsum(count)[count == 2] - 2
         border = components(len(edge), np.column_stack([order[first], order[first + 1]]))
-        place = np.zeros((int(corner.max()) + 1, 3))
-        place[corner.reshape(-1)] = self.vertices[self.faces[face].reshape(-1)]
         low, high = (np.full((border.max() + 1, 3), sign * np.inf) for sign in (1, -1))
         for side in edge.T:
-            np.minimum.at(low, border, place[side])
-            np.maximum.at(high, border, place[side])
+            np.minimum.at(low, border, self.places[side])
+            np.maximum.at(high, border, self.places[side])
         return float(np.linalg.norm(high - low, axis=1).max())
 
     @cached_property
