@@ -24,6 +24,7 @@ import numpy as np
 from warprrf.cache import Cache, making
 from warprrf.device import DeviceLike, Progress, resolve
 from warprrf.kernels.radio.records import MIRROR, SCATTER, SLAB, SOURCE
+from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.edge_paths import EdgeFinder
 from warprrf.rf.paths.images import MirrorImages
@@ -195,16 +196,17 @@ class Tracer:
         shape: tuple[int, int],
         sub_pixels: int,
         *,
-        loss_per_m: float = 0.0,
+        air: Air | None = None,
         device: DeviceLike = None,
     ) -> Tracer:
         """That of a grid of ``shape`` with ``sub_pixels`` squared rays a pixel; the last few are kept."""
         place = np.asarray(transmitter, np.float64).tobytes()
         where = str(resolve(device))
-        key = surface, place, frequency_hz, shape, sub_pixels, loss_per_m, where
+        key = surface, place, frequency_hz, shape, sub_pixels, air, where
 
         def make() -> Tracer:
-            grid = RayGrid(surface, shape, sub_pixels, loss_per_m=loss_per_m, device=device)
+            loss = 0.0 if air is None else air.loss_per_m(frequency_hz)
+            grid = RayGrid(surface, shape, sub_pixels, loss_per_m=loss, device=device)
             return cls(surface, transmitter, frequency_hz, grid)
 
         return _TRACED.get(key, make)

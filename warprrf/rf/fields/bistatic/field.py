@@ -473,9 +473,14 @@ class BistaticField(RadioField):
         """The geometry under ``transmitter`` (3,) [m], by default the fitted one; that of the last few is kept."""
         source = self.transmitter if transmitter is None else check_array("transmitter", transmitter, (3,))
         return Tracer.of(
-            self.surface, source, self.frequency_hz, self.shape, self.sub_pixels,
-            loss_per_m=0.0 if self.air is None else self.air.loss_per_m(self.frequency_hz), device=self.device,
-        )  # fmt: skip
+            self.surface,
+            source,
+            self.frequency_hz,
+            self.shape,
+            self.sub_pixels,
+            air=self.air,
+            device=self.device,
+        )
 
     def suggest(
         self,
