@@ -326,7 +326,7 @@ class Tracer:
         light = self.grid.light(rays.hits, self.transmitter)
         found = {"S": self.scattered(rays, light.lit, light.strength[light.lit], light.angle[light.lit])}
         if most:
-            row = light.shaded
+            row = np.setdiff1d(np.flatnonzero(light.strength > 0), light.lit)
             arrived, slabs = self.walls(most).between(self.transmitter, light.point[row])
             own = np.flatnonzero(slabs.count > 0)
             row, slabs = row[arrived[own]], slabs.take(own)
@@ -395,9 +395,13 @@ class Tracer:
     ) -> Records:
         """Records of what the rays ``row`` see over ``met``, one after the other; the residual's row is that of direct sight."""
         dtype, behind = self.grid.dtype, [] if rays.after is None else [rays.after.take(row)]
-        every = Interactions.in_a_row([*met, *behind])
+        legs = [*met, *behind]
+        index, angle, kind = (
+            np.concatenate([getattr(leg, name) for leg in legs], axis=1)
+            for name in ("index", "angle", "kind")
+        )
         return Records(
-            every.index.astype(np.int32), every.angle.astype(dtype), every.kind, np.asarray(power, dtype),
+            index.astype(np.int32), angle.astype(dtype), kind, np.asarray(power, dtype),
             rays.ray[row].astype(np.int32), -1 if behind else residual_row, self.grid.half_width,
             rays.hits.range_m[row].astype(np.float32) if rays.straight else None,
         )  # fmt: skip
