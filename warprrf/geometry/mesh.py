@@ -259,7 +259,7 @@ class Mesh:
 
         Faces whose corners fall together and repeats of a face are left out: they open and close nothing.
         """
-        corner = self.welded_faces[self._cornered]
+        corner = self.welded_faces[self.cornered_faces]
         return len(corner) > 0 and self._largest_hole(corner) == 0.0
 
     @cached_property
@@ -268,8 +268,8 @@ class Mesh:
         return np.unique(self.first_at_place)
 
     @cached_property
-    def _cornered(self) -> np.ndarray:
-        """Those of :attr:`distinct_faces` whose corners do not fall together."""
+    def cornered_faces(self) -> np.ndarray:
+        """Those of :attr:`distinct_faces` whose corners do not fall together, shape ``(K,)``."""
         corner = self.welded_faces[self.distinct_faces]
         return self.distinct_faces[(corner != np.roll(corner, 1, axis=1)).all(axis=1)]
 
@@ -280,7 +280,7 @@ class Mesh:
         A connected part is closed, and so has an inside, if all its edges belong to an even number of faces, or if its
         holes are small, as a scan's (:data:`LARGEST_HOLE`). A sheet has none, nor has a room with a doorway.
         """
-        face, corner = self._cornered, self.welded_faces[self._cornered]
+        face, corner = self.cornered_faces, self.welded_faces[self.cornered_faces]
         found, count = np.full(len(self.faces), -1), 0
         part = components(len(corner), edge_pairs(corner))
         for own in np.split(np.argsort(part, kind="stable"), np.cumsum(np.bincount(part))[:-1]):
@@ -296,7 +296,7 @@ class Mesh:
         """:attr:`face_normals`, those of one connected part on one side of it, however its faces are wound, where it has two sides,
         shape ``(F, 3)``."""
         corner, count = self.welded_faces, len(self.faces)
-        pairs = edge_pairs(corner, self._cornered)
+        pairs = edge_pairs(corner, self.cornered_faces)
         along = corner.astype(np.int64) * (corner.max() + 1) + np.roll(corner, -1, axis=1)
         a, b = along[pairs.T]
         other = (a[:, :, None] == b[:, None]).any(axis=(1, 2))  # wound so: both run along their edge alike
