@@ -313,7 +313,8 @@ class Mesh:
         return [Mesh(self.vertices, self.faces[order[a:b]]) for a, b in pairwise(starts)]
 
     def _largest_hole(self, corner: np.ndarray) -> float:
-        """Diagonal of the box around the largest border of faces with the welded vertices ``corner`` (K, 3) [m]."""
+        """Diagonal of the box around the largest border of faces with the welded vertices ``corner`` (K, 3) [m]; one along a line,
+        as where an edge is cut on one side alone, is no hole."""
         edge = np.sort(corner[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         first, _, count = distinct_rows(edge)
         edge = edge[first[count % 2 == 1]]
@@ -328,7 +329,10 @@ class Mesh:
         for side in edge.T:
             np.minimum.at(low, border, self.places[side])
             np.maximum.at(high, border, self.places[side])
-        return float(np.linalg.norm(high - low, axis=1).max())
+        way = self.places[edge[:, 1]] - self.places[edge[:, 0]]
+        along = headings(way[np.unique(border, return_index=True)[1]])[0][border]
+        bent = np.linalg.norm(np.cross(along, way), axis=1) > self.weld_m
+        return float((np.linalg.norm(high - low, axis=1) * (np.bincount(border, bent) > 0)).max())
 
     @cached_property
     def center(self) -> np.ndarray:
