@@ -37,6 +37,13 @@ def sheet(a, b, c, d):
     return np.array([a, b, c, d], float), np.array([[0, 1, 2], [0, 2, 3]])
 
 
+def with_a_face_without_area(mesh):
+    """Along an edge of the last solid, one corner amid it."""
+    a, b = mesh.faces[-1, :2]
+    vertices = np.vstack([mesh.vertices, mesh.vertices[[a, b]].mean(axis=0)])
+    return Mesh(vertices, np.vstack([mesh.faces, [a, len(vertices) - 1, b]]))
+
+
 def subdivided(mesh, noise_m, holes, seed=0):
     """Faces cut into many with noise on their corners, shared ones alike, and some faces missing."""
     vertices, faces = subdivide_to_size(mesh.vertices, mesh.faces, 0.4)
@@ -111,10 +118,11 @@ def test_a_map_marks_what_it_does_not_answer(field):
         room(inward=False),  # a shell wound outward
         room(box_mesh(*PILLAR)),  # solids that overlap
         Mesh(room().vertices, np.concatenate([room().faces, room().faces[:, ::-1]])),  # every face twice
+        with_a_face_without_area(room()),
         subdivided(room(), 0.0, 0.05),  # holes
         subdivided(room(), 0.01, 0.03),  # a scan
     ],
-    ids=["closed", "outward", "overlapping", "doubled", "holes", "scan"],
+    ids=["closed", "outward", "overlapping", "doubled", "flat face", "holes", "scan"],
 )
 def test_solids_are_known_and_air_passes_however_the_mesh_is(mesh):
     rng = np.random.default_rng(1)
