@@ -136,6 +136,11 @@ class RadioField(ABC):
     def mesh(self) -> Mesh | None:
         """What blocks; None if the geometry has no mesh."""
 
+    @property
+    def wavelength_m(self) -> float:
+        """Wavelength [m]."""
+        return SPEED_OF_LIGHT / self.frequency_hz
+
     @classmethod
     def fit(cls, geometry: GeometryLike, ds: Data, model: str = "bistatic", **options: Any) -> RadioField:
         """Fit a radio field to what was measured.
@@ -557,7 +562,7 @@ class RadioField(ABC):
         """
         ends = Ends.of(receivers, self.transmitter if transmitter is None else transmitter, name)
         check_positions(
-            self.mesh, ends.transmitters, ends.shaped(ends.receivers), SPEED_OF_LIGHT / self.frequency_hz,
+            self.mesh, ends.transmitters, ends.shaped(ends.receivers), self.wavelength_m,
             names=("transmitter", name), known=self.transmitter, device=self.device,
         )  # fmt: skip
         return ends

@@ -43,7 +43,7 @@ from warprrf.rf.channel.array_spectra import check_steering
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.materials import Material
-from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT, check_frequency
+from warprrf.rf.em.waves import NEPER, check_frequency
 from warprrf.rf.fields.base import Data, Location, Measured, RadioField, with_settings
 from warprrf.rf.fields.batches import Work
 from warprrf.rf.fields.bistatic import edited, files
@@ -136,11 +136,6 @@ class BistaticField(RadioField):
     def mesh(self) -> Mesh:
         """What blocks."""
         return self.surface.mesh
-
-    @property
-    def wavelength_m(self) -> float:
-        """Wavelength [m]."""
-        return SPEED_OF_LIGHT / self.frequency_hz
 
     @property
     def state(self) -> Model:

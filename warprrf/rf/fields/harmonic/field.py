@@ -296,7 +296,7 @@ class HarmonicField(RadioField):
     def _free_space(self, length_m: float | np.ndarray) -> float | np.ndarray:
         """Gain of a path of ``length_m`` [m] between isotropic antennas, less what the air absorbs."""
         with np.errstate(divide="ignore"):
-            gain = (SPEED_OF_LIGHT / self.frequency_hz / (4 * np.pi * length_m)) ** 2
+            gain = (self.wavelength_m / (4 * np.pi * length_m)) ** 2
         return gain if self.air is None else gain * self.air.transmittance(self.frequency_hz, length_m)
 
     def _seen_from(self, receivers: np.ndarray, progress: Progress | None) -> Transport:
