@@ -76,6 +76,15 @@ def test_houses_are_no_places_with_or_without_floors_and_however_wound(floor, in
             check_positions(s.mesh, place, STREET, WAVELENGTH)
 
 
+def test_a_street_whose_faces_are_there_twice_is_a_street():
+    """With both of their sides, as exporters write them, it counted as closed: houses without floors were air."""
+    once = street()
+    twice = Mesh(once.vertices, np.concatenate([once.faces, once.faces[:, ::-1]]))
+    assert is_open_air(twice) and not twice.is_closed
+    s = scene(twice)
+    assert s.is_free(STREET).all() and not s.is_free(INDOORS).any()
+
+
 def test_a_link_within_a_house_without_a_floor_passes():
     check_positions(street(), INDOORS[0], INDOORS[0] + [[2.0, 1.0, 0.5]], WAVELENGTH)
 

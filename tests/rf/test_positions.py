@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from radio_scenes import box_mesh, joined
-from trimesh.remesh import subdivide_to_size
+from trimesh.remesh import subdivide, subdivide_to_size
 
 import warprrf as wr
 from warprrf.geometry.mesh import Mesh
@@ -35,6 +35,13 @@ def scene():
 
 def sheet(a, b, c, d):
     return np.array([a, b, c, d], float), np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def with_a_face_without_area(mesh):
+    """Along an edge of the last solid, one corner amid it."""
+    a, b = mesh.faces[-1, :2]
+    vertices = np.vstack([mesh.vertices, mesh.vertices[[a, b]].mean(axis=0)])
+    return Mesh(vertices, np.vstack([mesh.faces, [a, len(vertices) - 1, b]]))
 
 
 def subdivided(mesh, noise_m, holes, seed=0):
@@ -111,10 +118,11 @@ def test_a_map_marks_what_it_does_not_answer(field):
         room(inward=False),  # a shell wound outward
         room(box_mesh(*PILLAR)),  # solids that overlap
         Mesh(room().vertices, np.concatenate([room().faces, room().faces[:, ::-1]])),  # every face twice
+        with_a_face_without_area(room()),
         subdivided(room(), 0.0, 0.05),  # holes
         subdivided(room(), 0.01, 0.03),  # a scan
     ],
-    ids=["closed", "outward", "overlapping", "doubled", "holes", "scan"],
+    ids=["closed", "outward", "overlapping", "doubled", "flat face", "holes", "scan"],
 )
 def test_solids_are_known_and_air_passes_however_the_mesh_is(mesh):
     rng = np.random.default_rng(1)
@@ -161,6 +169,17 @@ def test_a_room_is_one_though_fragments_lie_beside_it():
     mesh = joined(box_mesh(LOW, HIGH, inward=True), fragment)[0]
     check_positions(mesh, TX, np.zeros((0, 3)), WAVELENGTH)
     assert is_free(mesh, np.array([AIR, TX])).all()
+
+
+def test_a_room_whose_walls_have_two_sheets_is_one():
+    """As where an exporter writes a wall's other side in finer faces: no place in it was free, unless one was known to be."""
+    whole = room()
+    vertices, faces = subdivide(whole.vertices, whole.faces)
+    mesh = joined((whole.vertices, whole.faces), (vertices, faces[:, ::-1]))[0]
+    places = np.random.default_rng(3).uniform(LOW + 0.05, HIGH - 0.05, (200, 3))
+    held = ((places > CUPBOARD[0]) & (places < CUPBOARD[1])).all(axis=1)
+    for known in (TX, None):
+        np.testing.assert_array_equal(is_free(mesh, places, known), ~held)
 
 
 def test_a_room_of_solid_walls_has_its_air_between_them():

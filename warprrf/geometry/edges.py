@@ -62,8 +62,7 @@ def mesh_edges(mesh: Mesh, normal: np.ndarray | None = None, groups: np.ndarray 
     """
     normal = mesh.face_normals if normal is None else normal
     groups = np.zeros(len(mesh.faces), int) if groups is None else groups
-    reach = max(2.0 * mesh.rounding_m, 0.5e-6 * float(np.linalg.norm(np.ptp(mesh.bounds, axis=0))))
-    sides, place = _candidates(mesh, normal), _places(mesh)
+    sides, place, reach = _candidates(mesh, normal), mesh.places, mesh.weld_m
     ends = _split(mesh, sides, place, reach)
     span = place[ends[:, 1]] - place[ends[:, 0]]
     span *= np.where(span @ _SIDE < 0, -1.0, 1.0)[:, None]
@@ -75,14 +74,6 @@ def mesh_edges(mesh: Mesh, normal: np.ndarray | None = None, groups: np.ndarray 
     piece, inward, n, face = piece[keep], inward[keep], n[keep], face[keep]
     pieces = Edges(middle[piece] - 0.5 * span[piece], along[piece], length[piece], inward, n, face)
     return _merged(pieces, ends[piece], groups[face], reach)
-
-
-def _places(mesh: Mesh) -> np.ndarray:
-    """Position of each index of ``mesh.welded_faces`` [m]."""
-    corner = mesh.welded_faces
-    place = np.zeros((int(corner.max()) + 1, 3))
-    place[corner.reshape(-1)[::-1]] = mesh.triangles.reshape(-1, 3)[::-1]
-    return place
 
 
 def _candidates(mesh: Mesh, normal: np.ndarray) -> np.ndarray:

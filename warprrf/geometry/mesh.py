@@ -228,12 +228,23 @@ class Mesh:
         return max(near, float(step[count % 2 == 1].max(initial=0.0)))
 
     @cached_property
+    def weld_m(self) -> float:
+        """How near to each other vertices are one [m]: 1e-6 of the box's half diagonal."""
+        return max(2.0 * self.rounding_m, 0.5e-6 * float(np.linalg.norm(np.ptp(self.bounds, axis=0))))
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """Position of each index of :attr:`welded_faces` [m]."""
+        place = np.zeros((int(self.welded_faces.max()) + 1, 3))
+        place[self.welded_faces.reshape(-1)[::-1]] = self.triangles.reshape(-1, 3)[::-1]
+        return place
+
+    @cached_property
     def welded_faces(self) -> np.ndarray:
-        """Faces with vertices at one place (to 1e-6 of the box's half diagonal) given one index, shape ``(F, 3)``."""
+        """Faces with vertices at one place (:attr:`weld_m`) given one index, shape ``(F, 3)``."""
         first, index, _ = distinct_rows(self.vertices)
         point = self.vertices[first]
-        reach = max(2.0 * self.rounding_m, 0.5e-6 * float(np.linalg.norm(np.ptp(self.bounds, axis=0))))
-        near = cKDTree(point - self.center).query_pairs(reach, output_type="ndarray")
+        near = cKDTree(point - self.center).query_pairs(self.weld_m, output_type="ndarray")
         return components(len(point), near)[index][self.faces]
 
     @cached_property
@@ -246,21 +257,21 @@ class Mesh:
     def is_closed(self) -> bool:
         """Whether every edge, after welding, belongs to an even number of faces.
 
-        Faces whose corners fall together and repeats of a face (wound alike) are left out: they open nothing.
+        Faces whose corners fall together and repeats of a face are left out: they open and close nothing.
         """
-        faces = self.welded_faces
-        first, second, third = faces.T
-        faces = faces[(first != second) & (second != third) & (third != first)]
-        lowest = faces.argmin(axis=1)[:, None]
-        faces = np.take_along_axis(faces, (lowest + np.arange(3)) % 3, axis=1)
-        faces = faces[distinct_rows(faces)[0]]
-        edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        return len(edges) > 0 and bool((distinct_rows(edges)[2] % 2 == 0).all())
+        corner = self.welded_faces[self.cornered_faces]
+        return len(corner) > 0 and self._largest_hole(corner) == 0.0
 
     @cached_property
     def distinct_faces(self) -> np.ndarray:
         """Faces of which no earlier one has the same three corners, however wound, shape ``(K,)``."""
         return np.unique(self.first_at_place)
+
+    @cached_property
+    def cornered_faces(self) -> np.ndarray:
+        """Those of :attr:`distinct_faces` whose corners do not fall together, shape ``(K,)``."""
+        corner = self.welded_faces[self.distinct_faces]
+        return self.distinct_faces[(corner != np.roll(corner, 1, axis=1)).all(axis=1)]
 
     @cached_property
     def closed_part_of(self) -> np.ndarray:
@@ -269,18 +280,13 @@ class Mesh:
         A connected part is closed, and so has an inside, if all its edges belong to an even number of faces, or if its
         holes are small, as a scan's (:data:`LARGEST_HOLE`). A sheet has none, nor has a room with a doorway.
         """
-        corner = self.welded_faces[self.distinct_faces]
-        flat = (corner == np.roll(corner, 1, axis=1)).any(axis=1)
-        face, corner = self.distinct_faces[~flat], corner[~flat]
+        face, corner = self.cornered_faces, self.welded_faces[self.cornered_faces]
         found, count = np.full(len(self.faces), -1), 0
         part = components(len(corner), edge_pairs(corner))
         for own in np.split(np.argsort(part, kind="stable"), np.cumsum(np.bincount(part))[:-1]):
             share, most = LARGEST_HOLE
             size = float(np.linalg.norm(np.ptp(self.triangles[face[own]].reshape(-1, 3), axis=0)))
-            # A face without area may close a seam, or only lie on an edge.
-            large = own[self.areas[face[own]] > 1e-9 * size**2]
-            holes = (self._largest_hole(corner[some], face[some]) for some in (own, large))
-            if len(large) > 3 and any(hole <= min(share * size, most) for hole in holes):
+            if len(own) > 3 and self._largest_hole(corner[own]) <= min(share * size, most):
                 found[face[own]] = count
                 count += 1
         return found
@@ -292,8 +298,9 @@ class Mesh:
         starts = np.searchsorted(self.closed_part_of[order], np.arange(self.closed_part_of.max() + 2))
         return [Mesh(self.vertices, self.faces[order[a:b]]) for a, b in pairwise(starts)]
 
-    def _largest_hole(self, corner: np.ndarray, face: np.ndarray) -> float:
-        """Diagonal of the box around the largest border of faces with the welded vertices ``corner`` (K, 3) [m]."""
+    def _largest_hole(self, corner: np.ndarray) -> float:
+        """Diagonal of the box around the largest border of faces with the welded vertices ``corner`` (K, 3) [m]; one along a line,
+        as where an edge is cut on one side alone, is no hole."""
         edge = np.sort(corner[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         first, _, count = distinct_rows(edge)
         edge = edge[first[count % 2 == 1]]
@@ -304,13 +311,14 @@ class Mesh:
         order = np.argsort(index.reshape(-1), kind="stable") // 2
         first = np.cumsum(count)[count == 2] - 2
         border = components(len(edge), np.column_stack([order[first], order[first + 1]]))
-        place = np.zeros((int(corner.max()) + 1, 3))
-        place[corner.reshape(-1)] = self.vertices[self.faces[face].reshape(-1)]
         low, high = (np.full((border.max() + 1, 3), sign * np.inf) for sign in (1, -1))
         for side in edge.T:
-            np.minimum.at(low, border, place[side])
-            np.maximum.at(high, border, place[side])
-        return float(np.linalg.norm(high - low, axis=1).max())
+            np.minimum.at(low, border, self.places[side])
+            np.maximum.at(high, border, self.places[side])
+        way = self.places[edge[:, 1]] - self.places[edge[:, 0]]
+        along = headings(way[np.unique(border, return_index=True)[1]])[0][border]
+        bent = np.linalg.norm(np.cross(along, way), axis=1) > self.weld_m
+        return float((np.linalg.norm(high - low, axis=1) * (np.bincount(border, bent) > 0)).max())
 
     @cached_property
     def center(self) -> np.ndarray:

@@ -233,11 +233,11 @@ def planar_patches(mesh: Mesh, groups: ArrayLike | None = None) -> PlanarPatches
         warn(
             f"mesh: {differ} faces lie on another of a different material or group; the first of each is taken"
         )
-    once = first == np.arange(count)
     longest = np.linalg.norm(mesh.triangles - np.roll(mesh.triangles, 1, axis=1), axis=2).max(axis=1)
     height = 2.0 * mesh.areas / np.maximum(longest, 1e-300)
-    once &= ~_is_sliver(corner, height, rounding)
-    pairs = edge_pairs(corner, np.flatnonzero(once))
+    own = mesh.cornered_faces
+    own = own[height[own] > 4.0 * rounding]  # less is made by rounding alone, and has no plane of its own
+    pairs, once = edge_pairs(corner, own), np.isin(np.arange(count), own)
     noise = vertex_noise(mesh, pairs, rounding)
     faces = _Faces(mesh, group, height, FLAT_M + 6.0 * noise, 3.0 * noise)
     piece = _pieces(faces, once, pairs)
@@ -298,12 +298,6 @@ class _Faces:
         return np.abs(np.einsum("nki,ni->nk", self.mesh.triangles[face], normal) - offset[:, None]).max(
             axis=1, initial=0.0
         )
-
-
-def _is_sliver(corner: np.ndarray, height: np.ndarray, rounding: float) -> np.ndarray:
-    """Faces without a plane of their own: corners that fall together, or a height that rounding alone makes."""
-    a, b, c = corner.T
-    return (a == b) | (b == c) | (c == a) | (height <= 4.0 * rounding)
 
 
 def _pieces(faces: _Faces, once: np.ndarray, pairs: np.ndarray) -> np.ndarray:

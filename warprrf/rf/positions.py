@@ -428,11 +428,12 @@ def _rooms(mesh: Mesh) -> list[int]:
     for k in sorted(range(len(volume)), key=lambda k: -volume[k]):
         if volume[k] < least:
             break
-        rest = np.flatnonzero(~np.isin(mesh.closed_part_of[mesh.distinct_faces], [*rooms, k]))
-        rest = mesh.distinct_faces[
-            rest[np.argsort(-mesh.areas[mesh.distinct_faces[rest]], kind="stable")][:samples]
-        ]
+        rest = mesh.distinct_faces
+        rest = rest[~np.isin(mesh.closed_part_of[rest], [*rooms, k])]
+        rest = rest[np.argsort(-mesh.areas[rest], kind="stable")][:samples]
         places, area, part = mesh.triangles[rest].mean(axis=1), mesh.areas[rest], mesh.closed_parts[k]
+        off = part.distance(places) > WALL_CLEARANCE_M  # what covers it is neither in it nor beside it
+        places, area = places[off], area[off]
         held, left = area[holds(part, places)].sum(), area.sum()
         # a tenth of a surface's area beside it is nothing to speak of
         fragments = left <= 0.1 * part.areas.sum() and not _is_amid(part, places)

@@ -160,6 +160,16 @@ def test_a_store_holds_the_same_bits_and_is_known_again(field, tmp_path):
     assert {file.suffix for file in tmp_path.iterdir()} == {".nc"}  # nothing is left beside them
 
 
+def test_stored_paths_of_one_transmitter_are_those_of_one(field, tmp_path):
+    """What takes paths of one transmitter (spectra, DeepMIMO, Sionna's shapes) takes those of a store too."""
+    stored = field.paths(PLACES, max_paths=7, store=tmp_path / "paths.nc")
+    np.testing.assert_array_equal(stored.transmitter, TX)
+    now, before = (
+        wr.SpectrumDataset.from_paths(p, shape=(6, 12)) for p in (stored, field.paths(PLACES, max_paths=7))
+    )
+    np.testing.assert_array_equal(now.path_gain, before.path_gain)
+
+
 def test_a_store_of_something_else_is_refused(field, tmp_path):
     file = tmp_path / "spectra.nc"
     field.spectra(PLACES, store=file)

@@ -49,13 +49,26 @@ def paths(scene, ends=(TX, RX), most=3, **options):
     )
 
 
-pytestmark = pytest.mark.filterwarnings("ignore:28 GHz")  # that diffraction is not asked for
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:28 GHz"),  # that diffraction is not asked for
+    pytest.mark.filterwarnings("ignore:mesh"),  # that faces lie on others
+]
 
 
 SHEET = room(pane(1.0))
 thick = replace(GLASS, thickness_m=0.3)  # said of a solid, it does not count
+CORNERS, FACES = box_mesh([1.0, -6.0, 0.001], [1.01, 6.0, 6.0])
+EAST = Mesh(CORNERS, FACES).face_normals[:, :1] > 0.5
+CUT = np.concatenate(
+    [[[0, 1, 9], [0, 9, 8], [8, 9, 3], [8, 3, 2]], FACES[2:]]
+)  # the west side, of another one's edges
+AGAIN, PART = joined(FLOOR, (CORNERS, FACES), (CORNERS, FACES[:, ::-1]))
 WALLS = {
-    "solid": room(box_mesh([1.0, -6.0, 0.001], [1.01, 6.0, 6.0]), thick),
+    "solid": room((CORNERS, FACES), thick),
+    "solid, wound either way": room((CORNERS, np.where(EAST, FACES[:, ::-1], FACES)), thick),
+    "solid, cut on one side": room((np.vstack([CORNERS, [[1.0, 0.0, 0.001], [1.0, 0.0, 6.0]]]), CUT), thick),
+    "solid, doubled": Scene(AGAIN, [FLOORING, thick], np.minimum(PART, 1)),
+    "solid, doubled of another material": Scene(AGAIN, [FLOORING, thick], PART % 2),
     "turned": room((pane(1.0)[0], pane(1.0)[1][:, ::-1])),
     "doubled": room((pane(1.0)[0], np.concatenate([pane(1.0)[1], pane(1.0)[1][:, ::-1]]))),
     "cut up": room(

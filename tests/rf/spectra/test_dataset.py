@@ -98,6 +98,17 @@ def test_floor_and_range_follow_from_the_spectra():
     assert ds.range_db == pytest.approx((10 * np.log10(floor), 10 * np.log10(ds.path_gain.max() + floor)))
 
 
+def test_pixels_that_were_not_measured_are_so_in_a_single_spectrum():
+    """One NaN pixel was an error of what a data set hands out of one receiver."""
+    whole = dataset(3)
+    gain = whole.path_gain.copy()
+    gain[1, 2:4] = np.nan
+    for one, own in zip(replace(whole, path_gain=gain), gain, strict=True):
+        np.testing.assert_array_equal(one.path_gain, own)
+    with pytest.raises(ValueError, match="path_gain: got"):
+        Spectrum(np.full((2, 4), np.inf))
+
+
 def test_exr_keeps_the_spectrum_and_its_numbers(tmp_path):
     exr = pytest.importorskip("OpenEXR")
     ds = dataset()

@@ -136,6 +136,11 @@ class RadioField(ABC):
     def mesh(self) -> Mesh | None:
         """What blocks; None if the geometry has no mesh."""
 
+    @property
+    def wavelength_m(self) -> float:
+        """Wavelength [m]."""
+        return SPEED_OF_LIGHT / self.frequency_hz
+
     @classmethod
     def fit(cls, geometry: GeometryLike, ds: Data, model: str = "bistatic", **options: Any) -> RadioField:
         """Fit a radio field to what was measured.
@@ -346,11 +351,9 @@ class RadioField(ABC):
             return found[0] if ends.single else Paths.stack([found[k] for k in sorted(found)])
         if max_paths is None:
             raise ValueError("max_paths: got None with a store, expected how many paths it has room for")
-        source = ends.transmitters if len(ends.groups()) > 1 else ends.transmitters[0]
-        known = encoded({"receiver": ends.receivers, "transmitter": source}, PATH_VARIABLES)
         attributes = attributes_of(self.frequency_hz, self.air) | self._known_by(batch, max_paths)
         attributes["single_receiver"] = int(ends.single)
-        batch.gather(partial(_path_arrays, work, max_paths), PATH_VARIABLES, known, attributes)
+        batch.gather(partial(_path_arrays, work, max_paths), PATH_VARIABLES, {}, attributes)
         return Paths.load(store)
 
     def cfr(
@@ -557,7 +560,7 @@ class RadioField(ABC):
         """
         ends = Ends.of(receivers, self.transmitter if transmitter is None else transmitter, name)
         check_positions(
-            self.mesh, ends.transmitters, ends.shaped(ends.receivers), SPEED_OF_LIGHT / self.frequency_hz,
+            self.mesh, ends.transmitters, ends.shaped(ends.receivers), self.wavelength_m,
             names=("transmitter", name), known=self.transmitter, device=self.device,
         )  # fmt: skip
         return ends

@@ -183,6 +183,9 @@ def _fields_of(fields: dict[str, Any], attributes: dict[str, Any]) -> dict[str, 
     carrier = attributes.get("frequency_hz")
     fields["frequency_hz"] = None if carrier is None else check_positive("frequency_hz", carrier)
     fields["air"] = Air.from_attributes(attributes)
+    source: Any = fields.get("transmitter")
+    if np.ndim(source) == 2 and len(np.unique(source, axis=0)) == 1:  # stores have it in every row
+        fields["transmitter"] = source[0]
     for name in PADDING.keys() & fields.keys():
         fields[name][~fields["valid"]] = PADDING[name]
     check_known_whole("vertices", fields["vertices"])

@@ -128,12 +128,11 @@ class Walls:
 
     @cached_property
     def _part(self) -> np.ndarray:
-        """Closed part of each face, that of the face at its place for a repeat, -1 for none; parts that fill one box are one, as
-        copies that lie micrometres apart."""
-        parts, part = self.mesh.closed_parts, self.mesh.closed_part_of[self.mesh.first_at_place]
+        """Closed part of each face, -1 for none; parts that fill one box are one, as copies that lie micrometres apart."""
+        parts = self.mesh.closed_parts
         boxes = cKDTree(np.array([p.bounds.ravel() for p in parts]).reshape(-1, 6))
         label = components(len(parts), boxes.query_pairs(self.clearance_m, output_type="ndarray"))
-        return np.append(label, -1)[part]
+        return np.append(label, -1)[self.mesh.closed_part_of]
 
     def between(self, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, Slabs]:
         """Which of the ways from ``start`` to ``end``, (N, 3) or (3,), arrive, and the slabs that those pass."""
@@ -170,7 +169,7 @@ class Walls:
         slabs of all rays so far. ``known`` are faces and ranges of what is met first."""
         row, slabs = np.arange(len(start)), Slabs.none(len(start), self.most)
         gone, last, count = np.zeros(len(start)), np.full(len(start), -1), np.zeros(len(start), int)
-        normal = self.mesh.face_normals
+        part, first, normal = self._part, self.mesh.first_at_place, self.mesh.face_normals
         while len(row):
             if known is None:
                 hit = self.mesh.cast(
@@ -180,17 +179,15 @@ class Walls:
             else:
                 (face, t), known = known, None
             met = (face >= 0) & (t < limit[row])
-            face = np.where(met, face, -1)
+            face = np.where(met, first[face], -1)
             cosine = np.abs(_dot(normal[face], direction[row]))
             before, place = last[row], count[row] - 1
-            again = np.flatnonzero(met & (before >= 0) & (self._part[face] >= 0))
-            again = again[self._part[face[again]] == self._part[before[again]]]
+            again = np.flatnonzero(met & (before >= 0) & (part[face] >= 0) & (part[face] == part[before]))
             r, k = row[again], place[again]
             apart = (t[again] - slabs.range_m[r, k]) * slabs.cosine[r, k]
             along, left, entered = direction[row[again]], normal[face[again]], normal[before[again]]
-            alike = _dot(left, entered) * np.sign(
-                _dot(left, along) * _dot(entered, along)
-            )  # however they are wound
+            turned = np.sign(_dot(left, along) * _dot(entered, along))  # however they are wound
+            alike = turned * _dot(left, entered)
             back = (apart <= THICKEST_M) & (alike > ALIKE)
             slabs.thickness_m[r[back], k[back]] = apart[back]
             out = np.zeros(len(row), bool)

@@ -305,7 +305,8 @@ class SpectrumDataset:
         if isinstance(index, bool) or not isinstance(index, int | np.integer):
             raise TypeError(f"index: got {index!r}, expected a whole number; subset() takes several")
         of_all = ("transmitter", "frequency_hz", "beam_sigma_rad", "engine")
-        attributes = {"receiver": self.receivers[index]} | {name: getattr(self, name) for name in of_all}
+        attributes = {**self.attributes, "receiver": self.receivers[index]}
+        attributes |= {name: getattr(self, name) for name in of_all}
         arrays = self.path_gain[index], self.delay_s[index], self.aod[index]
         return Spectrum(*arrays, self.floor, self.range_db, attributes=attributes)
 

@@ -428,12 +428,14 @@ class Spectrum:
     """The spatial spectrum of one receiver, arrays ``(H, W)``, or of several, arrays ``(R, H, W)``.
 
     Attributes:
-        path_gain: Path gain per pixel [linear], shape ``(H, W)``.
+        path_gain: Path gain per pixel [linear], shape ``(H, W)``; NaN where not measured.
         delay_s: Delay of the pixel's strongest path [s], shape ``(H, W)``; NaN where empty.
         aod: Its zenith and azimuth of departure at the transmitter [rad], shape ``(H, W, 2)``; NaN where empty.
         floor: Noise floor N0 added before taking decibels [linear].
         range_db: Lowest and highest value of the data set's dB images [dB].
         std_db: Standard deviation of the dB image per pixel [dB], shape ``(H, W)``; None where it is not known.
+        attributes: What else is known: ``transmitter``, ``frequency_hz``, ``beam_sigma_rad``, those of the air. Of several
+            receivers that were stacked a list each.
     """
 
     __repr__ = one_line
@@ -448,7 +450,7 @@ class Spectrum:
 
     def __post_init__(self) -> None:
         """Check shapes and values; ValueError or TypeError names the field."""
-        shape = check_array("path_gain", self.path_gain, (..., None, None)).shape
+        shape = check_array("path_gain", self.path_gain, (..., None, None), finite=False).shape
         for name, value in self._arrays().items():
             if value is not None:
                 least = 0.0 if name != "aod" else None
@@ -477,6 +479,7 @@ class Spectrum:
         each, several = check_items("spectra", spectra, Spectrum, 1), dict[str, Any]()
         for name, first in each[0]._arrays().items():
             several[name] = None if first is None else np.stack([getattr(one, name) for one in each])
+        several["attributes"] = {n: [one.attributes.get(n) for one in each] for n in each[0].attributes}
         return replace(each[0], **several)
 
     def __getitem__(self, receiver: int) -> Spectrum:
@@ -484,6 +487,7 @@ class Spectrum:
         if not self.batched:
             raise TypeError("spectrum: it is of one receiver, which has no index")
         own: dict[str, Any] = {n: None if a is None else a[receiver] for n, a in self._arrays().items()}
+        own["attributes"] = {n: a[receiver] if isinstance(a, list) else a for n, a in self.attributes.items()}
         return replace(self, **own)
 
     def _arrays(self) -> dict[str, Any]:

@@ -62,7 +62,7 @@ class Room:
         patches = None if isinstance(geometry, Surface) else getattr(geometry, "patches", None)
         mesh = patches.mesh if isinstance(patches, PlanarPatches) else as_mesh(geometry, "geometry")
         material, names = named_faces(geometry, mesh)
-        once = np.flatnonzero(mesh.first_at_place == np.arange(len(mesh.faces)))
+        once = mesh.distinct_faces
         cut, group, parent = _lying_on(surface, Mesh(mesh.vertices, mesh.faces[once]))
         parent, groups = once[parent], list(surface.group_names)
         label = np.full(len(parent), len(names)) if material is None else material[parent]
@@ -71,8 +71,7 @@ class Room:
             if own.any():
                 groups += [name] * (name not in groups)
                 group[own] = groups.index(name)
-        none: dict[str, Any] = {"face_object": np.full(len(parent), -1, np.int32), "object_names": ()}
-        return cls(cut, group, tuple(map(Called, groups)), **none | objects_of(geometry, parent))
+        return cls(cut, group, tuple(map(Called, groups)), **objects_of(geometry, parent))
 
 
 def edited(surface: Surface, room: Room, **slabs: np.ndarray) -> tuple[Surface, np.ndarray]:
@@ -104,7 +103,9 @@ def edited(surface: Surface, room: Room, **slabs: np.ndarray) -> tuple[Surface, 
         lies_on = np.append(lies_on, np.where(same, s.cells.at(near.face, middle), -1))
     used, corners = np.unique(corners, return_inverse=True)
     mesh, new = Mesh(vertices[used], corners.reshape(-1, 3)), len(names) - s.groups
-    plane, own["patch"] = _renumbered(own["patch"])
+    patch = own["patch"]
+    plane = np.unique(patch[patch >= 0])
+    own["patch"] = np.where(patch >= 0, np.searchsorted(plane, patch), -1).astype(np.int32)
     made = Surface(
         mesh=mesh, cells=cells, **own,
         **{name: np.concatenate([getattr(s, name), slabs[name]]) for name in ("thickness_m", "dispersion")},
@@ -144,12 +145,6 @@ def _lying_on(s: Surface, mesh: Mesh) -> tuple[Mesh, np.ndarray, np.ndarray]:
 def _first_at_place(s: Surface, mesh: Mesh) -> np.ndarray:
     """Of the faces of ``s`` and of ``mesh``, one after the other, the first with the same corners."""
     return joined([(part.vertices, part.faces) for part in (s.mesh, mesh)]).first_at_place
-
-
-def _renumbered(index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which of ``index`` there are, -1 apart, and each one's place among those, -1 staying -1."""
-    used = np.unique(index[index >= 0])
-    return used, np.where(index >= 0, np.searchsorted(used, index), -1).astype(np.int32)
 
 
 def _cut(

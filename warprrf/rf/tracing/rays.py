@@ -75,13 +75,6 @@ class Light:
     point: np.ndarray
     lit: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
-    @property
-    def shaded(self) -> np.ndarray:
-        """Rows in the shadow of something."""
-        bright = self.strength > 0
-        bright[self.lit] = False
-        return np.flatnonzero(bright)
-
 
 def quasi_random(count: int, each: int) -> np.ndarray:
     """Numbers that fill the unit cube, ``each`` for each of ``count``, shape ``(3, count, each)``."""

@@ -53,12 +53,6 @@ class Interactions(Rows):
         return cls.alike(group[:, None], angle[:, None], kernels.MIRROR)
 
     @classmethod
-    def in_a_row(cls, legs: Sequence[Interactions]) -> Interactions:
-        """Those of each of ``legs`` after those of the one before."""
-        columns = ([leg.index for leg in legs], [leg.angle for leg in legs], [leg.kind for leg in legs])
-        return cls(*(np.concatenate(own, axis=1) for own in columns))
-
-    @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
         """The rows of all ``parts``; shorter ones meet nothing at their end."""
         most = max(part.index.shape[1] for part in parts)

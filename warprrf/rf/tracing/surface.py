@@ -479,11 +479,11 @@ def law_of(
 
 
 def objects_of(geometry: GeometryLike, parent: np.ndarray) -> dict[str, Any]:
-    """Object of each face, a piece of ``parent`` (F,), and the objects' names, by the names of :class:`Surface`; of a geometry that
-    has some, and was not flattened."""
+    """Object of each face, a piece of ``parent`` (F,), and the objects' names, by the names of :class:`Surface`; none of a geometry
+    that has none, or was flattened."""
     known, names = getattr(geometry, "face_object", None), tuple(getattr(geometry, "object_names", ()))
     if known is None or not names or len(known) <= parent.max():
-        return {}
+        known, names = np.full(parent.max() + 1, -1), ()
     return {"face_object": np.asarray(known, np.int32)[parent], "object_names": names}
 
 

@@ -24,6 +24,7 @@ import numpy as np
 from warprrf.cache import Cache, making
 from warprrf.device import DeviceLike, Progress, resolve
 from warprrf.kernels.radio.records import MIRROR, SCATTER, SLAB, SOURCE
+from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.edge_paths import EdgeFinder
 from warprrf.rf.paths.images import MirrorImages
@@ -200,16 +201,17 @@ class Tracer:
         shape: tuple[int, int],
         sub_pixels: int,
         *,
-        loss_per_m: float = 0.0,
+        air: Air | None = None,
         device: DeviceLike = None,
     ) -> Tracer:
         """That of a grid of ``shape`` with ``sub_pixels`` squared rays a pixel; the last few are kept."""
         place = np.asarray(transmitter, np.float64).tobytes()
         where = str(resolve(device))
-        key = surface, place, frequency_hz, shape, sub_pixels, loss_per_m, where
+        key = surface, place, frequency_hz, shape, sub_pixels, air, where
 
         def make() -> Tracer:
-            grid = RayGrid(surface, shape, sub_pixels, loss_per_m=loss_per_m, device=device)
+            loss = 0.0 if air is None else air.loss_per_m(frequency_hz)
+            grid = RayGrid(surface, shape, sub_pixels, loss_per_m=loss, device=device)
             return cls(surface, transmitter, frequency_hz, grid)
 
         return _TRACED.get(key, make)
@@ -329,7 +331,7 @@ class Tracer:
         light = self.grid.light(rays.hits, self.transmitter)
         found = {"S": self.scattered(rays, light.lit, light.strength[light.lit], light.angle[light.lit])}
         if most:
-            row = light.shaded
+            row = np.setdiff1d(np.flatnonzero(light.strength > 0), light.lit)
             arrived, slabs = self.walls(most).between(self.transmitter, light.point[row])
             own = np.flatnonzero(slabs.count > 0)
             row, slabs = row[arrived[own]], slabs.take(own)
@@ -395,9 +397,13 @@ class Tracer:
     ) -> Records:
         """Records of what the rays ``row`` see over ``met``, one after the other; the residual's row is that of direct sight."""
         dtype, behind = self.grid.dtype, [] if rays.after is None else [rays.after.take(row)]
-        every = Interactions.in_a_row([*met, *behind])
+        legs = [*met, *behind]
+        index, angle, kind = (
+            np.concatenate([getattr(leg, name) for leg in legs], axis=1)
+            for name in ("index", "angle", "kind")
+        )
         return Records(
-            every.index.astype(np.int32), every.angle.astype(dtype), every.kind, np.asarray(power, dtype),
+            index.astype(np.int32), angle.astype(dtype), kind, np.asarray(power, dtype),
             rays.ray[row].astype(np.int32), -1 if behind else residual_row, self.grid.half_width,
             rays.hits.range_m[row].astype(np.float32) if rays.straight else None,
         )  # fmt: skip

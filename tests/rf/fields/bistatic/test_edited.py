@@ -213,6 +213,8 @@ def test_an_edited_field_is_saved_and_loaded(field, tmp_path):
     assert there.paths(SEES).power.sum() == pytest.approx(gains(there).sum(), rel=1e-5)
     links = there.links(RECEIVERS[:3])
     assert links is not None
+    with pytest.raises(ValueError, match="uncertainty: .* it was edited"):
+        there.spectrum(SEES, uncertainty=True)
 
 
 def test_a_scene_of_named_objects_moves_one_of_them():

@@ -90,6 +90,26 @@ def test_powers_that_hold_absorption_are_looked_for_with_it(field):
         field.locate([read, other])
 
 
+def test_a_spectrum_says_which_transmitter_carrier_and_air_it_is_of(scene, field):
+    """As a data set of it does: a field's spectrum under another transmitter was looked for under the field's own."""
+    other, air = field.transmitter - [0.5, 0.4, 0.3], wr.Air(pressure_hpa=30_000.0, water_vapour_g_m3=100.0)
+    humid, sources = field.with_gas(air), np.array([field.transmitter, other])
+    both = humid.spectrum(np.repeat(UNSEEN[:1], 2, axis=0), sources)
+    for one, source in zip((both[0], both[1]), sources, strict=True):
+        of = {
+            "transmitter": source,
+            "frequency_hz": field.frequency_hz,
+            "beam_sigma_rad": field.beam_sigma_rad,
+        }
+        ds = wr.SpectrumDataset.from_spectra(
+            receivers=UNSEEN[:1], path_gain=one.path_gain[None], floor=field.floor, attributes=air.attributes, **of
+        )  # fmt: skip
+        found = [field.locate(told) for told in (ds, ds[0], one)]
+        assert len({place.position.tobytes() for place in found}) == 1 and found[0].known
+    with pytest.raises(ValueError, match="measured: got 320 GHz, expected 300"):
+        field.locate(field.at_frequency(320e9).spectrum(UNSEEN[0]))
+
+
 def test_a_horn_of_unknown_gain_and_azimuth_finds_all_three(field, horn):
     found = field.locate(horn)
     assert np.linalg.norm(found.position - UNSEEN[1]) < 0.15

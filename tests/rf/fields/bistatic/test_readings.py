@@ -149,6 +149,21 @@ def test_several_transmitters_are_fitted_together_and_remembered(scene, tmp_path
     assert both > 25.0
 
 
+def test_rows_of_which_nothing_was_read_change_nothing(scene, turned):
+    """Wherever they stand: a field whose first row was NaN, under a transmitter of its own, could not be made."""
+    part = turned.subset(np.arange(36))
+    ends = {"transmitters": np.vstack([TX + [0.3, 0.2, 0.0], part.transmitters])}
+    ends["receivers"] = np.vstack([RECEIVERS[7], part.receivers])
+    first = {"power": np.append(np.nan, part.power), "floor": np.append(1e-12, part.floor), "std_db": 0.0}
+    arrival, chain = np.vstack([[1.5, 0.0], part.arrival]), ["horn"] * 37
+    more = replace(part, **ends, **first, arrival=arrival, chain=chain)
+    now, before = (RadioField.fit(scene, one, quick=True, effects="single") for one in (more, part))
+    np.testing.assert_array_equal(now.transmitter, TX)
+    np.testing.assert_array_equal(now.fitted_on, before.fitted_on)
+    a, b = (field.spectrum(RECEIVERS[6]).path_gain for field in (now, before))
+    np.testing.assert_allclose(a, b, rtol=1e-6)
+
+
 def test_a_rotator_whose_zero_is_unknown_is_turned_to_the_room(scene, turned):
     assert turned.arrival is not None
     away = replace(

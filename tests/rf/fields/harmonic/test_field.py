@@ -10,6 +10,7 @@ from furnished import ROOM
 from radio_scenes import box_mesh, joined
 
 from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.geometry.splats.gaussians import Gaussians, discs_on_mesh
 from warprrf.rf.fields.harmonic.field import HarmonicField
 from warprrf.rf.fields.harmonic.fitting import FieldOptions
@@ -257,11 +258,15 @@ def test_line_of_sight_path_is_exact(room, truth):
     assert not (truth.paths(BLOCKED).kind == "los").any()
 
 
-def test_phase_and_delay_of_a_path_follow_from_its_vertices(truth):
-    paths = truth.paths(BLOCKED)
+@pytest.mark.parametrize(("line_of_sight", "receiver"), [(None, BLOCKED), ("explicit", VISIBLE)])
+def test_phase_and_delay_of_a_path_follow_from_its_vertices(room, truth, line_of_sight, receiver):
+    paths = field_with(room, truth.layers, line_of_sight=line_of_sight).paths(receiver)
+    paths = paths.select(paths.kind == "diffuse")
     point = paths.vertices[:, 0]
-    length = np.linalg.norm(point - TRANSMITTER, axis=1) + np.linalg.norm(point - BLOCKED, axis=1)
+    length = np.linalg.norm(point - TRANSMITTER, axis=1) + np.linalg.norm(point - receiver, axis=1)
     assert paths.tau == pytest.approx(length / LIGHT, rel=1e-12)
+    out = (point - TRANSMITTER) / np.linalg.norm(point - TRANSMITTER, axis=1, keepdims=True)
+    np.testing.assert_allclose(paths.departure, out, atol=1e-6)
     turned = paths.gain * np.exp(2j * np.pi * np.mod(FREQUENCY * paths.tau, 1.0))
     assert np.abs(np.angle(turned)).max() < 1e-6
 
@@ -269,6 +274,18 @@ def test_phase_and_delay_of_a_path_follow_from_its_vertices(truth):
 def test_max_paths_keeps_the_strongest(truth):
     everything, few = truth.paths(VISIBLE), truth.paths(VISIBLE, max_paths=5)
     assert few.gain == pytest.approx(everything.gain[np.argsort(-everything.power)[:5]])
+
+
+def test_gaussians_are_enough_by_themselves_or_in_a_reconstruction(room, spectra):
+    """One of splats alone was refused for want of a mesh, which an implicit line of sight does not need."""
+    fields = [
+        HarmonicField.fit(one, spectra, iterations=2)
+        for one in (room.gaussians, Reconstruction(room.gaussians))
+    ]
+    a, b = (field.spectrum(VISIBLE).path_gain for field in fields)
+    np.testing.assert_array_equal(a, b)
+    with pytest.raises(TypeError, match="geometry: got int, expected a Mesh, a Scene or anything else"):
+        HarmonicField.fit(3, spectra)
 
 
 def test_options_that_do_not_exist_are_refused(room, spectra):

@@ -43,7 +43,7 @@ from warprrf.rf.channel.array_spectra import check_steering
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.materials import Material
-from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT, check_frequency
+from warprrf.rf.em.waves import NEPER, check_frequency
 from warprrf.rf.fields.base import Data, Location, Measured, RadioField, with_settings
 from warprrf.rf.fields.batches import Work
 from warprrf.rf.fields.bistatic import edited, files
@@ -136,11 +136,6 @@ class BistaticField(RadioField):
     def mesh(self) -> Mesh:
         """What blocks."""
         return self.surface.mesh
-
-    @property
-    def wavelength_m(self) -> float:
-        """Wavelength [m]."""
-        return SPEED_OF_LIGHT / self.frequency_hz
 
     @property
     def state(self) -> Model:
@@ -368,14 +363,10 @@ class BistaticField(RadioField):
     def _seen(self, view: View, uncertainty: bool) -> Spectrum:
         gains = self.path_gains(view)
         image = spectra_of(gains, self._beam)[0]
-        delay, aod = strongest(gains, image, self.beam_sigma_rad)
-        spectrum = Spectrum(
-            path_gain=image.astype(np.float32),
-            delay_s=delay,
-            aod=aod,
-            floor=self.floor,
-            range_db=self.range_db,
-        )
+        known = {"transmitter": view.tracer.transmitter, "frequency_hz": self.frequency_hz}
+        known |= {"beam_sigma_rad": self.beam_sigma_rad} | ({} if self.air is None else self.air.attributes)
+        arrays = image.astype(np.float32), *strongest(gains, image, self.beam_sigma_rad)
+        spectrum = Spectrum(*arrays, self.floor, self.range_db, attributes=known)
         return replace(spectrum, std_db=self._std_db(view, image)) if uncertainty else spectrum
 
     def paths(
@@ -477,9 +468,14 @@ class BistaticField(RadioField):
         """The geometry under ``transmitter`` (3,) [m], by default the fitted one; that of the last few is kept."""
         source = self.transmitter if transmitter is None else check_array("transmitter", transmitter, (3,))
         return Tracer.of(
-            self.surface, source, self.frequency_hz, self.shape, self.sub_pixels,
-            loss_per_m=0.0 if self.air is None else self.air.loss_per_m(self.frequency_hz), device=self.device,
-        )  # fmt: skip
+            self.surface,
+            source,
+            self.frequency_hz,
+            self.shape,
+            self.sub_pixels,
+            air=self.air,
+            device=self.device,
+        )
 
     def suggest(
         self,
@@ -551,8 +547,9 @@ class BistaticField(RadioField):
         """Standard deviation of the dB image per pixel (H, W); see :mod:`warprrf.rf.fields.bistatic.uncertainty`."""
         if self.errors is None:
             raise ValueError(
-                f"uncertainty: no receiver was held out of this field's fit to {self.report.get('receivers', 0)}, so its "
-                "error is not known; fit whole spectra of four or more, without quick=True"
+                f"uncertainty: no receiver was held out of this field's fit to {self.report.get('receivers', 0)}, or it was "
+                "edited, or is of another carrier since, so its error is not known; fit whole spectra of four or more, without "
+                "quick=True"
             )
         rows = np.unique(self.material, return_index=True)[1]
         lit = materials_of(view.tracer, self.parameters, self.effects)

@@ -20,6 +20,7 @@ from scipy.ndimage import uniform_filter
 from threadpoolctl import threadpool_limits
 
 from warprrf.device import Progress
+from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT
 from warprrf.rf.fields.base import Location, Measured
 from warprrf.rf.fields.bistatic.field_map import SPACING_M, FieldMap, best_on_map, coarse, maps_of
@@ -45,11 +46,11 @@ def as_data(field: Any, measured: Any) -> list[Measured]:
             raise ValueError(
                 f"measured: got {len(measured.path_gain)} spectra, expected that of one receiver"
             )
-        own = {name: getattr(field, name) for name in ("transmitter", "frequency_hz", "beam_sigma_rad")}
-        own = {name: measured.attributes.get(name, value) for name, value in own.items()}
+        told, names = measured.attributes, ("transmitter", "frequency_hz", "beam_sigma_rad")
+        own, air = {n: told.get(n, getattr(field, n)) for n in names}, Air.from_attributes(told)
         measured = SpectrumDataset.from_spectra(
-            receivers=field.transmitter[None] + 1.0, path_gain=measured.path_gain[None],
-            floor=measured.floor or field.floor, **own,
+            receivers=own["transmitter"][None] + 1.0, path_gain=measured.path_gain[None],
+            floor=measured.floor or field.floor, attributes=None if air is None else air.attributes, **own,
         )  # fmt: skip
     found = []
     for one in as_list(measured):

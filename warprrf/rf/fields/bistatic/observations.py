@@ -436,14 +436,13 @@ class Kind(ABC):
         """What was read at ``place``, where ``view`` is seen."""
 
     def frame(self) -> SpectrumDataset:
-        """What a field's spectra are made with, if it is the first: floor and range are those of the powers."""
+        """What a field's spectra are made with, if it is the first; its transmitter is the first of which anything was read."""
         one = self.one
-        floor = float(np.min(one.floor))
-        levels = 10.0 * float(np.log10(floor)), 10.0 * float(np.log10(np.nanmax(one.power)))
+        first = np.isfinite(one.power).reshape(len(one), -1).any(axis=1).argmax()
         none = SpectrumDataset.empty(
-            transmitter=one.transmitters[0], frequency_hz=one.frequency_hz, shape=READINGS_SHAPE, floor=floor
+            transmitter=one.transmitters[first], frequency_hz=one.frequency_hz, shape=READINGS_SHAPE
         )
-        return replace(none, range_db=levels, attributes={} if one.air is None else one.air.attributes)
+        return replace(none, attributes={} if one.air is None else one.air.attributes)
 
 
 @dataclass(eq=False)

@@ -22,7 +22,6 @@ from warprrf.rf.fields.bistatic.observations import NOISE_DB, READING_ERROR_DB
 from warprrf.rf.spectra.antenna import Antenna, turned_gain
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_of
 from warprrf.rf.tracing.model import Model
-from warprrf.rf.tracing.records import Records
 from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.tracer import SPECULAR, Tracer
 
@@ -87,9 +86,11 @@ class Sensitivity:
         s, count = self.tracer.surface, SHAPE[0] * SHAPE[1]
         elements = len(s.element_area)
         pixel = np.ravel_multi_index(pixel_of(view.paths.arrival, SHAPE), SHAPE)
-        mirror = first_mirror(view.records[SPECULAR])
-        own = mirror >= 0
-        parts = [(pixel[own], 2 * elements + mirror[own], found.specular[own])]
+        table = view.records[SPECULAR]
+        is_mirror = (table.kind == MIRROR) & (table.index >= 0)
+        own, first = is_mirror.any(axis=1), is_mirror.argmax(axis=1)
+        mirror = table.index[np.flatnonzero(own), first[own]]  # whatever slabs a path passes before
+        parts = [(pixel[own], 2 * elements + mirror, found.specular[own])]
         rest = [(pixel[~own], found.specular[~own])]
         learned = self.model.learned_rows(self.tracer.transmitter)
         for name, power in found.powers.items():
@@ -101,10 +102,10 @@ class Sensitivity:
                 # transmitter's light, whose gains are others.
                 rest.append((ray, power))
         row, unknown, power = (np.concatenate(column) for column in zip(*parts, strict=True))
-        table = csr_matrix((power, (row, unknown)), shape=(count, 2 * elements + s.groups))
+        due = csr_matrix((power, (row, unknown)), shape=(count, 2 * elements + s.groups))
         ray, power = (np.concatenate(column) for column in zip(*rest, strict=True))
         known = np.bincount(ray, power, minlength=count)
-        return table, np.asarray(table.sum(axis=1)).ravel() + known
+        return due, np.asarray(due.sum(axis=1)).ravel() + known
 
     def of(self, place: np.ndarray, turned: np.ndarray | None) -> tuple[np.ndarray, csr_matrix]:
         """Of a spectrum at ``place``: squared derivatives, summed over its pixels [dB^2/neper^2], shape ``(U,)``. And the
@@ -135,13 +136,6 @@ def precision(
     for sensitivity, place in with_progress(measured, "suggest", progress):
         known += np.asarray(sensitivity.of(place, turned)[1].sum(axis=0)).ravel()
     return known
-
-
-def first_mirror(table: Records) -> np.ndarray:
-    """Group of the first mirror of each record, whatever slabs it passes before, -1 for none, shape ``(N,)``."""
-    is_mirror = (table.kind == MIRROR) & (table.index >= 0)
-    first = np.take_along_axis(table.index, is_mirror.argmax(axis=1)[:, None], axis=1)[:, 0]
-    return np.where(is_mirror.any(axis=1), first, -1)
 
 
 def suggest(

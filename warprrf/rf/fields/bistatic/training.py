@@ -94,10 +94,9 @@ def trace(
     views: dict[int, View] = {}
     for own in together.values():
         first = places[own[0]]
-        loss_per_m = 0.0 if first.air is None else first.air.loss_per_m(first.frequency_hz)
         make = partial(
             Tracer.of, surface, first.transmitter, first.frequency_hz, first.shape, sub_pixels,
-            loss_per_m=loss_per_m, device=str(resolve(device)),
+            air=first.air, device=str(resolve(device)),
         )  # fmt: skip
         tracer = make()
         receivers = np.stack([places[k].receiver for k in own])

@@ -30,9 +30,18 @@ from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.cache import Cache
-from warprrf.checks import Expected, Positive, check_array, check_arrays, checked, one_line, within
+from warprrf.checks import (
+    Expected,
+    Positive,
+    check_array,
+    check_arrays,
+    check_type,
+    checked,
+    one_line,
+    within,
+)
 from warprrf.device import DeviceLike, Progress
-from warprrf.geometry.mesh import GeometryLike, Mesh
+from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.splats.gaussians import Gaussians, discs_on_mesh, gaussians_of
 from warprrf.geometry.splats.rasterizer import Parameters, Rasterizer
 from warprrf.kernels.radio import harmonics as _kernels
@@ -287,7 +296,7 @@ class HarmonicField(RadioField):
     def _free_space(self, length_m: float | np.ndarray) -> float | np.ndarray:
         """Gain of a path of ``length_m`` [m] between isotropic antennas, less what the air absorbs."""
         with np.errstate(divide="ignore"):
-            gain = (SPEED_OF_LIGHT / self.frequency_hz / (4 * np.pi * length_m)) ** 2
+            gain = (self.wavelength_m / (4 * np.pi * length_m)) ** 2
         return gain if self.air is None else gain * self.air.transmittance(self.frequency_hz, length_m)
 
     def _seen_from(self, receivers: np.ndarray, progress: Progress | None) -> Transport:
@@ -329,10 +338,10 @@ class HarmonicField(RadioField):
         elif friis > 0 and self.options.model == "rf3dgs+":
             direct = near_line_of_sight(receiver, source, self.shape, self.beam_sigma_rad)
         toward = receiver - source
-        delay = np.where(direct, np.linalg.norm(toward) / SPEED_OF_LIGHT, delay)
-        angles = np.where(direct[..., None], np.stack(angles_from_directions(toward)), angles)
-        spectrum = Spectrum(power.astype(np.float32), delay, angles, self.floor, self.range_db)
-        return View(spectrum, receiver, source, point, friis, beam)
+        soonest = np.where(direct, np.linalg.norm(toward) / SPEED_OF_LIGHT, delay)
+        aod = np.where(direct[..., None], np.stack(angles_from_directions(toward)), angles)
+        spectrum = Spectrum(power.astype(np.float32), soonest, aod, self.floor, self.range_db)
+        return View(spectrum, receiver, source, point, delay, angles, friis, beam)
 
     def _channels(self, seen: Transport) -> tuple[np.ndarray, np.ndarray]:
         """Learned delay [s] and vector of departure; NaN where a ray meets nothing or nothing was learned."""
@@ -348,17 +357,13 @@ def _geometry(geometry: GeometryLike | Gaussians) -> tuple[Gaussians, Mesh | Non
     if isinstance(geometry, Gaussians):
         return geometry, None
     gaussians = gaussians_of(geometry)
-    mesh = geometry if isinstance(geometry, Mesh) else getattr(geometry, "mesh", None)
-    if gaussians is None and mesh is not None:
-        gaussians = discs_on_mesh(mesh)
-    if not isinstance(gaussians, Gaussians):
-        raise TypeError(
-            f"geometry: got {type(geometry).__name__}, expected a Reconstruction (or anything with .gaussians and "
-            ".mesh), a Scene or a Mesh"
-        )
+    if gaussians is None:
+        mesh = as_mesh(geometry, "geometry")
+        return discs_on_mesh(mesh), mesh
+    check_type("geometry.gaussians", gaussians, Gaussians)
     if len(gaussians) == 0:
         raise ValueError("geometry: got no Gaussians, expected at least one")
-    return gaussians, mesh
+    return gaussians, getattr(geometry, "mesh", None) if getattr(geometry, "has_mesh", True) else None
 
 
 def _train(

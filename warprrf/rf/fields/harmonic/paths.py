@@ -21,7 +21,8 @@ class View:
     Attributes:
         spectrum: the spectrum at ``receiver``.
         receiver, transmitter: positions [m], shape ``(3,)``.
-        points: interaction points [m], shape ``(H, W, 3)``; NaN where unknown.
+        points, delay_s, aod: interaction points [m], shape ``(H, W, 3)``, delays [s] and departures [rad] of what does not come
+            directly, of all pixels; NaN where unknown.
         line_of_sight_gain: its Friis gain; 0 where the mesh does not let the two see each other.
         beam: power of the explicit line of sight per pixel, shape ``(H, W)``; None if the model has none.
     """
@@ -30,6 +31,8 @@ class View:
     receiver: np.ndarray
     transmitter: np.ndarray
     points: np.ndarray
+    delay_s: np.ndarray
+    aod: np.ndarray
     line_of_sight_gain: float
     beam: np.ndarray | None
 
@@ -56,9 +59,8 @@ def paths_of(view: View, beam_sigma_rad: float, frequency_hz: float, max_paths: 
         diffuse = diffuse * (max(rest, 0.0) / diffuse.sum())
     else:
         line_of_sight = total  # nothing else has power
-    columns = spectrum.delay_s, pixel_directions(shape), spectrum.aod, view.points
-    known = [np.asarray(values)[row, column] for values in columns]
-    parts: list[Any] = [diffuse, *known, ["diffuse"] * len(diffuse)]
+    columns = view.delay_s, pixel_directions(shape), view.aod, view.points
+    parts: list[Any] = [diffuse, *(a[row, column] for a in columns), ["diffuse"] * len(diffuse)]
     if line_of_sight > 0:
         departure = np.stack(angles_from_directions(outward[None]), axis=-1)
         flight, nowhere = np.linalg.norm(outward) / SPEED_OF_LIGHT, np.full((1, 3), np.nan)
