@@ -40,7 +40,7 @@ VERSIONS = {
     "metrics": 1,
     "exact": 2,
     "sionna": 1,
-    "bistatic": 7,
+    "bistatic": 8,
     "harmonic": 1,
     "lookups": 1,
     "networks": 1,
