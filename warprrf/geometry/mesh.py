@@ -21,7 +21,6 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
-from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
 from warprrf.checks import (
     LARGEST_M,
@@ -33,7 +32,7 @@ from warprrf.checks import (
     one_line,
     within,
 )
-from warprrf.device import DeviceLike
+from warprrf.device import DeviceLike, launch, resolve
 from warprrf.geometry.mesh_files import MeshOptions, load_mesh
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
 from warprrf.kernels.rays.mesh import closest_faces, find_crossings, find_touching
@@ -320,7 +319,7 @@ class Mesh:
 
     def on_device(self, device: DeviceLike = None) -> wp.Mesh:
         """The Warp mesh on ``device`` with its vertices relative to :attr:`center`, built once per device."""
-        return self._rays.on_device(_device.resolve(device))[0]
+        return self._rays.on_device(resolve(device))[0]
 
     def cast(
         self,
@@ -350,7 +349,7 @@ class Mesh:
             ImportError: if Embree is asked for and Open3D is not installed.
         """
         o, d = check_rows(("origins", origins), ("directions", directions), per_origin)
-        where = _device.resolve(device)
+        where = resolve(device)
         t, face = self._rays.nearest(o, d, per_origin=per_origin, device=where, backend=backend)
         if face.min(initial=0) < 0 and self.is_closed:
             self._rays.recast(o, d, t, face, per_origin=per_origin, device=where, backend=backend)
@@ -380,18 +379,18 @@ class Mesh:
             Shape ``(N,)``, bool.
         """
         start, end = check_rows(("a", a), ("b", b))
-        where = _device.resolve(device)
+        where = resolve(device)
         return self._rays.free(start, end, clearance=clearance, device=where, backend=backend)
 
     def closest(self, points: ArrayLike, *, device: DeviceLike = None) -> Closest:
         """The nearest point of the surface to each of ``points`` (N, 3) [m], in float64 once the face is known."""
         p = check_array("points", points, (None, 3))
-        where = _device.resolve(device)
+        where = resolve(device)
         face = wp.zeros(len(p), dtype=wp.int32, device=where)
         reach = float(
             np.abs(p - self.center).max(initial=0.0) * 4.0 + np.ptp(self.bounds, axis=0).sum() * 4.0 + 1.0
         )
-        _device.launch(
+        launch(
             closest_faces,
             len(p),
             [self.on_device(where).id, p - self.center, reach, face],
@@ -417,11 +416,11 @@ class Mesh:
             int32.
         """
         p, d = check_array("points", points, (None, 3)), check_array("directions", directions, (None, 3))
-        where = _device.resolve(device)
+        where = resolve(device)
         bvh, corners = self._boxes(where)
         winding, side = (wp.zeros(len(p) * len(d), dtype=wp.int32, device=where) for _ in range(2))
         inputs = [bvh.id, corners, p - self.center, d, winding, side]
-        _device.launch(find_crossings, len(p) * len(d), inputs, device=where)
+        launch(find_crossings, len(p) * len(d), inputs, device=where)
         return winding.numpy().reshape(len(p), len(d)), side.numpy().reshape(len(p), len(d))
 
     def faces_at(
@@ -432,14 +431,12 @@ class Mesh:
         Of repeated faces the first is named.
         """
         p = check_array("points", points, (None, 3))
-        where = _device.resolve(device)
+        where = resolve(device)
         bvh, corners = self._boxes(where)
         put = wp.array(p - self.center, dtype=wp.vec3d, device=where)
         start, count, face = (wp.zeros(n, dtype=wp.int32, device=where) for n in (len(p), len(p), 0))
         for _ in range(2):  # how many, then which
-            _device.launch(
-                find_touching, len(p), [bvh.id, corners, put, reach_m, start, count, face], device=where
-            )
+            launch(find_touching, len(p), [bvh.id, corners, put, reach_m, start, count, face], device=where)
             many = count.numpy()
             start = wp.array(np.cumsum(many) - many, dtype=wp.int32, device=where)
             row = np.repeat(np.arange(len(p)), many)

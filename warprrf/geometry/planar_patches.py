@@ -16,9 +16,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
 from warprrf.checks import check_similarity, warn
+from warprrf.device import filled, launch, resolve
 from warprrf.geometry.edges import Edges, mesh_edges
 from warprrf.geometry.mesh import Mesh, components, edge_pairs, vectors_across
 from warprrf.kernels.rays.mesh import OverlapFaces, find_overlaps
@@ -188,7 +188,7 @@ class PlanarPatches:
             low, high = grown.min(axis=1) - reach, grown.max(axis=1) + reach
             low[flat], high[flat] = -np.inf, np.inf
             wide = slack_m + self.tolerance_m
-            return _device.filled(
+            return filled(
                 PatchFaces, "cpu", ends=ends, normal=self.normal, corners=corner, low=self.boxes[:, 0] - wide,
                 high=self.boxes[:, 1] + wide, face_low=low, face_high=high,
             )  # fmt: skip
@@ -198,13 +198,13 @@ class PlanarPatches:
     def contains(self, patch: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Whether point k [m], on the plane of patch ``patch[k]``, lies in it or close beside it, shape ``(N,)``."""
         slack_m = 1e-9  # width added to every face: faces leave no seam between them
-        where, inside = _device.resolve("cpu"), np.empty(len(patch), dtype=bool)
+        where, inside = resolve("cpu"), np.empty(len(patch), dtype=bool)
         given = partial(wp.array, device=where, copy=False)
         inputs = [
             self._by_patch(slack_m), slack_m, given(np.asarray(patch, np.int32), dtype=wp.int32),
             given(np.asarray(points, float), dtype=wp.vec3d), given(inside, dtype=wp.bool),
         ]  # fmt: skip
-        _device.launch(lie_in_patches, len(patch), inputs, device=where)
+        launch(lie_in_patches, len(patch), inputs, device=where)
         return inside
 
 
@@ -338,18 +338,18 @@ def _overlaps(faces: _Faces, piece: np.ndarray) -> np.ndarray:
     """Pairs of faces that lie on each other within the tolerance, in pieces of one group, shape ``(N, 2)``: each face with
     one of the largest such piece."""
     own = np.flatnonzero(piece >= 0)
-    where = _device.resolve("cpu")
+    where = resolve("cpu")
     corners = faces.mesh.triangles[own] - faces.mesh.center
     margin = 2.0 * faces.distance_m  # float32's rounding is less
     low, high = corners.min(axis=1) - margin, corners.max(axis=1) + margin
     bvh = wp.Bvh(*(wp.array(x.astype(np.float32), dtype=wp.vec3, device=where) for x in (low, high)))
     area = faces.mesh.areas[own]
-    held = _device.filled(
+    held = filled(
         OverlapFaces, where, corners=corners, normal=faces.mesh.face_normals[own], area=area, part=piece[own],
         group=faces.group[own], part_area=np.bincount(piece[own], area),
     )  # fmt: skip
     other = wp.full(len(own), -1, dtype=wp.int32, device=where)
-    _device.launch(find_overlaps, len(own), [bvh.id, held, faces.distance_m, other], device=where)
+    launch(find_overlaps, len(own), [bvh.id, held, faces.distance_m, other], device=where)
     found = other.numpy()
     return np.column_stack([own, own[found]])[found >= 0]
 

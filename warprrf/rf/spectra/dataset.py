@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from warprrf import device as _device
 from warprrf.checks import Seed, Shaped, check_array, check_chosen, check_count, checked, positive, whole
-from warprrf.device import DeviceLike
+from warprrf.device import DeviceLike, Progress
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import Hertz
 from warprrf.rf.spectra import dataset_files
@@ -357,7 +356,7 @@ class SpectrumDataset:
         *,
         boresight_gain_dbi: float | None = None,
         noise: float = 0.0,
-        progress: _device.Progress | None = None,
+        progress: Progress | None = None,
         **options: Any,
     ) -> SpectrumDataset:
         """These spectra without the antenna that measured them.

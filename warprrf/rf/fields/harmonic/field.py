@@ -28,10 +28,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf import device as _device
 from warprrf.cache import Cache
 from warprrf.checks import Expected, Positive, check_array, check_arrays, checked, one_line, within
-from warprrf.device import DeviceLike, Progress
+from warprrf.device import DeviceLike, Progress, launch
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.geometry.splats.gaussians import Gaussians, discs_on_mesh, gaussians_of
 from warprrf.geometry.splats.rasterizer import Parameters, Rasterizer
@@ -263,7 +262,7 @@ class HarmonicField(RadioField):
             points, lengths = (wp.empty(len(toward), dtype=t, device=device) for t in (wp.vec3d, wp.float64))
             inputs = [how, wp.vec3d(origin), wp.vec3d(transmitter), directions, *self._on_device()[:3]]
             inputs += [view.dominant, ranges, points, lengths]
-            _device.launch(_rays.single_bounces, len(toward), inputs, device=device)
+            launch(_rays.single_bounces, len(toward), inputs, device=device)
             yield points.numpy().reshape(*self.shape, 3), lengths.numpy().reshape(self.shape)
 
     def _factor(self, length: np.ndarray) -> np.ndarray:
@@ -308,7 +307,7 @@ class HarmonicField(RadioField):
             name, lambda: wp.array(self.layers[name], dtype=kernels.vec16, device=device)
         )
         inputs = [kind, view.start, view.gaussian, view.weight, basis, layer, out]
-        _device.launch(kernels.predict, len(out), inputs, device=device)
+        launch(kernels.predict, len(out), inputs, device=device)
         return out.numpy().reshape(self.shape).astype(np.float64)
 
     def _view_from(self, receiver: np.ndarray, source: np.ndarray) -> View:
