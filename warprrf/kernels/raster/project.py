@@ -272,7 +272,7 @@ def build_project(real: type) -> Any:
 
 
 @wp.func
-def whitened_sums(y: sums_d, a: wp.vec3d, steep: wp.float64, opacity: wp.float64):  # type: ignore[valid-type]
+def whitened_sums(y: sums_d, a: wp.vec3d, steep: wp.float64, opacity: wp.float64):
     """Y1 and Y2 in the Gaussian's axes, from the summed numbers in the turned ones."""
     flat = wp.float64(-1.0) / steep
     f = wp.float64(-0.5) * opacity

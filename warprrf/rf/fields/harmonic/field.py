@@ -155,7 +155,7 @@ class HarmonicField(RadioField):
             mesh=mesh,
             transmitter=transmitter,
             **{n: getattr(ds, n) for n in ("frequency_hz", "floor", "range_db", "beam_sigma_rad")},
-            shape=images.shape[1:],  # type: ignore[arg-type]
+            shape=images.shape[1:],
             options=replace(chosen, checkpoint=None),
             layers={},
             gain_unit=1.0,
