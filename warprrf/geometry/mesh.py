@@ -556,8 +556,7 @@ def _closest_on_triangles(p: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def components(count: int, pairs: np.ndarray) -> np.ndarray:
     """Number of the connected component of each of ``count`` things, of which ``pairs`` (N, 2) are linked, ``(count,)``."""
     link = sparse.coo_array((np.ones(len(pairs), bool), pairs.T), shape=(count, count))
-    found: np.ndarray = csgraph.connected_components(link, directed=False)[1]
-    return found
+    return csgraph.connected_components(link, directed=False)[1]
 
 
 def edge_pairs(corner: np.ndarray, face: np.ndarray | None = None) -> np.ndarray:

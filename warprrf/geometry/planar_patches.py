@@ -129,7 +129,7 @@ class PlanarPatches:
     @property
     def once(self) -> np.ndarray:
         """Faces that repeat no other, shape ``(F,)``, bool."""
-        return np.asarray(self.first == np.arange(len(self.first)))
+        return self.first == np.arange(len(self.first))
 
     @cached_property
     def curved_m2(self) -> float:

@@ -308,8 +308,7 @@ class EmbreeScene:
         met = self._scene.test_occlusions(
             self._o3d.core.Tensor.from_numpy(rays), tnear=0.0, tfar=1.0, nthreads=self._threads_for(rays)
         )
-        hit: np.ndarray = met.numpy()
-        return hit
+        return met.numpy()
 
     def _threads_for(self, rays: np.ndarray) -> int:
         return min(threads(), 1 + len(rays) // _RAYS_A_THREAD)

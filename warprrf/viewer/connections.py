@@ -115,10 +115,7 @@ def open_server(host: str, port: int, refused: Callable[[str], None]) -> tuple[A
             wrong = _refusal(request, token)
             if wrong is not None:
                 return connection.respond(http.HTTPStatus.FORBIDDEN, f"{wrong}\n")
-            found: Response | None = process_request(
-                connection, replace(request, path=request.path.removeprefix(f"/{token}"))
-            )
-            return found
+            return process_request(connection, replace(request, path=request.path.removeprefix(f"/{token}")))
 
         return serve(handler, *address, process_request=asked, create_connection=Checked, **options)
 

@@ -16,7 +16,7 @@ from warprrf.checks import check_count, check_type
 from warprrf.device import Progress, TimeLeft, require
 
 
-class _GivenUp(Exception):  # noqa: N818
+class _GivenUp(Exception):
     """Raised in background work that nobody waits for any more."""
 
 

@@ -161,7 +161,7 @@ class Survey:
         axes = [np.arange(a + 0.5 * CANDIDATE_M, b, CANDIDATE_M) for a, b in mesh.bounds[:, :2].T]
         places = np.stack(np.meshgrid(*axes, [float(self.height.value)]), axis=-1).reshape(-1, 3)
         places = places[is_free(mesh, places, field.transmitter, device=field.device)]
-        return np.asarray(places[np.linalg.norm(places - field.transmitter, axis=1) > CLEAR_M])
+        return places[np.linalg.norm(places - field.transmitter, axis=1) > CLEAR_M]
 
     def _suggest(self, field: BistaticField, progress: Progress) -> None:
         places = self.candidates(field)

@@ -485,7 +485,7 @@ def _sees(
     cosine = np.einsum("hwc,rc->rhw", pixel_directions(gain.shape[1:]), way / length[:, None])
     near = cosine > np.cos(max(3.0 * sigma_rad, 2.0 * np.pi / gain.shape[1]))
     received = np.where(near, np.nan_to_num(gain), 0.0).sum(axis=(1, 2))
-    return np.asarray(received >= 0.5 * free_space_gain(transmitter, receivers, frequency_hz))
+    return received >= 0.5 * free_space_gain(transmitter, receivers, frequency_hz)
 
 
 def measured_at(ds: SpectrumDataset, receivers: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
@@ -496,7 +496,7 @@ def measured_at(ds: SpectrumDataset, receivers: np.ndarray, transmitter: np.ndar
     own = receivers[np.linalg.norm(under - ds.transmitter, axis=1) <= same_m]
     if len(own) == 0:
         return np.zeros(len(ds.receivers), dtype=bool)
-    return np.asarray(cKDTree(own).query(ds.receivers)[0] <= same_m)
+    return cKDTree(own).query(ds.receivers)[0] <= same_m
 
 
 def _check_roles(role: ArrayLike, count: int) -> np.ndarray:

@@ -132,7 +132,7 @@ class OpacityTraining:
     @property
     def opacities(self) -> np.ndarray:
         """Opacities of the Gaussians seen, shape ``(G,)``."""
-        return np.asarray(self._opacity.numpy())
+        return self._opacity.numpy()
 
     @property
     def state(self) -> np.ndarray:

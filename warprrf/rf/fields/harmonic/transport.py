@@ -101,7 +101,7 @@ class Transport:
         for r, view in enumerate(self.views):
             inputs = [view.start, view.weight, out[r]]
             launch(_kernels.sum_rows, pixels, inputs, device=self.device)
-        return np.asarray(out.numpy().reshape(-1, *self.shape))
+        return out.numpy().reshape(-1, *self.shape)
 
 
 def cutoffs(range_db: tuple[float, float], rule: str = "product") -> Blending:
