@@ -33,7 +33,7 @@ from warprrf.checks import (
     within,
 )
 from warprrf.device import DeviceLike, launch, resolve
-from warprrf.geometry.mesh_files import MeshOptions, load_mesh
+from warprrf.geometry.mesh_files import load_mesh
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
 from warprrf.kernels.rays.mesh import closest_faces, find_crossings, find_touching
 from warprrf.rows import distinct_rows
@@ -172,7 +172,7 @@ class Mesh:
         Example:
             >>> mesh = Mesh.load("room.stl", unit="mm")  # doctest: +SKIP
         """
-        content = load_mesh(path, MeshOptions(unit, up, simplify, allow_outside))
+        content = load_mesh(path, unit=unit, up=up, simplify=simplify, allow_outside=allow_outside)
         return cls(content.vertices, content.faces, **content.known)
 
     def __repr__(self) -> str:
