@@ -51,7 +51,7 @@ _RAYS_A_THREAD = 4_096
 _LONGEST = 1e18
 
 
-@dataclass(eq=False, repr=False)
+@dataclass(eq=False)
 class Hit:
     """What rays met, one entry a ray.
 

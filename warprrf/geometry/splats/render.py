@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
@@ -29,11 +29,11 @@ class Rendering:
 
     __repr__ = one_line
 
-    features: np.ndarray = field(repr=False)
-    alpha: np.ndarray = field(repr=False)
-    depth: np.ndarray = field(repr=False)
-    dominant: np.ndarray = field(repr=False)
-    peak: np.ndarray = field(repr=False)
+    features: np.ndarray
+    alpha: np.ndarray
+    depth: np.ndarray
+    dominant: np.ndarray
+    peak: np.ndarray
 
 
 @checked
@@ -52,12 +52,12 @@ class BlendWeights:
 
     __repr__ = one_line
 
-    index: np.ndarray = field(repr=False)
-    weight: np.ndarray = field(repr=False)
-    range: np.ndarray = field(repr=False)
-    dominant: np.ndarray = field(repr=False)
-    alpha: np.ndarray = field(repr=False)
-    dropped: np.ndarray = field(repr=False)
+    index: np.ndarray
+    weight: np.ndarray
+    range: np.ndarray
+    dominant: np.ndarray
+    alpha: np.ndarray
+    dropped: np.ndarray
 
 
 @checked

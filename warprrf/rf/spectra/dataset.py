@@ -89,7 +89,7 @@ class Received:
 
 
 @checked
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class SpectrumDataset:
     """Spectra at R receivers.
 

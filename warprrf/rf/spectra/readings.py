@@ -95,7 +95,7 @@ class PowerTable:
 
 
 @checked
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class Readings(PowerTable):
     """N received powers over transmitted power.
 

@@ -443,7 +443,7 @@ class Spectrum:
     floor: NotNegative = 0.0
     range_db: RangeDb | None = None
     std_db: np.ndarray | None = None
-    attributes: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
+    attributes: dict[str, Any] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
         """Check shapes and values; ValueError or TypeError names the field."""

@@ -81,13 +81,13 @@ class HarmonicField(RadioField):
 
     __repr__ = one_line
 
-    gaussians: Gaussians = field(repr=False)
+    gaussians: Gaussians
     options: FieldOptions
-    layers: dict[str, np.ndarray] = field(repr=False)
+    layers: dict[str, np.ndarray]
     gain_unit: Positive
     delay_unit: Annotated[float, within(0.0, 1.0)]
-    mesh: Mesh | None = field(default=None, repr=False)
-    _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(8))
+    mesh: Mesh | None = None
+    _uploaded: Cache = field(init=False, default_factory=lambda: Cache(8))
 
     def __post_init__(self) -> None:
         super().__post_init__()
