@@ -12,7 +12,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, Any, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import warp as wp
@@ -26,11 +26,11 @@ from warprrf.checks import (
     LARGEST_M,
     Count,
     NotNegative,
+    Number,
     check_array,
     check_similarity,
     checked,
     one_line,
-    within,
 )
 from warprrf.device import DeviceLike, launch, resolve
 from warprrf.geometry.mesh_files import load_mesh
@@ -457,9 +457,9 @@ class Mesh:
             corners = self.triangles[self.distinct_faces] - self.center
             margin = 1e-6 * float(np.ptp(self.bounds, axis=0).max())
             bounds = [corners.min(axis=1) - margin, corners.max(axis=1) + margin]
-            low, high = (wp.array(x.astype(np.float32), dtype=wp.vec3, device=where) for x in bounds)
+            low, high = (wp.array(x, dtype=wp.vec3, device=where) for x in bounds)
             bvh = wp.Bvh(low, high, constructor="sah")  # as on a CPU
-            return bvh, wp.array(np.ascontiguousarray(corners), dtype=wp.vec3d, device=where)
+            return bvh, wp.array(corners, dtype=wp.vec3d, device=where)
 
         return self._boxed.get(str(where), build)
 
@@ -473,7 +473,7 @@ class Mesh:
         scale, turn, moved = check_similarity(scale, rotation, shift)
         return Mesh(**self.__getstate__() | {"vertices": scale * self.vertices @ turn.T + moved})
 
-    def cross_section(self, height: Annotated[float, within()]) -> np.ndarray:
+    def cross_section(self, height: Number) -> np.ndarray:
         """Line segments in which the surface meets the plane z = ``height`` [m]: a floor plan, shape ``(S, 2, 2)`` [m]."""
         above = self.triangles[:, :, 2] > height
         cut = (above.sum(axis=1) % 3) > 0

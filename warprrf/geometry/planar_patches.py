@@ -342,7 +342,7 @@ def _overlaps(faces: _Faces, piece: np.ndarray) -> np.ndarray:
     corners = faces.mesh.triangles[own] - faces.mesh.center
     margin = 2.0 * faces.distance_m  # float32's rounding is less
     low, high = corners.min(axis=1) - margin, corners.max(axis=1) + margin
-    bvh = wp.Bvh(*(wp.array(x.astype(np.float32), dtype=wp.vec3, device=where) for x in (low, high)))
+    bvh = wp.Bvh(*(wp.array(x, dtype=wp.vec3, device=where) for x in (low, high)))
     area = faces.mesh.areas[own]
     held = filled(
         OverlapFaces, where, corners=corners, normal=faces.mesh.face_normals[own], area=area, part=piece[own],

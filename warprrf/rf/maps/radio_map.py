@@ -14,7 +14,7 @@ from typing import Annotated, Any, TypeAlias
 import numpy as np
 
 from warprrf import netcdf_files
-from warprrf.checks import Positive, Shaped, check_array, checked, one_of, within
+from warprrf.checks import Number, Positive, Shaped, check_array, checked, one_of
 from warprrf.device import require
 from warprrf.files import write_bytes
 from warprrf.geometry.mesh import Mesh
@@ -41,7 +41,6 @@ QUANTITIES = {
 """What :meth:`RadioMap.plot` draws, and how the picture calls it."""
 
 
-Number: TypeAlias = Annotated[float, within()]
 Layer: TypeAlias = Annotated[np.ndarray, Shaped("Y X", finite=False, least=0.0)]
 Quantity: TypeAlias = Annotated[str, one_of(*QUANTITIES)]
 

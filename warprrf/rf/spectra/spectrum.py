@@ -395,7 +395,7 @@ def _least_falls(shape: tuple[int, int], sigma: float, device: str) -> tuple[wp.
     fall[nearest > 2.0 * np.sin(0.5 * _cutoff(shape, sigma)) * (1.0 + 1e-6)] = np.inf
     return (
         wp.array(first, dtype=wp.int32, device=device),
-        wp.array(fall.astype(np.float32), dtype=wp.float32, device=device),
+        wp.array(fall, dtype=wp.float32, device=device),
     )
 
 

@@ -149,7 +149,7 @@ class HarmonicField(RadioField):
         warn_of_unmodelled(mesh, transmitter, receivers, frequency_hz=ds.frequency_hz, device=device)
         if mesh is None and (chosen.line_of_sight == "explicit" or chosen.interaction_point == "mesh"):
             raise ValueError('line_of_sight="explicit" and interaction_point="mesh" need a mesh; got none')
-        images = check_array("ds.path_gain", ds.path_gain, (len(receivers), None, None), np.float64)
+        images = check_array("ds.path_gain", ds.path_gain, (len(receivers), None, None))
         blank = cls(
             gaussians=gaussians,
             mesh=mesh,
