@@ -215,7 +215,7 @@ def _simulate(args: argparse.Namespace, out: Output) -> None:
     out.resumes(unfinished)
     dataset = wr.simulate(
         load_scene(args.scene, args),
-        transmitter=np.array(args.transmitter, dtype=np.float64),
+        transmitter=args.transmitter,
         receivers=read_receivers(args.receivers),
         frequency_hz=args.frequency,
         shape=tuple(args.shape),
@@ -556,7 +556,7 @@ def _relevance(args: argparse.Namespace, out: Output) -> None:
     receivers = None if args.receivers is None else read_receivers(args.receivers)
     if args.spectra is not None:
         dataset = load_spectra(args.spectra)
-        measured = {"transmitter": dataset.transmitter, "frequency_hz": float(dataset.frequency_hz)}
+        measured = {"transmitter": dataset.transmitter, "frequency_hz": dataset.frequency_hz}
         given = {name: measured[name] if value is None else value for name, value in given.items()}
         receivers = dataset.receivers if receivers is None else receivers
     if receivers is None:

@@ -141,7 +141,7 @@ class Room:
 
     def _draw(self) -> None:
         """Mesh and splats up to the cut; what is hidden is not sent, for browsers sort splats even so."""
-        cut, scene = float(self._cut.value), self._page.scene
+        cut, scene = self._cut.value, self._page.scene
         with self._page.server.atomic():
             if self._faces is not None and "mesh" not in self._page.hidden:
                 import trimesh

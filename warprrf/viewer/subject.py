@@ -117,7 +117,7 @@ class Subject:
         """That of the field, or of what was measured [Hz]."""
         for known in (self.field, self.spectra, self.readings):
             if known is not None:
-                return float(known.frequency_hz)
+                return known.frequency_hz
         return CARRIER_HZ
 
     @property

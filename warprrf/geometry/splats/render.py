@@ -116,7 +116,7 @@ def blend_weights(
     _check(g, cam)
     check_count("top_k", top_k)
     raster = Rasterizer(device=device, blending=blending)
-    found = raster.strongest(raster.prepare(*raster.upload(g), cam), int(top_k))
+    found = raster.strongest(raster.prepare(*raster.upload(g), cam), top_k)
     indices, weights, ranges, alpha = (array.numpy() for array in found)
     best = np.argmax(weights, axis=2)
     dominant = np.take_along_axis(indices, best[..., None], axis=2)[..., 0]

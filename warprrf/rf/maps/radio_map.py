@@ -113,7 +113,7 @@ class RadioMap:
         Raises:
             ValueError: for a quantity that is not one of :data:`QUANTITIES`.
         """
-        value = np.asarray(getattr(self, quantity))
+        value: np.ndarray = getattr(self, quantity)
         if quantity == "delay_spread_s":
             return value * 1e9
         return value if quantity.endswith("_db") else to_db(value)
