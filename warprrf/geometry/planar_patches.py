@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf.cache import Cache, cached_property
+from warprrf.cache import cached_property
 from warprrf.checks import check_similarity, warn
 from warprrf.device import filled, launch, resolve
 from warprrf.geometry.edges import Edges, mesh_edges
@@ -35,6 +35,8 @@ BENT_RAD = 0.8
 FACETS = 6
 FACET_BEND_RAD = (0.03, 0.62)
 """Facets of a smooth surface: more than a bay window's, bent by less than an octagon's 45 degrees."""
+SEAM_M = 1e-9
+"""Width added to every face, so that faces leave no seam between them [m]."""
 MOST_NOISE_M = 0.05
 """Standard deviation of vertices' errors up to which unevenness is taken for a scanner's [m]."""
 
@@ -166,42 +168,21 @@ class PlanarPatches:
         return boxes
 
     @cached_property
-    def _grown(self) -> Cache:
-        return Cache(4)
-
-    def _by_patch(self, slack_m: float) -> PatchFaces:
-        """Faces patch by patch on the CPU, with boxes of what lies no further than ``slack_m`` from each side of a face: a
-        triangle grown about the centre of its inscribed circle."""
-
-        def make() -> PatchFaces:
-            order, ends = self._faces_and_ends
-            corner, reach = self.mesh.triangles[order], self.tolerance_m + 1e-9
-            side = np.linalg.norm(np.roll(corner, -1, axis=1) - np.roll(corner, 1, axis=1), axis=2)
-            around = np.maximum(side.sum(axis=1), 1e-300)
-            middle = (side[..., None] * corner).sum(axis=1, keepdims=True) / around[:, None, None]
-            radius = 2.0 * self.mesh.areas[order] / around
-            with np.errstate(divide="ignore", invalid="ignore"):
-                grown = np.nan_to_num(
-                    middle + (corner - middle) * (1.0 + slack_m / radius)[:, None, None], nan=np.inf
-                )
-            flat = ~np.isfinite(grown).all(axis=(1, 2))
-            low, high = grown.min(axis=1) - reach, grown.max(axis=1) + reach
-            low[flat], high[flat] = -np.inf, np.inf
-            wide = slack_m + self.tolerance_m
-            return filled(
-                PatchFaces, "cpu", ends=ends, normal=self.normal, corners=corner, low=self.boxes[:, 0] - wide,
-                high=self.boxes[:, 1] + wide, face_low=low, face_high=high,
-            )  # fmt: skip
-
-        return self._grown.get(slack_m, make)
+    def _by_patch(self) -> PatchFaces:
+        """Faces patch by patch on the CPU, with boxes of patches and faces and what lies close beside them."""
+        order, ends = self._faces_and_ends
+        corner, reach = self.mesh.triangles[order], self.tolerance_m + SEAM_M
+        return filled(
+            PatchFaces, "cpu", ends=ends, normal=self.normal, corners=corner, low=self.boxes[:, 0] - reach,
+            high=self.boxes[:, 1] + reach, face_low=corner.min(axis=1) - reach, face_high=corner.max(axis=1) + reach,
+        )  # fmt: skip
 
     def contains(self, patch: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Whether point k [m], on the plane of patch ``patch[k]``, lies in it or close beside it, shape ``(N,)``."""
-        slack_m = 1e-9  # width added to every face: faces leave no seam between them
         where, inside = resolve("cpu"), np.empty(len(patch), dtype=bool)
         given = partial(wp.array, device=where, copy=False)
         inputs = [
-            self._by_patch(slack_m), slack_m, given(np.asarray(patch, np.int32), dtype=wp.int32),
+            self._by_patch, SEAM_M, given(np.asarray(patch, np.int32), dtype=wp.int32),
             given(np.asarray(points, float), dtype=wp.vec3d), given(inside, dtype=wp.bool),
         ]  # fmt: skip
         launch(lie_in_patches, len(patch), inputs, device=where)
