@@ -49,7 +49,7 @@ def once(build: Callable[P, T]) -> Callable[P, T]:
     return locked
 
 
-class cached_property(functools.cached_property[T]):  # noqa: N801  (as functools names it)
+class cached_property(functools.cached_property[T]):  # as functools names it
     """An attribute that is computed when first asked for, by one thread while others wait for it.
 
     That of ``functools`` has a lock for each class in Python 3.11, which stays locked in a child that is forked while

@@ -379,6 +379,7 @@ def one_of(*allowed: object) -> Callable[[str, Any], Any]:
 
 
 Count: TypeAlias = Annotated[int, whole()]
+Number: TypeAlias = Annotated[float, within()]
 Seed: TypeAlias = Annotated[int, whole(0, 2**63 - 1)]
 Positive: TypeAlias = Annotated[float, positive()]
 NotNegative: TypeAlias = Annotated[float, within(0.0)]

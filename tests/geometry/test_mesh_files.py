@@ -10,7 +10,7 @@ from model_files import BLUE, RED, changed_glb, obj_with_materials, room_glb, ro
 
 import warprrf as wr
 from warprrf.geometry import gltf_files, mesh_content, obj_files
-from warprrf.geometry.mesh_files import MeshOptions, load_mesh, read_mesh, write_mesh
+from warprrf.geometry.mesh_files import load_mesh, read_mesh, write_mesh
 
 BLUE_SRGB = np.array(BLUE) / 255.0
 
@@ -184,7 +184,7 @@ def test_a_small_file_that_makes_many_triangles_is_refused(most, tmp_path, monke
 def test_vertices_at_one_place_become_one_in_the_file_s_order(tmp_path):
     text = "v 1 0 0\nv -0 0 0\nv 0 1 0\nv 0 -0 0\nv 1 0 0\nv 0 0 1\nf 1 2 3\nf 4 5 6\n"
     (tmp_path / "two.obj").write_text(text)
-    content = load_mesh(tmp_path / "two.obj", MeshOptions())
+    content = load_mesh(tmp_path / "two.obj")
     np.testing.assert_array_equal(content.vertices, [[1, 0, 0], [0, 0, 0], [0, 1, 0], [0, 0, 1]])
     np.testing.assert_array_equal(content.faces, [[0, 1, 2], [1, 0, 3]])
 

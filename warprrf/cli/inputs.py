@@ -226,7 +226,7 @@ def load_field(path: str | Path, args: argparse.Namespace) -> wr.RadioField:
         return field
     if field.model != "bistatic":
         raise ValueError(f"--frequency: {path} is of model {field.model}, which knows its own carrier alone")
-    return field.at_frequency(args.frequency)  # type: ignore[attr-defined, no-any-return]
+    return field.at_frequency(args.frequency)  # type: ignore[attr-defined]
 
 
 def read_pattern(text: str) -> Any:

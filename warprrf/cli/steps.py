@@ -215,7 +215,7 @@ def _simulate(args: argparse.Namespace, out: Output) -> None:
     out.resumes(unfinished)
     dataset = wr.simulate(
         load_scene(args.scene, args),
-        transmitter=np.array(args.transmitter, dtype=np.float64),
+        transmitter=args.transmitter,
         receivers=read_receivers(args.receivers),
         frequency_hz=args.frequency,
         shape=tuple(args.shape),

@@ -12,7 +12,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, Any, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import warp as wp
@@ -21,20 +21,19 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
-from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
 from warprrf.checks import (
     LARGEST_M,
     Count,
     NotNegative,
+    Number,
     check_array,
     check_similarity,
     checked,
     one_line,
-    within,
 )
-from warprrf.device import DeviceLike
-from warprrf.geometry.mesh_files import MeshOptions, load_mesh
+from warprrf.device import DeviceLike, launch, resolve
+from warprrf.geometry.mesh_files import load_mesh
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
 from warprrf.kernels.rays.mesh import closest_faces, find_crossings, find_touching
 from warprrf.rows import distinct_rows
@@ -173,7 +172,7 @@ class Mesh:
         Example:
             >>> mesh = Mesh.load("room.stl", unit="mm")  # doctest: +SKIP
         """
-        content = load_mesh(path, MeshOptions(unit, up, simplify, allow_outside))
+        content = load_mesh(path, unit=unit, up=up, simplify=simplify, allow_outside=allow_outside)
         return cls(content.vertices, content.faces, **content.known)
 
     def __repr__(self) -> str:
@@ -331,7 +330,7 @@ class Mesh:
 
     def on_device(self, device: DeviceLike = None) -> wp.Mesh:
         """The Warp mesh on ``device`` with its vertices relative to :attr:`center`, built once per device."""
-        return self._rays.on_device(_device.resolve(device))[0]
+        return self._rays.on_device(resolve(device))[0]
 
     def cast(
         self,
@@ -361,7 +360,7 @@ class Mesh:
             ImportError: if Embree is asked for and Open3D is not installed.
         """
         o, d = check_rows(("origins", origins), ("directions", directions), per_origin)
-        where = _device.resolve(device)
+        where = resolve(device)
         t, face = self._rays.nearest(o, d, per_origin=per_origin, device=where, backend=backend)
         if face.min(initial=0) < 0 and self.is_closed:
             self._rays.recast(o, d, t, face, per_origin=per_origin, device=where, backend=backend)
@@ -391,18 +390,18 @@ class Mesh:
             Shape ``(N,)``, bool.
         """
         start, end = check_rows(("a", a), ("b", b))
-        where = _device.resolve(device)
+        where = resolve(device)
         return self._rays.free(start, end, clearance=clearance, device=where, backend=backend)
 
     def closest(self, points: ArrayLike, *, device: DeviceLike = None) -> Closest:
         """The nearest point of the surface to each of ``points`` (N, 3) [m], in float64 once the face is known."""
         p = check_array("points", points, (None, 3))
-        where = _device.resolve(device)
+        where = resolve(device)
         face = wp.zeros(len(p), dtype=wp.int32, device=where)
         reach = float(
             np.abs(p - self.center).max(initial=0.0) * 4.0 + np.ptp(self.bounds, axis=0).sum() * 4.0 + 1.0
         )
-        _device.launch(
+        launch(
             closest_faces,
             len(p),
             [self.on_device(where).id, p - self.center, reach, face],
@@ -428,11 +427,11 @@ class Mesh:
             int32.
         """
         p, d = check_array("points", points, (None, 3)), check_array("directions", directions, (None, 3))
-        where = _device.resolve(device)
+        where = resolve(device)
         bvh, corners = self._boxes(where)
         winding, side = (wp.zeros(len(p) * len(d), dtype=wp.int32, device=where) for _ in range(2))
         inputs = [bvh.id, corners, p - self.center, d, winding, side]
-        _device.launch(find_crossings, len(p) * len(d), inputs, device=where)
+        launch(find_crossings, len(p) * len(d), inputs, device=where)
         return winding.numpy().reshape(len(p), len(d)), side.numpy().reshape(len(p), len(d))
 
     def faces_at(
@@ -443,14 +442,12 @@ class Mesh:
         Of repeated faces the first is named.
         """
         p = check_array("points", points, (None, 3))
-        where = _device.resolve(device)
+        where = resolve(device)
         bvh, corners = self._boxes(where)
         put = wp.array(p - self.center, dtype=wp.vec3d, device=where)
         start, count, face = (wp.zeros(n, dtype=wp.int32, device=where) for n in (len(p), len(p), 0))
         for _ in range(2):  # how many, then which
-            _device.launch(
-                find_touching, len(p), [bvh.id, corners, put, reach_m, start, count, face], device=where
-            )
+            launch(find_touching, len(p), [bvh.id, corners, put, reach_m, start, count, face], device=where)
             many = count.numpy()
             start = wp.array(np.cumsum(many) - many, dtype=wp.int32, device=where)
             row = np.repeat(np.arange(len(p)), many)
@@ -471,9 +468,9 @@ class Mesh:
             corners = self.triangles[self.distinct_faces] - self.center
             margin = 1e-6 * float(np.ptp(self.bounds, axis=0).max())
             bounds = [corners.min(axis=1) - margin, corners.max(axis=1) + margin]
-            low, high = (wp.array(x.astype(np.float32), dtype=wp.vec3, device=where) for x in bounds)
+            low, high = (wp.array(x, dtype=wp.vec3, device=where) for x in bounds)
             bvh = wp.Bvh(low, high, constructor="sah")  # as on a CPU
-            return bvh, wp.array(np.ascontiguousarray(corners), dtype=wp.vec3d, device=where)
+            return bvh, wp.array(corners, dtype=wp.vec3d, device=where)
 
         return self._boxed.get(str(where), build)
 
@@ -487,7 +484,7 @@ class Mesh:
         scale, turn, moved = check_similarity(scale, rotation, shift)
         return Mesh(**self.__getstate__() | {"vertices": scale * self.vertices @ turn.T + moved})
 
-    def cross_section(self, height: Annotated[float, within()]) -> np.ndarray:
+    def cross_section(self, height: Number) -> np.ndarray:
         """Line segments in which the surface meets the plane z = ``height`` [m]: a floor plan, shape ``(S, 2, 2)`` [m]."""
         above = self.triangles[:, :, 2] > height
         cut = (above.sum(axis=1) % 3) > 0
@@ -570,8 +567,7 @@ def _closest_on_triangles(p: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def components(count: int, pairs: np.ndarray) -> np.ndarray:
     """Number of the connected component of each of ``count`` things, of which ``pairs`` (N, 2) are linked, ``(count,)``."""
     link = sparse.coo_array((np.ones(len(pairs), bool), pairs.T), shape=(count, count))
-    found: np.ndarray = csgraph.connected_components(link, directed=False)[1]
-    return found
+    return csgraph.connected_components(link, directed=False)[1]
 
 
 def edge_pairs(corner: np.ndarray, face: np.ndarray | None = None) -> np.ndarray:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,33 +34,15 @@ modelling programs have it that write z-up scenes so."""
 USUAL_SIZE_M = (0.2, 5000.0)  # of what is in metres when nobody said so
 
 
-@dataclass(frozen=True)
-class MeshOptions:
-    """How a mesh file is read.
-
-    Attributes:
-        unit: one of :data:`METRES`; the format's by default: metres.
-        up: the file's axis that points up, ``"x"``, ``"y"`` or ``"z"``; the format's by default: ``"y"`` for glTF, else
-            ``"z"``.
-        simplify: most triangles: more are merged where the surface is flattest.
-        allow_outside: whether the file may name materials, textures and buffers outside its folder.
-    """
-
-    unit: str | None = None
-    up: str | None = None
-    simplify: int | None = None
-    allow_outside: bool = False
-
-    def __post_init__(self) -> None:
-        for name, value, known in (("unit", self.unit, METRES), ("up", self.up, UP)):
-            if value is not None:
-                check_choice(name, value, known)
-        if self.simplify is not None:
-            check_count("simplify", self.simplify, 4)
-
-
-def load_mesh(path: str | os.PathLike[str], options: MeshOptions) -> MeshContent:
-    """Read a mesh file into metres, z up; vertices at one place become one.
+def load_mesh(
+    path: str | os.PathLike[str],
+    *,
+    unit: str | None = None,
+    up: str | None = None,
+    simplify: int | None = None,
+    allow_outside: bool = False,
+) -> MeshContent:
+    """Read a mesh file into metres, z up; vertices at one place become one. Arguments are those of :meth:`Mesh.load`.
 
     Raises:
         OSError, ValueError: as :func:`read_mesh`.
@@ -69,22 +51,26 @@ def load_mesh(path: str | os.PathLike[str], options: MeshOptions) -> MeshContent
     Warns:
         UserWarning: if no unit is given and the mesh is very large or small for one in metres.
     """
-    content = read_mesh(path, allow_outside=options.allow_outside)
-    up = options.up or ("y" if Path(path).suffix.lower() in GLTF else "z")
-    axes, signs = UP[up]
-    turned = content.vertices[:, axes] * np.array(signs) * METRES[options.unit or "m"]
+    for name, value, known in (("unit", unit, METRES), ("up", up, UP)):
+        if value is not None:
+            check_choice(name, value, known)
+    if simplify is not None:
+        check_count("simplify", simplify, 4)
+    content = read_mesh(path, allow_outside=allow_outside)
+    axes, signs = UP[up or ("y" if Path(path).suffix.lower() in GLTF else "z")]
+    turned = content.vertices[:, axes] * np.array(signs) * METRES[unit or "m"]
     vertices, faces = _merged(turned, content.faces)
     if not (np.abs(vertices) < LARGEST_M).all():
-        raise ValueError(f"unit: in {options.unit!r} {path} holds vertices beyond {LARGEST_M:g} m")
+        raise ValueError(f"unit: in {unit!r} {path} holds vertices beyond {LARGEST_M:g} m")
     size = float(np.ptp(vertices, axis=0).max())
-    if options.unit is None and not USUAL_SIZE_M[0] <= size <= USUAL_SIZE_M[1]:
+    if unit is None and not USUAL_SIZE_M[0] <= size <= USUAL_SIZE_M[1]:
         warn(
             f"path: {path} is {size:.3g} m in size if its unit is the metre; give unit= ({', '.join(METRES)})"
         )
     content = replace(content, vertices=vertices, faces=faces, uv=None)
-    if options.simplify is None or len(faces) <= options.simplify:
+    if simplify is None or len(faces) <= simplify:
         return content
-    return content.with_faces(*_simplified(vertices, faces, options.simplify))
+    return content.with_faces(*_simplified(vertices, faces, simplify))
 
 
 def read_mesh(

@@ -16,9 +16,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf import device as _device
-from warprrf.cache import Cache, cached_property
+from warprrf.cache import cached_property
 from warprrf.checks import check_similarity, warn
+from warprrf.device import filled, launch, resolve
 from warprrf.geometry.edges import Edges, mesh_edges
 from warprrf.geometry.mesh import Mesh, components, edge_pairs, vectors_across
 from warprrf.kernels.rays.mesh import OverlapFaces, find_overlaps
@@ -35,6 +35,8 @@ BENT_RAD = 0.8
 FACETS = 6
 FACET_BEND_RAD = (0.03, 0.62)
 """Facets of a smooth surface: more than a bay window's, bent by less than an octagon's 45 degrees."""
+SEAM_M = 1e-9
+"""Width added to every face, so that faces leave no seam between them [m]."""
 MOST_NOISE_M = 0.05
 """Standard deviation of vertices' errors up to which unevenness is taken for a scanner's [m]."""
 
@@ -129,7 +131,7 @@ class PlanarPatches:
     @property
     def once(self) -> np.ndarray:
         """Faces that repeat no other, shape ``(F,)``, bool."""
-        return np.asarray(self.first == np.arange(len(self.first)))
+        return self.first == np.arange(len(self.first))
 
     @cached_property
     def curved_m2(self) -> float:
@@ -166,45 +168,24 @@ class PlanarPatches:
         return boxes
 
     @cached_property
-    def _grown(self) -> Cache:
-        return Cache(4)
-
-    def _by_patch(self, slack_m: float) -> PatchFaces:
-        """Faces patch by patch on the CPU, with boxes of what lies no further than ``slack_m`` from each side of a face: a
-        triangle grown about the centre of its inscribed circle."""
-
-        def make() -> PatchFaces:
-            order, ends = self._faces_and_ends
-            corner, reach = self.mesh.triangles[order], self.tolerance_m + 1e-9
-            side = np.linalg.norm(np.roll(corner, -1, axis=1) - np.roll(corner, 1, axis=1), axis=2)
-            around = np.maximum(side.sum(axis=1), 1e-300)
-            middle = (side[..., None] * corner).sum(axis=1, keepdims=True) / around[:, None, None]
-            radius = 2.0 * self.mesh.areas[order] / around
-            with np.errstate(divide="ignore", invalid="ignore"):
-                grown = np.nan_to_num(
-                    middle + (corner - middle) * (1.0 + slack_m / radius)[:, None, None], nan=np.inf
-                )
-            flat = ~np.isfinite(grown).all(axis=(1, 2))
-            low, high = grown.min(axis=1) - reach, grown.max(axis=1) + reach
-            low[flat], high[flat] = -np.inf, np.inf
-            wide = slack_m + self.tolerance_m
-            return _device.filled(
-                PatchFaces, "cpu", ends=ends, normal=self.normal, corners=corner, low=self.boxes[:, 0] - wide,
-                high=self.boxes[:, 1] + wide, face_low=low, face_high=high,
-            )  # fmt: skip
-
-        return self._grown.get(slack_m, make)
+    def _by_patch(self) -> PatchFaces:
+        """Faces patch by patch on the CPU, with boxes of patches and faces and what lies close beside them."""
+        order, ends = self._faces_and_ends
+        corner, reach = self.mesh.triangles[order], self.tolerance_m + SEAM_M
+        return filled(
+            PatchFaces, "cpu", ends=ends, normal=self.normal, corners=corner, low=self.boxes[:, 0] - reach,
+            high=self.boxes[:, 1] + reach, face_low=corner.min(axis=1) - reach, face_high=corner.max(axis=1) + reach,
+        )  # fmt: skip
 
     def contains(self, patch: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Whether point k [m], on the plane of patch ``patch[k]``, lies in it or close beside it, shape ``(N,)``."""
-        slack_m = 1e-9  # width added to every face: faces leave no seam between them
-        where, inside = _device.resolve("cpu"), np.empty(len(patch), dtype=bool)
+        where, inside = resolve("cpu"), np.empty(len(patch), dtype=bool)
         given = partial(wp.array, device=where, copy=False)
         inputs = [
-            self._by_patch(slack_m), slack_m, given(np.asarray(patch, np.int32), dtype=wp.int32),
+            self._by_patch, SEAM_M, given(np.asarray(patch, np.int32), dtype=wp.int32),
             given(np.asarray(points, float), dtype=wp.vec3d), given(inside, dtype=wp.bool),
         ]  # fmt: skip
-        _device.launch(lie_in_patches, len(patch), inputs, device=where)
+        launch(lie_in_patches, len(patch), inputs, device=where)
         return inside
 
 
@@ -332,18 +313,18 @@ def _overlaps(faces: _Faces, piece: np.ndarray) -> np.ndarray:
     """Pairs of faces that lie on each other within the tolerance, in pieces of one group, shape ``(N, 2)``: each face with
     one of the largest such piece."""
     own = np.flatnonzero(piece >= 0)
-    where = _device.resolve("cpu")
+    where = resolve("cpu")
     corners = faces.mesh.triangles[own] - faces.mesh.center
     margin = 2.0 * faces.distance_m  # float32's rounding is less
     low, high = corners.min(axis=1) - margin, corners.max(axis=1) + margin
-    bvh = wp.Bvh(*(wp.array(x.astype(np.float32), dtype=wp.vec3, device=where) for x in (low, high)))
+    bvh = wp.Bvh(*(wp.array(x, dtype=wp.vec3, device=where) for x in (low, high)))
     area = faces.mesh.areas[own]
-    held = _device.filled(
+    held = filled(
         OverlapFaces, where, corners=corners, normal=faces.mesh.face_normals[own], area=area, part=piece[own],
         group=faces.group[own], part_area=np.bincount(piece[own], area),
     )  # fmt: skip
     other = wp.full(len(own), -1, dtype=wp.int32, device=where)
-    _device.launch(find_overlaps, len(own), [bvh.id, held, faces.distance_m, other], device=where)
+    launch(find_overlaps, len(own), [bvh.id, held, faces.distance_m, other], device=where)
     found = other.numpy()
     return np.column_stack([own, own[found]])[found >= 0]
 

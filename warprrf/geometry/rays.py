@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
 from warprrf.checks import check_array, check_choice
+from warprrf.device import launch, require, threads
 from warprrf.kernels.rays.mesh import (
     AGAIN,
     BAD,
@@ -51,7 +51,7 @@ _RAYS_A_THREAD = 4_096
 _LONGEST = 1e18
 
 
-@dataclass(eq=False, repr=False)
+@dataclass(eq=False)
 class Hit:
     """What rays met, one entry a ray.
 
@@ -160,7 +160,7 @@ class RaySearch:
                 mesh.id, *self._frame, planes, clearance, _given(o, wp.vec3d, device), per_origin,
                 _given(d, wp.vec3d, device), _given(np.atleast_1d(reach), wp.float64, device), distance, found,
             ]  # fmt: skip
-            _device.launch(cast_rays, count, inputs, device=device)
+            launch(cast_rays, count, inputs, device=device)
             t, face = distance.numpy(), found.numpy()
         if face.min(initial=0) == BAD:
             _refuse(("origins", o), ("directions", d))
@@ -187,14 +187,14 @@ class RaySearch:
         ends = _given(o, wp.vec3d, cpu), per_origin, _given(d, wp.vec3d, cpu)
         rays = np.empty((count, 6), dtype=np.float32)
         inputs = [*self._frame, clearance, begin, *ends, _given(rays.reshape(-1, 3), wp.vec3, cpu)]
-        _device.launch(pack_rays, count, inputs, device=cpu)
+        launch(pack_rays, count, inputs, device=cpu)
         near, met = self._embree.cast(rays)
         t, face = np.empty(count), np.empty(count, dtype=np.int32)
         inputs = [
             *self._frame, _given(self._planes, wp.vec4d, cpu), clearance, begin, *ends, _given(near, wp.float32, cpu),
             _given(met, wp.int32, cpu), _given(t, wp.float64, cpu), _given(face, wp.int32, cpu),
         ]  # fmt: skip
-        _device.launch(place_hits, count, inputs, device=cpu)
+        launch(place_hits, count, inputs, device=cpu)
         which = np.flatnonzero(face == AGAIN)
         if len(which):
             some = rays_of(o, d, per_origin, which)
@@ -218,7 +218,7 @@ class RaySearch:
         mesh, planes = self.on_device(device)
         seen = wp.empty(count, dtype=wp.int8, device=device)
         ends = _given(a, wp.vec3d, device), _given(b, wp.vec3d, device)
-        _device.launch(see, count, [mesh.id, *self._frame, planes, clearance, *ends, seen], device=device)
+        launch(see, count, [mesh.id, *self._frame, planes, clearance, *ends, seen], device=device)
         free = seen.numpy()
         if free.min(initial=0) == BAD:
             _refuse(("a", a), ("b", b))
@@ -234,7 +234,7 @@ class RaySearch:
             *self._frame, clearance, _LONGEST, _given(a, wp.vec3d, cpu), _given(b, wp.vec3d, cpu),
             _given(rays.reshape(-1, 3), wp.vec3, cpu), _given(length, wp.float64, cpu),
         ]  # fmt: skip
-        _device.launch(pack_segments, count, inputs, device=cpu)
+        launch(pack_segments, count, inputs, device=cpu)
         if not np.isfinite(length).all():
             _refuse(("a", a), ("b", b))
         free, which = np.ones(count, dtype=bool), np.flatnonzero(self._embree.blocked(rays))
@@ -291,7 +291,7 @@ class EmbreeScene:
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, kept: np.ndarray) -> None:
         self._o3d = open3d()
         self._kept = None if len(kept) == len(faces) else kept.astype(np.int32)
-        self._scene = self._o3d.t.geometry.RaycastingScene(nthreads=_device.threads())
+        self._scene = self._o3d.t.geometry.RaycastingScene(nthreads=threads())
         tensor = self._o3d.core.Tensor.from_numpy
         self._scene.add_triangles(tensor(vertices.astype(np.float32)), tensor(faces[kept].astype(np.uint32)))
 
@@ -308,11 +308,10 @@ class EmbreeScene:
         met = self._scene.test_occlusions(
             self._o3d.core.Tensor.from_numpy(rays), tnear=0.0, tfar=1.0, nthreads=self._threads_for(rays)
         )
-        hit: np.ndarray = met.numpy()
-        return hit
+        return met.numpy()
 
     def _threads_for(self, rays: np.ndarray) -> int:
-        return min(_device.threads(), 1 + len(rays) // _RAYS_A_THREAD)
+        return min(threads(), 1 + len(rays) // _RAYS_A_THREAD)
 
 
 def open3d() -> ModuleType:
@@ -321,7 +320,7 @@ def open3d() -> ModuleType:
     Raises:
         ImportError: naming the extra that brings it, if it is not installed.
     """
-    return _device.require("open3d", extra="photos")
+    return require("open3d", extra="photos")
 
 
 @cache

@@ -107,8 +107,8 @@ class Reconstruction:
         self._mesh = mesh
         self.cameras = dict(cameras or {})
         self.patches = patches
-        self.scale_rms_m = float(scale_rms_m)
-        self.metric = bool(metric)
+        self.scale_rms_m = scale_rms_m
+        self.metric = metric
         self.unposed = tuple(unposed)
         self.held_out = tuple(held_out)
         self.guessed = tuple(guessed)

@@ -137,12 +137,11 @@ def pull_to_planes(
     if wp.dot(axis, normal) < 0.0:
         normal = -normal
     turn = 0.5 * strength * wp.cross(axis, normal)  # half the rotation vector, small angle
-    w = 1.0
     quaternions[i] = wp.normalize(
         wp.vec4(
-            w * q[0] - turn[0] * q[1] - turn[1] * q[2] - turn[2] * q[3],
-            w * q[1] + turn[0] * q[0] + turn[1] * q[3] - turn[2] * q[2],
-            w * q[2] - turn[0] * q[3] + turn[1] * q[0] + turn[2] * q[1],
-            w * q[3] + turn[0] * q[2] - turn[1] * q[1] + turn[2] * q[0],
+            q[0] - turn[0] * q[1] - turn[1] * q[2] - turn[2] * q[3],
+            q[1] + turn[0] * q[0] + turn[1] * q[3] - turn[2] * q[2],
+            q[2] - turn[0] * q[3] + turn[1] * q[0] + turn[2] * q[1],
+            q[3] + turn[0] * q[2] - turn[1] * q[1] + turn[2] * q[0],
         )
     )

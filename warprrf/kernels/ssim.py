@@ -56,7 +56,7 @@ def _blocks(real: type, lanes: int, channels: int) -> SimpleNamespace:
     for (int i = 0; i < {lanes}; ++i) out[i] = from[i];
     return out;
     """)
-    def load(source: plane, at: int) -> block:  # type: ignore[valid-type, empty-body]
+    def load(source: plane, at: int) -> block:
         """The block that begins at a number of a plane."""
         ...
 
@@ -64,7 +64,7 @@ def _blocks(real: type, lanes: int, channels: int) -> SimpleNamespace:
     wp::{name}* to = target.data + at;
     for (int i = 0; i < {lanes}; ++i) to[i] = values[i];
     """)
-    def store(target: plane, at: int, values: block):  # type: ignore[valid-type]
+    def store(target: plane, at: int, values: block):
         """Write a block."""
         ...
 
@@ -73,12 +73,12 @@ def _blocks(real: type, lanes: int, channels: int) -> SimpleNamespace:
     for (int i = 0; i < {lanes}; ++i) out[i] = wp::{name}((x[i] > wp::{name}(0)) - (x[i] < wp::{name}(0)));
     return out;
     """)
-    def signs(x: block) -> block:  # type: ignore[valid-type, empty-body]
+    def signs(x: block) -> block:
         """-1, 0 or 1."""
         ...
 
     @wp.func
-    def along_row(source: plane, at: int):  # type: ignore[valid-type]
+    def along_row(source: plane, at: int):
         """Window average of a block along its row."""
         total = block()
         for k in range(wp.static(2 * RADIUS + 1)):

@@ -27,9 +27,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf import device as _device
 from warprrf.checks import check_array, check_count, check_seed
-from warprrf.device import DeviceLike
+from warprrf.device import DeviceLike, resolve
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE
 from warprrf.kernels.radio.records import MIRROR, SCATTER
 from warprrf.rf.channel.path_arrays import length_along, points_along
@@ -152,7 +151,7 @@ class ExactEngine:
             raise TypeError(
                 "scene: got a bare Mesh, expected a Scene with materials, because scattering needs them"
             )
-        self.device = _device.resolve(device)
+        self.device = resolve(device)
         # Of faces at one place rays may meet any: each is of the first one's material.
         material = np.asarray(scene.face_material, dtype=np.int32)[self.mirrors.patches.first]
         self.surface = Surface.of_materials(self.mirrors.patches, material, [m.name for m in scene.materials])

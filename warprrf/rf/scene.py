@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from warprrf.checks import NotNegative, check_array, check_arrays, check_items, check_type, checked, index_to
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh, joined
-from warprrf.geometry.mesh_files import MeshOptions, is_mesh_file
+from warprrf.geometry.mesh_files import is_mesh_file
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.materials import Material
 from warprrf.rf.em.waves import Hertz
@@ -129,7 +129,9 @@ class Scene:
             raise FileNotFoundError(f"path: there is no scene file {path}")
         choice = MaterialChoice(materials, path.parent / "materials.json", extrapolate)
         if is_mesh_file(path):
-            found = read_mesh_scene(path, choice, MeshOptions(unit, up, simplify, allow_outside))
+            found = read_mesh_scene(
+                path, choice, unit=unit, up=up, simplify=simplify, allow_outside=allow_outside
+            )
             choice.check_used()
             return cls(**found)
         if (unit, up, simplify) != (None, None, None):

@@ -18,7 +18,7 @@ import numpy as np
 
 from warprrf.checks import check_type
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.mesh_files import MeshOptions, load_mesh
+from warprrf.geometry.mesh_files import load_mesh
 from warprrf.rf.em.materials import Material, itu_material, itu_name, load_materials
 
 Materials = Mapping[str, Material] | str | os.PathLike[str]
@@ -100,14 +100,12 @@ class MaterialChoice:
             )
 
 
-def read_mesh_scene(
-    path: str | os.PathLike[str], choice: MaterialChoice, options: MeshOptions
-) -> dict[str, Any]:
-    """Arguments of :class:`~warprrf.rf.scene.Scene` for a mesh file; errors as for :meth:`Mesh.load`.
+def read_mesh_scene(path: str | os.PathLike[str], choice: MaterialChoice, **options: Any) -> dict[str, Any]:
+    """Arguments of :class:`~warprrf.rf.scene.Scene` for a mesh file; options and errors are those of :meth:`Mesh.load`.
 
     Where no material has a name, the objects' names stand for them.
     """
-    content = load_mesh(path, options)
+    content = load_mesh(path, **options)
     mesh = Mesh(content.vertices, content.faces, **content.known)
     things, objects = _used(content.face_object, content.object_names, len(mesh.faces), "object")
     if content.face_material is None and len(objects) > 1:

@@ -279,7 +279,7 @@ def _sionna_pattern(rt: Any, antenna: Antenna) -> Any:
 
         return towards
 
-    class Sampled(rt.AntennaPattern):  # type: ignore[misc]
+    class Sampled(rt.AntennaPattern):
         def __init__(self) -> None:
             self.patterns = [port(field) for field in fields]
 

@@ -229,7 +229,7 @@ class _Builder(ElementTree.TreeBuilder):
 
     depth = 0
 
-    def start(self, tag: str, attributes: dict[str, str]) -> Element:  # type: ignore[override]
+    def start(self, tag: str, attributes: dict[str, str]) -> Element:
         self.depth += 1
         if self.depth > MOST_NESTED:
             raise ValueError(f"it is nested more than {MOST_NESTED} deep")

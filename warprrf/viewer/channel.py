@@ -80,7 +80,7 @@ class Channel:
         """What the settings ask for."""
         mirrors, slabs, edges = (int(setting.value) for setting in (self._mirrors, self._slabs, self._edges))
         return Asked(
-            float(self.carrier.value) * 1e9, mirrors, slabs, edges, uncertainty=bool(self._uncertainty.value)
+            self.carrier.value * 1e9, mirrors, slabs, edges, uncertainty=bool(self._uncertainty.value)
         )
 
     def show(self, found: Answer) -> None:
@@ -101,7 +101,7 @@ class Channel:
         self.spectra.content = pictures.figure("", "".join(drawn) + note)
         self.table.content = pictures.figure("strongest paths", _table(rows[:LISTED]))
         delay, power = answers.delay_profile(found.paths, BANDWIDTH_HZ)
-        self._profile.data = (delay, np.maximum(power, power.max() - float(self.range_db.value)))
+        self._profile.data = (delay, np.maximum(power, power.max() - self.range_db.value))
 
     def _panoramas(self, found: Answer) -> tuple[list[pictures.Image], str]:
         """Images of the spectrum and what is known to compare with, and a note on how wrong it is."""
@@ -119,7 +119,7 @@ class Channel:
                 note = f"Measured here: {ds.frequency_hz / 1e9:g} GHz, one transmitter at {place} m."
         known = [s.path_gain_db for s in (spectrum, truth) if s is not None]
         top = max(float(image.max()) for image in known)
-        low = top - float(self.range_db.value)
+        low = top - self.range_db.value
         images = [(n, i, low, top, "viridis") for n, i in zip(("spectrum", "truth"), known, strict=False)]
         if truth is not None and ds is not None and field is not None:
             difference = np.maximum(known[0], low) - np.maximum(known[1], low)

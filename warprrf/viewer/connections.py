@@ -31,7 +31,7 @@ import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-from warprrf import device as _device
+from warprrf.device import require
 
 Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]  # which no NaN is
 Text = Annotated[str, msgspec.Meta(max_length=1000)]
@@ -94,7 +94,7 @@ def open_server(host: str, port: int, refused: Callable[[str], None]) -> tuple[A
         host, port: where it listens; the next free port if it is taken.
         refused: called with what is wrong with a message.
     """
-    viser, serve = _device.require("viser", extra="view"), websockets.asyncio.server.serve
+    viser, serve = require("viser", extra="view"), websockets.asyncio.server.serve
     token = "" if _is_this_machine(host) else secrets.token_urlsafe(16)
 
     class Checked(ServerConnection):
@@ -115,10 +115,7 @@ def open_server(host: str, port: int, refused: Callable[[str], None]) -> tuple[A
             wrong = _refusal(request, token)
             if wrong is not None:
                 return connection.respond(http.HTTPStatus.FORBIDDEN, f"{wrong}\n")
-            found: Response | None = process_request(
-                connection, replace(request, path=request.path.removeprefix(f"/{token}"))
-            )
-            return found
+            return process_request(connection, replace(request, path=request.path.removeprefix(f"/{token}")))
 
         return serve(handler, *address, process_request=asked, create_connection=Checked, **options)
 

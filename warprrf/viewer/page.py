@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from warprrf import device as _device
 from warprrf.checks import check_count, check_type
-from warprrf.device import Progress, TimeLeft
+from warprrf.device import Progress, TimeLeft, require
 
 
-class _GivenUp(Exception):  # noqa: N818
+class _GivenUp(Exception):
     """Raised in background work that nobody waits for any more."""
 
 
@@ -68,7 +67,7 @@ class Page:
                 pass
         except OSError as error:
             raise ValueError(f"host: got {host!r}, expected an address of this machine ({error})") from error
-        _device.require("viser", extra="view")
+        require("viser", extra="view")
         from warprrf.viewer.connections import open_server
 
         self.server, self.url = open_server(host, port, self._refused)

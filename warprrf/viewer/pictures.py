@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from warprrf import device as _device
+from warprrf.device import require
 from warprrf.geometry.splats.gaussians import Y00, Gaussians
 
 Image = tuple[str, np.ndarray, float, float, str]
@@ -30,7 +30,7 @@ STYLE = """<style>
 
 def coloured(values: np.ndarray, low: float, high: float, name: str = "viridis") -> np.ndarray:
     """Values (...) as colours (..., 3) uint8, ``low`` to ``high`` along a colour map of matplotlib; NaN in grey."""
-    colours = _device.require("matplotlib", extra="view").colormaps[name]
+    colours = require("matplotlib", extra="view").colormaps[name]
     unit = (np.asarray(values, dtype=np.float64) - low) / max(high - low, 1e-12)
     found = np.round(colours(np.clip(np.nan_to_num(unit), 0.0, 1.0))[..., :3] * 255).astype(np.uint8)
     found[np.isnan(unit)] = GREY
@@ -94,7 +94,7 @@ def panorama(image: Image, marks: Sequence[tuple[float, float, str]] = (), *, sc
 
 def combined(caption: str, images: Sequence[Image], view: np.ndarray | None = None) -> bytes:
     """A PNG file of images as :func:`panorama` takes them, below what the browser shows (H, W, 3)."""
-    figures = _device.require("matplotlib.figure", extra="view")
+    figures = require("matplotlib.figure", extra="view")
     drawing = figures.Figure(
         figsize=(9.0, 3.5 * len(images) + (6.8 if view is not None else 0.5)), layout="constrained"
     )

@@ -52,9 +52,9 @@ def learned(field: BistaticField, kind: str, progress: Progress | None = None) -
         return field.gain_std_db(progress)[surface.element[tiles.cell]]
     if kind == "roughness":
         height_m = field.wavelength_m / (4.0 * np.pi) * np.sqrt(np.maximum(-p.log_smooth, 0.0))
-        return np.asarray(1e3 * height_m[surface.group[tiles.face]])
+        return 1e3 * height_m[surface.group[tiles.face]]
     share = p.mirrored_share if kind == "reflection" else p.scattered_share
-    return np.asarray(10.0 * np.log10(np.maximum(share, 1e-12))[surface.group[tiles.face]])
+    return 10.0 * np.log10(np.maximum(share, 1e-12))[surface.group[tiles.face]]
 
 
 def face_colours(
@@ -141,7 +141,7 @@ class Room:
 
     def _draw(self) -> None:
         """Mesh and splats up to the cut; what is hidden is not sent, for browsers sort splats even so."""
-        cut, scene = float(self._cut.value), self._page.scene
+        cut, scene = self._cut.value, self._page.scene
         with self._page.server.atomic():
             if self._faces is not None and "mesh" not in self._page.hidden:
                 import trimesh

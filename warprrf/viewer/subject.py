@@ -92,9 +92,9 @@ class Subject:
     def bounds(self) -> np.ndarray:
         """Lowest and highest corner of what is shown [m], shape ``(2, 3)``."""
         if self.mesh is not None:
-            return np.asarray(self.mesh.bounds, dtype=np.float64)
+            return self.mesh.bounds
         if self.gaussians is not None:
-            return np.asarray(np.percentile(self.gaussians.means, [1, 99], axis=0), dtype=np.float64)
+            return np.percentile(self.gaussians.means, [1, 99], axis=0)
         places = np.concatenate([d.receivers for d in (self.spectra, self.readings) if d is not None])
         if not len(places):
             raise ValueError("things: got spectra of no receiver, and nothing else that says where to look")
@@ -105,11 +105,11 @@ class Subject:
         """Where the transmitter stands at first (3,) [m]."""
         for source in (self.field, self.spectra):
             if source is not None:
-                return np.asarray(source.transmitter, dtype=np.float64)
+                return source.transmitter
         if self.readings is not None:
-            return np.asarray(self.readings.transmitters, dtype=np.float64)[0]
+            return self.readings.transmitters[0]
         if self.scene is not None and self.scene.transmitters:
-            return np.asarray(next(iter(self.scene.transmitters.values())), dtype=np.float64)
+            return next(iter(self.scene.transmitters.values()))
         return None
 
     @property
@@ -117,7 +117,7 @@ class Subject:
         """That of the field, or of what was measured [Hz]."""
         for known in (self.field, self.spectra, self.readings):
             if known is not None:
-                return float(known.frequency_hz)
+                return known.frequency_hz
         return CARRIER_HZ
 
     @property

@@ -134,7 +134,7 @@ class Survey:
 
     def _map(self, field: RadioField, progress: Progress) -> None:
         found = field.radio_map(
-            float(self.height.value), float(self._cell.value), self._transmitters()[0], progress=progress
+            self.height.value, self._cell.value, self._transmitters()[0], progress=progress
         )
         quantity = next(name for name, text in QUANTITIES.items() if text == self._quantity.value)
         value = found.plot_values(quantity)
@@ -161,9 +161,9 @@ class Survey:
         """Places (C, 3) in the air, at the height that is set."""
         mesh = field.mesh
         axes = [np.arange(a + 0.5 * CANDIDATE_M, b, CANDIDATE_M) for a, b in mesh.bounds[:, :2].T]
-        places = np.stack(np.meshgrid(*axes, [float(self.height.value)]), axis=-1).reshape(-1, 3)
+        places = np.stack(np.meshgrid(*axes, [self.height.value]), axis=-1).reshape(-1, 3)
         places = places[is_free(mesh, places, field.transmitter, device=field.device)]
-        return np.asarray(places[np.linalg.norm(places - field.transmitter, axis=1) > CLEAR_M])
+        return places[np.linalg.norm(places - field.transmitter, axis=1) > CLEAR_M]
 
     def _suggest(self, field: BistaticField, progress: Progress) -> None:
         places = self.candidates(field)
@@ -182,8 +182,8 @@ class Survey:
         self._page.in_background(lambda progress: self._locate(self._asked(), name, content, progress))
 
     def _locate(self, field: RadioField, name: str, content: bytes, progress: Progress) -> None:
-        width = np.radians(float(self._width_deg.value))
-        floor = 10.0 ** (float(self._floor_db.value) / 10.0)
+        width = np.radians(self._width_deg.value)
+        floor = 10.0 ** (self._floor_db.value / 10.0)
         with TemporaryDirectory() as folder:
             file = Path(folder) / "readings.csv"
             file.write_bytes(content)

@@ -225,7 +225,7 @@ class Viewer:
             raise ValueError(f"No answer here: {error}") from error
         with page.server.atomic():
             self._channel.show(found)
-            self._rays.show(found, float(self._channel.range_db.value))
+            self._rays.show(found, self._channel.range_db.value)
         page.server.flush()
         carried = abs(found.frequency_hz - self.subject.carrier_hz) > 0.5 * answers.CARRIER_STEP_HZ
         page.say(

@@ -101,7 +101,7 @@ def colours_matched(picture: np.ndarray, photo: np.ndarray) -> np.ndarray:
     """``picture`` after the affine change of its colours that brings it nearest to ``photo``, both ``(H, W, 3)``."""
     given = np.column_stack([picture.reshape(-1, 3), np.ones(picture.shape[0] * picture.shape[1])])
     change = np.linalg.lstsq(given, photo.reshape(-1, 3), rcond=None)[0]
-    return np.asarray((given @ change).reshape(picture.shape))
+    return (given @ change).reshape(picture.shape)
 
 
 def _head(subject: Subject, gaussians: Gaussians | None, mesh: Mesh | None) -> str:

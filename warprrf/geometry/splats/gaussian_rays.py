@@ -154,8 +154,7 @@ class GaussianRays:
         Raises:
             TypeError, ValueError: naming the argument that does not fit.
         """
-        values: np.ndarray = self._transmit(a, b, requires_grad=False)[0].numpy()
-        return values
+        return self._transmit(a, b, requires_grad=False)[0].numpy()
 
     def trace(
         self, origins: ArrayLike, directions: ArrayLike, k: int = 16, *, order: str = "peak"

@@ -6,7 +6,7 @@ Scales in metres, opacities in [0, 1], quaternions wxyz (normalised on entry), c
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -51,11 +51,11 @@ class Gaussians:
 
     __repr__ = one_line
 
-    means: np.ndarray = field(repr=False)
-    quaternions: np.ndarray = field(repr=False)
-    scales: np.ndarray = field(repr=False)
-    opacities: np.ndarray = field(repr=False)
-    sh: np.ndarray = field(repr=False)
+    means: np.ndarray
+    quaternions: np.ndarray
+    scales: np.ndarray
+    opacities: np.ndarray
+    sh: np.ndarray
 
     def __post_init__(self) -> None:
         means = check_array("means", self.means, (None, 3), np.float32)

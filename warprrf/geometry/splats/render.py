@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
@@ -29,11 +29,11 @@ class Rendering:
 
     __repr__ = one_line
 
-    features: np.ndarray = field(repr=False)
-    alpha: np.ndarray = field(repr=False)
-    depth: np.ndarray = field(repr=False)
-    dominant: np.ndarray = field(repr=False)
-    peak: np.ndarray = field(repr=False)
+    features: np.ndarray
+    alpha: np.ndarray
+    depth: np.ndarray
+    dominant: np.ndarray
+    peak: np.ndarray
 
 
 @checked
@@ -52,12 +52,12 @@ class BlendWeights:
 
     __repr__ = one_line
 
-    index: np.ndarray = field(repr=False)
-    weight: np.ndarray = field(repr=False)
-    range: np.ndarray = field(repr=False)
-    dominant: np.ndarray = field(repr=False)
-    alpha: np.ndarray = field(repr=False)
-    dropped: np.ndarray = field(repr=False)
+    index: np.ndarray
+    weight: np.ndarray
+    range: np.ndarray
+    dominant: np.ndarray
+    alpha: np.ndarray
+    dropped: np.ndarray
 
 
 @checked
@@ -116,7 +116,7 @@ def blend_weights(
     _check(g, cam)
     check_count("top_k", top_k)
     raster = Rasterizer(device=device, blending=blending)
-    found = raster.strongest(raster.prepare(*raster.upload(g), cam), int(top_k))
+    found = raster.strongest(raster.prepare(*raster.upload(g), cam), top_k)
     indices, weights, ranges, alpha = (array.numpy() for array in found)
     best = np.argmax(weights, axis=2)
     dominant = np.take_along_axis(indices, best[..., None], axis=2)[..., 0]

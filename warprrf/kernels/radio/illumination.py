@@ -12,11 +12,6 @@ def build(real: type) -> Any:
     """The kernel ``illuminate`` with angles in precision ``real``."""
     vec3 = wp.types.vector(3, real)
 
-    @wp.func
-    def narrow(v: wp.vec3d):
-        """A vector in that precision."""
-        return vec3(real(v[0]), real(v[1]), real(v[2]))
-
     @wp.kernel(module="unique", enable_backward=False)
     def illuminate(
         offset: int,
@@ -56,11 +51,11 @@ def build(real: type) -> Any:
             met = origins[r / per_origin] + range_m[r] * d
             way = source[wp.min(k, source.shape[0] - 1)] - met
             d1 = real(wp.length(way))
-            toward = narrow(way) / wp.max(d1, real(1.0e-9))
-            back = -narrow(d)
+            toward = vec3(way) / wp.max(d1, real(1.0e-9))
+            back = -vec3(d)
             n = normal[f]
             cos_s = wp.dot(n, back)
-            if wp.dot(narrow(flat_normal[f]), back) < real(0.0):
+            if wp.dot(vec3(flat_normal[f]), back) < real(0.0):
                 n = -n
                 cos_s = -cos_s
             cos_s = wp.max(cos_s, real(0.0))  # a smoothed normal may turn away from who sees the face

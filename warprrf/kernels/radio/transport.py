@@ -136,8 +136,7 @@ def sum_rows(
 @wp.func
 def peak_range(origin: wp.vec3d, direction: wp.vec3d, mean: wp.vec3, quaternion: wp.vec4, scale: wp.vec3):
     """Range [m] at which a Gaussian's response peaks on a ray: t* = -(o.g) / (g.g)."""
-    q = wp.vec4d(quaternion)
-    turned = wp.transpose(rotation_matrix(q[0], q[1], q[2], q[3]))
+    turned = wp.transpose(rotation_matrix(wp.vec4d(quaternion)))
     g = wp.cw_div(turned * direction, wp.vec3d(scale))
     o = wp.cw_div(turned * (origin - wp.vec3d(mean)), wp.vec3d(scale))
     return -wp.dot(o, g) / wp.dot(g, g)

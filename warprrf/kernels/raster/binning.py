@@ -42,14 +42,6 @@ def emit_entries(
 
 @wp.kernel(enable_backward=False)
 def tile_starts(offset: int, keys: wp.array(dtype=int), count: int, starts: wp.array(dtype=int)):
-    """``starts[t]``: first entry of tile t in the sorted list, by bisection; ``starts[tiles]`` is the count."""
+    """``starts[t]``: first entry of tile t in the sorted list; ``starts[tiles]`` is the count."""
     tile = offset + wp.tid()
-    lo = int(0)
-    hi = count
-    while lo < hi:
-        middle = (lo + hi) / 2
-        if keys[middle] < tile:
-            lo = middle + 1
-        else:
-            hi = middle
-    starts[tile] = lo
+    starts[tile] = wp.lower_bound(keys, 0, count + 1, tile)  # the answer is before the end given

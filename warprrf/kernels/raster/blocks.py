@@ -70,7 +70,7 @@ def vector_functions(real: type) -> SimpleNamespace:
     for (int i = 0; i < {PIXELS}; ++i) found |= x[i] > wp::{name}(0);
     return found;
     """)
-    def any_positive(x: per_pixel) -> bool:  # type: ignore[valid-type, empty-body]
+    def any_positive(x: per_pixel) -> bool:
         """Whether a number is above zero."""
         ...
 
@@ -82,7 +82,7 @@ def vector_functions(real: type) -> SimpleNamespace:
     }}
     return out;
     """)
-    def where_positive(x: per_pixel, a: per_pixel, b: per_pixel) -> per_pixel:  # type: ignore[valid-type, empty-body]
+    def where_positive(x: per_pixel, a: per_pixel, b: per_pixel) -> per_pixel:
         """``a`` where x > 0, else ``b``."""
         ...
 
@@ -94,7 +94,7 @@ def vector_functions(real: type) -> SimpleNamespace:
     }}
     return out;
     """)
-    def number_where_positive(x: per_pixel, a: int, b: integers) -> integers:  # type: ignore[valid-type, empty-body]
+    def number_where_positive(x: per_pixel, a: int, b: integers) -> integers:
         """``a`` where x > 0, else ``b``."""
         ...
 
@@ -106,7 +106,7 @@ def vector_functions(real: type) -> SimpleNamespace:
     }}
     return out;
     """)
-    def lower(a: per_pixel, b: per_pixel) -> per_pixel:  # type: ignore[valid-type, empty-body]
+    def lower(a: per_pixel, b: per_pixel) -> per_pixel:
         """The smaller of each two, ``b`` beside a NaN."""
         ...
 
@@ -118,7 +118,7 @@ def vector_functions(real: type) -> SimpleNamespace:
     }}
     return out;
     """)
-    def higher(a: per_pixel, b: per_pixel) -> per_pixel:  # type: ignore[valid-type, empty-body]
+    def higher(a: per_pixel, b: per_pixel) -> per_pixel:
         """The larger of each two, ``b`` beside a NaN."""
         ...
 
@@ -128,7 +128,7 @@ def vector_functions(real: type) -> SimpleNamespace:
     for (int i = 0; i < {PIXELS}; ++i) sum += x[i];
     return sum;
     """)
-    def total(x: per_pixel) -> real:  # type: ignore[valid-type, empty-body]
+    def total(x: per_pixel) -> real:
         """Sum of the numbers, in whatever order is quickest."""
         ...
 

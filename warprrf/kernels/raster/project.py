@@ -239,9 +239,7 @@ def build_project(real: type) -> Any:
             return
         s = wp.vec3d(scales[i])
         cut = wp.float64(2.0) * wp.log(opacity / rules.alpha_min)
-        q = quaternions[i]
-        r = rotation_matrix(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]), wp.float64(q[3]))
-        r = view.rotation * r
+        r = view.rotation * rotation_matrix(wp.vec4d(quaternions[i]))
         m = view.rotation * m
         smin = wp.min(s)
         scaling = wp.vec3d(smin / s[0], smin / s[1], smin / s[2])
@@ -274,7 +272,7 @@ def build_project(real: type) -> Any:
 
 
 @wp.func
-def whitened_sums(y: sums_d, a: wp.vec3d, steep: wp.float64, opacity: wp.float64):  # type: ignore[valid-type]
+def whitened_sums(y: sums_d, a: wp.vec3d, steep: wp.float64, opacity: wp.float64):
     """Y1 and Y2 in the Gaussian's axes, from the summed numbers in the turned ones."""
     flat = wp.float64(-1.0) / steep
     f = wp.float64(-0.5) * opacity
@@ -343,7 +341,7 @@ def build_chain(real: type) -> Any:
             return
         q = wp.vec4d(quaternions[i])
         s = wp.vec3d(scales[i])
-        r = rotation_matrix(q[0], q[1], q[2], q[3])
+        r = rotation_matrix(q)
         smin = wp.min(s)
         m = wp.vec3d(means[i]) - view.origin
         a = wp.cw_mul(wp.vec3d(smin / s[0], smin / s[1], smin / s[2]), wp.transpose(r) * m)

@@ -69,14 +69,11 @@ def pixel_of(thread: int, view: View):
 
 
 @wp.func
-def rotation_matrix(w: wp.float64, x: wp.float64, y: wp.float64, z: wp.float64):
+def rotation_matrix(q: wp.vec4d):
     """Rotation of the quaternion wxyz, normalised here."""
     one = wp.float64(1.0)
-    n = one / wp.sqrt(w * w + x * x + y * y + z * z)
-    w = w * n
-    x = x * n
-    y = y * n
-    z = z * n
+    unit = q * (one / wp.length(q))
+    w, x, y, z = unit[0], unit[1], unit[2], unit[3]
     two = wp.float64(2.0)
     return wp.mat33d(
         one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y),

@@ -72,12 +72,6 @@ def meeting(scene: Scene, k: int, origin: wp.vec3d, unit: wp.vec3d):
 
 
 @wp.func
-def narrow(p: wp.vec3d):
-    """A vector in float32."""
-    return wp.vec3(wp.float32(p[0]), wp.float32(p[1]), wp.float32(p[2]))
-
-
-@wp.func
 def lead(scene: Scene, origin: wp.vec3d, unit: wp.vec3d):
     """How far a ray can go before it comes near any box [m]: from there float32 places it well."""
     return wp.max(-wp.dot(origin - scene.center, unit) - scene.radius, wp.float64(0.0))
@@ -146,7 +140,7 @@ def transmit(
         unit = way / length
         ahead = lead(scene, origin, unit)
         if scene.ids.shape[0] > 0 and ahead < length:
-            query = wp.bvh_query_ray(scene.bvh, narrow(origin - scene.center + ahead * unit), narrow(unit))
+            query = wp.bvh_query_ray(scene.bvh, wp.vec3(origin - scene.center + ahead * unit), wp.vec3(unit))
             box = int(0)
             while wp.bvh_query_next(query, box, reach(scene, length, ahead)):
                 k = scene.ids[box]
@@ -193,7 +187,7 @@ def transmit_adjoint(
     ahead = lead(scene, origin, unit)
     if ahead >= length:
         return
-    query = wp.bvh_query_ray(scene.bvh, narrow(origin - scene.center + ahead * unit), narrow(unit))
+    query = wp.bvh_query_ray(scene.bvh, wp.vec3(origin - scene.center + ahead * unit), wp.vec3(unit))
     box = int(0)
     while wp.bvh_query_next(query, box, reach(scene, length, ahead)):
         k = scene.ids[box]
@@ -239,7 +233,7 @@ def collect(
     capacity = index.shape[1]
     ahead = lead(scene, origin, unit)
     length = wp.float64(wp.inf)
-    query = wp.bvh_query_ray(scene.bvh, narrow(origin - scene.center + ahead * unit), narrow(unit))
+    query = wp.bvh_query_ray(scene.bvh, wp.vec3(origin - scene.center + ahead * unit), wp.vec3(unit))
     box = int(0)
     found = int(0)
     while wp.bvh_query_next(query, box, reach(scene, length, ahead)):
@@ -354,10 +348,9 @@ def build(real: type) -> SimpleNamespace:
     ):
         """Each Gaussian in float64: whitening matrix, q at which alpha falls below alpha_min, half size of its box."""
         i = offset + wp.tid()
-        centers[i] = wp.vec3d(wp.float64(means[i][0]), wp.float64(means[i][1]), wp.float64(means[i][2]))
-        s = wp.vec3d(wp.float64(scales[i][0]), wp.float64(scales[i][1]), wp.float64(scales[i][2]))
-        q = quaternions[i]
-        r = rotation_matrix(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]), wp.float64(q[3]))
+        centers[i] = wp.vec3d(means[i])
+        s = wp.vec3d(scales[i])
+        r = rotation_matrix(wp.vec4d(quaternions[i]))
         a = wp.float64(opacities[i])
         cut = wp.float64(0.0)
         if a > rules.alpha_min:

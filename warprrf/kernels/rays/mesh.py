@@ -31,12 +31,6 @@ _STEPS = 1 << 20
 
 
 @wp.func
-def narrow(p: wp.vec3d):
-    """A position or direction in float32."""
-    return wp.vec3(wp.float32(p[0]), wp.float32(p[1]), wp.float32(p[2]))
-
-
-@wp.func
 def rounding_scale(origin: wp.vec3d, radius: wp.float64):
     """Largest coordinate that rounding acts on [m]."""
     return radius + wp.abs(origin[0]) + wp.abs(origin[1]) + wp.abs(origin[2])
@@ -95,7 +89,7 @@ def search(
     name = MISS
     for _ in range(_STEPS):
         query = wp.mesh_query_ray(
-            mesh, narrow(origin + start * unit), narrow(unit), wp.float32(most - start + step)
+            mesh, wp.vec3(origin + start * unit), wp.vec3(unit), wp.float32(most - start + step)
         )
         if not query.result:
             break
@@ -196,8 +190,8 @@ def pack_rays(
     begin = clearance - _ROUNDING * rounding_scale(origin, radius)
     if start.shape[0] > 0:
         begin = start[i]
-    rays[2 * i] = narrow(origin + begin * unit)
-    rays[2 * i + 1] = narrow(unit)
+    rays[2 * i] = wp.vec3(origin + begin * unit)
+    rays[2 * i + 1] = wp.vec3(unit)
 
 
 @wp.kernel(enable_backward=False)
@@ -223,8 +217,8 @@ def pack_segments(
     scale = wp.float64(wp.nan)
     if inner > wp.float64(0.0):
         scale = wp.min(inner + wp.float64(2.0) * margin, longest) / size
-    rays[2 * i] = narrow(start - center + (clearance - margin) / size * way)
-    rays[2 * i + 1] = narrow(scale * way)
+    rays[2 * i] = wp.vec3(start - center + (clearance - margin) / size * way)
+    rays[2 * i + 1] = wp.vec3(scale * way)
     length[i] = size
 
 
@@ -309,7 +303,7 @@ def find_crossings(
     crossed = int(0)
     first = int(0)
     nearest = wp.float64(wp.inf)
-    query = wp.bvh_query_ray(bvh, narrow(point), narrow(direction))
+    query = wp.bvh_query_ray(bvh, wp.vec3(point), wp.vec3(direction))
     face = int(0)
     while wp.bvh_query_next(query, face):
         a = corners[face, 0]
@@ -356,7 +350,7 @@ def find_touching(
     i = offset + wp.tid()
     p = points[i]
     around = wp.vec3d(reach, reach, reach)
-    query = wp.bvh_query_aabb(bvh, narrow(p - around), narrow(p + around))
+    query = wp.bvh_query_aabb(bvh, wp.vec3(p - around), wp.vec3(p + around))
     found = int(0)
     j = int(0)
     while wp.bvh_query_next(query, j):
@@ -413,7 +407,7 @@ def find_overlaps(
     a = faces.corners[i, 0]
     b = faces.corners[i, 1]
     c = faces.corners[i, 2]
-    query = wp.bvh_query_aabb(bvh, narrow(wp.min(wp.min(a, b), c)), narrow(wp.max(wp.max(a, b), c)))
+    query = wp.bvh_query_aabb(bvh, wp.vec3(wp.min(wp.min(a, b), c)), wp.vec3(wp.max(wp.max(a, b), c)))
     most = wp.float64(0.0)
     j = int(0)
     while wp.bvh_query_next(query, j):

@@ -292,7 +292,7 @@ class FresnelCurves:
     def even(self, log_excess: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Reflection under even light, 2 int F cos dcos, at ``log_excess`` (G,), and its derivative."""
         cosine = np.linspace(0.0, 1.0, COSINES)
-        return tuple(rows @ cosine / cosine.sum() for rows in self.at(self.curves, log_excess))  # type: ignore[return-value]
+        return tuple(rows @ cosine / cosine.sum() for rows in self.at(self.curves, log_excess))
 
 
 @lru_cache(maxsize=1)

@@ -27,6 +27,7 @@ import numpy as np
 
 from warprrf.checks import (
     NotNegative,
+    Number,
     check_choice,
     check_count,
     check_items,
@@ -50,7 +51,6 @@ WIDEST_HZ = (1e6, 1e13)
 ROUGHEST_M = 1.0  # rms height; from a few wavelengths on nothing is reflected as by a mirror
 
 
-Number: TypeAlias = Annotated[float, within()]
 Permittivity: TypeAlias = Annotated[float, within(1.0)]
 Roughness: TypeAlias = Annotated[float, within(0.0, ROUGHEST_M)]
 

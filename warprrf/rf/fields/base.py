@@ -80,8 +80,8 @@ class Location:
 
     position: np.ndarray
     covariance: np.ndarray
-    candidates: np.ndarray = field(repr=False)
-    likelihoods: np.ndarray = field(repr=False)
+    candidates: np.ndarray
+    likelihoods: np.ndarray
     known: bool
     misfit: float
     gains_db: Mapping[str, float]

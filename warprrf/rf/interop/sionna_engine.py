@@ -13,9 +13,8 @@ from typing import Annotated, Any
 
 from numpy.typing import ArrayLike
 
-from warprrf import device as _device
 from warprrf.checks import Count, Seed, check_array, checked, whole
-from warprrf.device import DeviceLike
+from warprrf.device import DeviceLike, require
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.waves import check_frequency
@@ -144,7 +143,7 @@ class SionnaEngine:
             self._scene.remove("rx")
         self._solved += 1
         if self._solved % 20 == 0:  # Dr.Jit keeps freed memory and compiled kernels
-            drjit = _device.require("drjit", extra="sionna")
+            drjit = require("drjit", extra="sionna")
             drjit.flush_malloc_cache()
             drjit.flush_kernel_cache()
         return found.with_gas(self.air)

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count, checked, one_of, within
+from warprrf.checks import Number, check_array, check_count, checked, one_of
 from warprrf.device import Progress, with_progress
 from warprrf.rf.maps.radio_map import MapOptions, radio_map
 
@@ -33,7 +33,7 @@ def place(
     n: int = 1,
     *,
     objective: Annotated[str, one_of(*OBJECTIVES)] = "share",
-    level_db: Annotated[float, within()] = 10.0,
+    level_db: Number = 10.0,
     height: float = 1.5,
     cell: float = 0.5,
     progress: Progress | None = None,

@@ -13,9 +13,9 @@ from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 
-from warprrf import device as _device
 from warprrf import netcdf_files
-from warprrf.checks import Positive, Shaped, check_array, checked, one_of, within
+from warprrf.checks import Number, Positive, Shaped, check_array, checked, one_of
+from warprrf.device import require
 from warprrf.files import write_bytes
 from warprrf.geometry.mesh import Mesh
 from warprrf.netcdf_files import Variable
@@ -41,7 +41,6 @@ QUANTITIES = {
 """What :meth:`RadioMap.plot` draws, and how the picture calls it."""
 
 
-Number: TypeAlias = Annotated[float, within()]
 Layer: TypeAlias = Annotated[np.ndarray, Shaped("Y X", finite=False, least=0.0)]
 Quantity: TypeAlias = Annotated[str, one_of(*QUANTITIES)]
 
@@ -114,7 +113,7 @@ class RadioMap:
         Raises:
             ValueError: for a quantity that is not one of :data:`QUANTITIES`.
         """
-        value = np.asarray(getattr(self, quantity))
+        value: np.ndarray = getattr(self, quantity)
         if quantity == "delay_spread_s":
             return value * 1e9
         return value if quantity.endswith("_db") else to_db(value)
@@ -132,7 +131,7 @@ class RadioMap:
         """
         value = self.plot_values(quantity)
         if ax is None:
-            _, ax = _device.require("matplotlib.pyplot", extra="plots").subplots(
+            _, ax = require("matplotlib.pyplot", extra="plots").subplots(
                 figsize=(8.0, 6.0), layout="constrained"
             )
         half = 0.5 * self.cell_m
@@ -154,9 +153,7 @@ class RadioMap:
         Raises:
             ImportError: if matplotlib is missing.
         """
-        figure = _device.require("matplotlib.figure", extra="plots").Figure(
-            figsize=(13.0, 9.0), layout="constrained"
-        )
+        figure = require("matplotlib.figure", extra="plots").Figure(figsize=(13.0, 9.0), layout="constrained")
         for ax, (quantity, name) in zip(figure.subplots(2, 2).flat, QUANTITIES.items(), strict=True):
             self.plot(quantity, ax=ax)
             ax.set_title(name, fontsize=11)

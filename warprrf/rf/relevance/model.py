@@ -190,7 +190,7 @@ class FullModel:
                 )
                 powers[name] = power * 10.0 ** (-0.1 * self.gas_db_per_m * length)
             gains = replace(gains, powers=powers)
-        return np.asarray(spectra_of(gains, self.beam)[0])
+        return spectra_of(gains, self.beam)[0]
 
     def power(self, lost: frozenset[str]) -> float:
         """Share of all receivers' power that goes with the effects ``lost``."""

@@ -125,7 +125,7 @@ class Antenna:
             raise ValueError("gain: got both of gain and field or neither, expected one of them")
         shape = len(rows), len(columns)
         if field is None or gain is not None:
-            return cls(_gridded(rows, columns, check_array("gain", gain, shape)), polarisation)  # type: ignore[arg-type]
+            return cls(_gridded(rows, columns, check_array("gain", gain, shape)), polarisation)
         ports = check_array("field", field, dtype=complex)
         ports = ports[None] if ports.ndim == 3 else ports
         if ports.ndim != 4 or ports.shape[1:] != (*shape, 2) or not 1 <= len(ports) <= 2:

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from warprrf import device as _device
 from warprrf.checks import Seed, Shaped, check_array, check_chosen, check_count, checked, positive, whole
-from warprrf.device import DeviceLike
+from warprrf.device import DeviceLike, Progress
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import Hertz
 from warprrf.rf.spectra import dataset_files
@@ -90,7 +89,7 @@ class Received:
 
 
 @checked
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class SpectrumDataset:
     """Spectra at R receivers.
 
@@ -358,7 +357,7 @@ class SpectrumDataset:
         *,
         boresight_gain_dbi: float | None = None,
         noise: float = 0.0,
-        progress: _device.Progress | None = None,
+        progress: Progress | None = None,
         **options: Any,
     ) -> SpectrumDataset:
         """These spectra without the antenna that measured them.
@@ -487,7 +486,7 @@ def _sees(
     cosine = np.einsum("hwc,rc->rhw", pixel_directions(gain.shape[1:]), way / length[:, None])
     near = cosine > np.cos(max(3.0 * sigma_rad, 2.0 * np.pi / gain.shape[1]))
     received = np.where(near, np.nan_to_num(gain), 0.0).sum(axis=(1, 2))
-    return np.asarray(received >= 0.5 * free_space_gain(transmitter, receivers, frequency_hz))
+    return received >= 0.5 * free_space_gain(transmitter, receivers, frequency_hz)
 
 
 def measured_at(ds: SpectrumDataset, receivers: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
@@ -498,7 +497,7 @@ def measured_at(ds: SpectrumDataset, receivers: np.ndarray, transmitter: np.ndar
     own = receivers[np.linalg.norm(under - ds.transmitter, axis=1) <= same_m]
     if len(own) == 0:
         return np.zeros(len(ds.receivers), dtype=bool)
-    return np.asarray(cKDTree(own).query(ds.receivers)[0] <= same_m)
+    return cKDTree(own).query(ds.receivers)[0] <= same_m
 
 
 def _check_roles(role: ArrayLike, count: int) -> np.ndarray:

@@ -16,9 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf import device as _device
 from warprrf.checks import Count, NotNegative, Positive, check_array, check_number, check_positive, checked
-from warprrf.device import DeviceLike
+from warprrf.device import DeviceLike, Progress
 from warprrf.rf.spectra.antenna import Antenna, Pattern, as_antenna
 from warprrf.rf.spectra.spectrum import (
     check_shape,
@@ -83,7 +82,7 @@ def deembed(
     *,
     boresight_gain_dbi: float | None = None,
     noise: float = 0.0,
-    progress: _device.Progress | None = None,
+    progress: Progress | None = None,
     **options: Any,
 ) -> Deembedded:
     """``path_gain`` (R, H, W) without the antenna; see :meth:`warprrf.SpectrumDataset.deembed`.
@@ -163,7 +162,7 @@ def _deembed_scanned(
     kernel: np.ndarray,
     beam_sigma_rad: float,
     scan: Scan,
-    progress: _device.Progress | None,
+    progress: Progress | None,
 ) -> Deembedded:
     """Spectra by this package's conventions from the powers that a steered antenna measured, ``(R, H, W)``."""
     count, shape = len(power), check_shape(power.shape[1:])

@@ -51,7 +51,7 @@ def unit_image(
     low, high = check_array("range_db", range_db, (2,))
     if not high > low:
         raise ValueError(f"range_db: got ({low}, {high}), expected (lowest, highest), the latter above")
-    return np.clip((np.asarray(to_db(path_gain, floor), dtype=np.float64) - low) / (high - low), 0.0, 1.0)
+    return np.clip((to_db(path_gain, floor) - low) / (high - low), 0.0, 1.0)
 
 
 @checked
@@ -218,7 +218,7 @@ def evaluate(
             "no errors of prediction; score receivers that were held out (ds.split)"
         )
     predict = _asked_alike(predict, test)
-    floor, range_db = float(test.floor), test.range_db
+    floor, range_db = test.floor, test.range_db
     rows = defaultdict[str, np.ndarray](lambda: np.full(count, np.nan))
     seconds = np.zeros(count)
     for i, receiver in enumerate(with_progress(test.receivers, "evaluate", progress)):

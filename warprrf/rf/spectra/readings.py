@@ -95,7 +95,7 @@ class PowerTable:
 
 
 @checked
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class Readings(PowerTable):
     """N received powers over transmitted power.
 
@@ -458,5 +458,5 @@ def antenna_of(name: str, pattern: Pattern) -> Antenna:
 def tap_share(place: np.ndarray, window: str) -> np.ndarray:
     """Share of a path's power in a tap ``place`` (in units of 1 / bandwidth) from it; over all taps they add up to 1."""
     if window == "rectangular":
-        return np.asarray(np.sinc(place) ** 2)
-    return np.asarray((np.sinc(place) + 0.5 * (np.sinc(place - 1.0) + np.sinc(place + 1.0))) ** 2 / 1.5)
+        return np.sinc(place) ** 2
+    return (np.sinc(place) + 0.5 * (np.sinc(place - 1.0) + np.sinc(place + 1.0))) ** 2 / 1.5

@@ -19,7 +19,6 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf import device as _device
 from warprrf.checks import (
     NotNegative,
     check_array,
@@ -32,7 +31,7 @@ from warprrf.checks import (
     positive,
     within,
 )
-from warprrf.device import DeviceLike
+from warprrf.device import DeviceLike, filled, launch, require, resolve
 from warprrf.kernels.radio import beam as beam_kernels
 
 BEAM_SIGMA_RAD = float(np.deg2rad(2.0))
@@ -272,14 +271,14 @@ def spread_paths(
     starts = np.zeros(rows * columns + 1, dtype=np.int32)
     starts[1:] = np.cumsum(np.bincount(cell, minlength=rows * columns))
 
-    where = _device.resolve(device)
+    where = resolve(device)
     grid = _beam_grid((rows, columns), float(sigma), str(where))
     known = beam_sums(d, shape, sigma, device=where) if beams is None else beams[positive]
     near, total = np.ascontiguousarray(known[order].T)
     image = wp.zeros((rows, columns), dtype=wp.float64, device=where)
     best = wp.zeros((rows, columns), dtype=wp.int32, device=where)
     inputs = [d[order], power[order] / total, near, starts, grid, image, best]
-    _device.launch(beam_kernels.gather_beams, rows * columns, inputs, device=where)
+    launch(beam_kernels.gather_beams, rows * columns, inputs, device=where)
     index = best.numpy()
     return SpreadPaths(image.numpy(), np.where(index >= 0, positive[order][index], -1).astype(np.int32))
 
@@ -289,11 +288,11 @@ def beam_sums(
 ) -> np.ndarray:
     """Squared chord from each unit vector ``directions`` (L, 3) to its pixel's centre, and the sum of its beam over all
     pixels, one there, shape ``(L, 2)``."""
-    where = _device.resolve(device)
+    where = resolve(device)
     grid = _beam_grid(shape, float(sigma), str(where))
     sums = [wp.zeros(len(directions), dtype=wp.float64, device=where) for _ in range(2)]
     inputs = [directions, np.ravel_multi_index(pixel_of(directions, shape), shape), grid, *sums]
-    _device.launch(beam_kernels.beam_normaliser, len(directions), inputs, device=where)
+    launch(beam_kernels.beam_normaliser, len(directions), inputs, device=where)
     return np.stack([one.numpy() for one in sums], axis=1)
 
 
@@ -317,7 +316,7 @@ def strongest_rays(
         sigma: beam width [rad].
     """
     rows, columns = check_shape(shape)
-    where = _device.resolve(device)
+    where = resolve(device)
     grid = _beam_grid((rows, columns), float(sigma), str(where))
     with np.errstate(divide="ignore"):
         log_power = np.log(np.asarray(power, np.float64))
@@ -327,7 +326,7 @@ def strongest_rays(
     first_row, least_fall = _least_falls((rows, columns), float(sigma), str(where))
     inputs = [directions, len(power) // (rows * columns), log_power, top, wp.float64(top.max())]
     inputs += [grid, first_row, least_fall, best]
-    _device.launch(beam_kernels.strongest_rays, rows * columns, inputs, device=where)
+    launch(beam_kernels.strongest_rays, rows * columns, inputs, device=where)
     return best.numpy().reshape(rows, columns)
 
 
@@ -338,12 +337,12 @@ def unit_beams(
 
     The same beams as :func:`spread`, all images at once: for tens of paths, not for thousands.
     """
-    shape, where = check_shape(shape), _device.resolve(device)
+    shape, where = check_shape(shape), resolve(device)
     near, total = beam_sums(directions, shape, sigma, device=where).T
     images = wp.zeros((len(directions), *shape), dtype=wp.float32, device=where)
     grid = _beam_grid(shape, float(sigma), str(where))
     inputs = [directions, np.ravel_multi_index(pixel_of(directions, shape), shape), near, total, grid, images]
-    _device.launch(beam_kernels.separate_beams, len(directions), inputs, device=where)
+    launch(beam_kernels.separate_beams, len(directions), inputs, device=where)
     return images.numpy()
 
 
@@ -371,7 +370,7 @@ def _beam_grid(shape: tuple[int, int], sigma: float, device: str) -> Any:
     azimuth = 2.0 * np.arcsin(np.sqrt(np.clip(np.nan_to_num(ratio, nan=1.0, posinf=1.0), 0.0, 1.0)))
     half = np.ceil(azimuth * columns / (2.0 * np.pi) + 0.5).astype(np.int32)
     half = np.where(room < 0, -1, np.minimum(half, columns)).astype(np.int32)
-    return _device.filled(
+    return filled(
         beam_kernels.BeamGrid, device, pixels=pixel_directions(shape), solid_angles=pixel_solid_angles(shape), half_widths=half,
         kappa=1.0 / sigma**2, chord_limit=4.0 * np.sin(0.5 * cutoff) ** 2 * (1.0 + 1e-12),
     )  # fmt: skip
@@ -396,7 +395,7 @@ def _least_falls(shape: tuple[int, int], sigma: float, device: str) -> tuple[wp.
     fall[nearest > 2.0 * np.sin(0.5 * _cutoff(shape, sigma)) * (1.0 + 1e-6)] = np.inf
     return (
         wp.array(first, dtype=wp.int32, device=device),
-        wp.array(fall.astype(np.float32), dtype=wp.float32, device=device),
+        wp.array(fall, dtype=wp.float32, device=device),
     )
 
 
@@ -446,7 +445,7 @@ class Spectrum:
     floor: NotNegative = 0.0
     range_db: RangeDb | None = None
     std_db: np.ndarray | None = None
-    attributes: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
+    attributes: dict[str, Any] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
         """Check shapes and values; ValueError or TypeError names the field."""
@@ -513,7 +512,7 @@ class Spectrum:
         """
         if self.batched:
             raise ValueError(f"spectrum: got {len(self.path_gain)} receivers, expected one: spectrum[0]")
-        pyplot = _device.require("matplotlib.pyplot", extra="plots")
+        pyplot = require("matplotlib.pyplot", extra="plots")
         if ax is None:
             _, ax = pyplot.subplots(figsize=(8.0, 4.0))
         low, high = self.range_db if self.range_db is not None else (None, None)

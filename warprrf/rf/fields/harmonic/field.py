@@ -28,7 +28,6 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf import device as _device
 from warprrf.cache import Cache
 from warprrf.checks import (
     Expected,
@@ -40,7 +39,7 @@ from warprrf.checks import (
     one_line,
     within,
 )
-from warprrf.device import DeviceLike, Progress
+from warprrf.device import DeviceLike, Progress, launch
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.splats.gaussians import Gaussians, discs_on_mesh, gaussians_of
 from warprrf.geometry.splats.rasterizer import Parameters, Rasterizer
@@ -91,13 +90,13 @@ class HarmonicField(RadioField):
 
     __repr__ = one_line
 
-    gaussians: Gaussians = field(repr=False)
+    gaussians: Gaussians
     options: FieldOptions
-    layers: dict[str, np.ndarray] = field(repr=False)
+    layers: dict[str, np.ndarray]
     gain_unit: Positive
     delay_unit: Annotated[float, within(0.0, 1.0)]
-    mesh: Mesh | None = field(default=None, repr=False)
-    _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(8))
+    mesh: Mesh | None = None
+    _uploaded: Cache = field(init=False, default_factory=lambda: Cache(8))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -159,13 +158,13 @@ class HarmonicField(RadioField):
         warn_of_unmodelled(mesh, transmitter, receivers, frequency_hz=ds.frequency_hz, device=device)
         if mesh is None and (chosen.line_of_sight == "explicit" or chosen.interaction_point == "mesh"):
             raise ValueError('line_of_sight="explicit" and interaction_point="mesh" need a mesh; got none')
-        images = check_array("ds.path_gain", ds.path_gain, (len(receivers), None, None), np.float64)
+        images = check_array("ds.path_gain", ds.path_gain, (len(receivers), None, None))
         blank = cls(
             gaussians=gaussians,
             mesh=mesh,
             transmitter=transmitter,
             **{n: getattr(ds, n) for n in ("frequency_hz", "floor", "range_db", "beam_sigma_rad")},
-            shape=images.shape[1:],  # type: ignore[arg-type]
+            shape=images.shape[1:],
             options=replace(chosen, checkpoint=None),
             layers={},
             gain_unit=1.0,
@@ -272,7 +271,7 @@ class HarmonicField(RadioField):
             points, lengths = (wp.empty(len(toward), dtype=t, device=device) for t in (wp.vec3d, wp.float64))
             inputs = [how, wp.vec3d(origin), wp.vec3d(transmitter), directions, *self._on_device()[:3]]
             inputs += [view.dominant, ranges, points, lengths]
-            _device.launch(_rays.single_bounces, len(toward), inputs, device=device)
+            launch(_rays.single_bounces, len(toward), inputs, device=device)
             yield points.numpy().reshape(*self.shape, 3), lengths.numpy().reshape(self.shape)
 
     def _factor(self, length: np.ndarray) -> np.ndarray:
@@ -317,7 +316,7 @@ class HarmonicField(RadioField):
             name, lambda: wp.array(self.layers[name], dtype=kernels.vec16, device=device)
         )
         inputs = [kind, view.start, view.gaussian, view.weight, basis, layer, out]
-        _device.launch(kernels.predict, len(out), inputs, device=device)
+        launch(kernels.predict, len(out), inputs, device=device)
         return out.numpy().reshape(self.shape).astype(np.float64)
 
     def _view_from(self, receiver: np.ndarray, source: np.ndarray) -> View:

@@ -386,7 +386,7 @@ def targets(
     Raises:
         ValueError: if no pixel above the floor meets a Gaussian.
     """
-    floor = float(ds.floor)
+    floor = ds.floor
     blended = factor * problem.transport.pixel_weight
     met = blended > 0
     power = images - extra
@@ -403,7 +403,7 @@ def targets(
     relative = np.log(floored / np.where(met, blended * gain_unit, np.nan))
     start = np.nan_to_num(problem.weighted_means(relative))
     exponential = options.gain == "exp"
-    low, high = (float(v) for v in ds.range_db)
+    low, high = ds.range_db
     layers = {
         "gain": Target(
             image=np.clip((to_db(images, floor) - low) / (high - low), 0.0, 1.0),

@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
-from warprrf import device as _device
-from warprrf.device import Progress
+from warprrf.device import Progress, launch, with_progress
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
 from warprrf.kernels.adam import build_adam, corrections
@@ -49,7 +48,7 @@ class Listed:
             wp.utils.array_scan(order, order, inclusive=False)  # 0, 1, 2, ...
             weight = wp.empty(len(response), dtype=float, device=device)
             inputs = [self.alpha_max, view.start, order, view.gaussian, response, opacity, weight]
-            _device.launch(kernels.blend, len(view.start) - 1, inputs, device=device)
+            launch(kernels.blend, len(view.start) - 1, inputs, device=device)
             views.append(replace(view, weight=weight))
         return replace(seen, views=tuple(views))
 
@@ -79,12 +78,12 @@ def list_responses(
     raster = Rasterizer(device=device, blending=blending)
     scene, views, responses = raster.upload(thin), [], []
     pairs_of = list(zip(seen.receivers, seen.views, strict=True))
-    for position, view in _device.with_progress(pairs_of, "transport", progress):
+    for position, view in with_progress(pairs_of, "transport", progress):
         found = strongest(raster, scene, position, seen.shape, top_k)
         start, pairs, _, _ = kept(device, found, 0.0)
         gaussian, response = (wp.empty(pairs, dtype=kind, device=device) for kind in (int, float))
         inputs = [*found[:2], scene[3], start, gaussian, response]
-        _device.launch(write_responses, len(start) - 1, inputs, device=device)
+        launch(write_responses, len(start) - 1, inputs, device=device)
         views.append(replace(view, start=start, gaussian=gaussian, weight=response))
         responses.append(response)
     listed = Listed(replace(seen, views=tuple(views)), tuple(responses), rules.alpha_max)
@@ -133,7 +132,7 @@ class OpacityTraining:
     @property
     def opacities(self) -> np.ndarray:
         """Opacities of the Gaussians seen, shape ``(G,)``."""
-        return np.asarray(self._opacity.numpy())
+        return self._opacity.numpy()
 
     @property
     def state(self) -> np.ndarray:

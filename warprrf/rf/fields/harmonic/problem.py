@@ -13,8 +13,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import DTypeLike
 
-from warprrf import device as _device
-from warprrf.device import DeviceLike
+from warprrf.device import DeviceLike, launch, resolve
 from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.kernels.radio import transport as _pairs
 from warprrf.kernels.raster.binning import tile_starts
@@ -56,7 +55,7 @@ class Problem:
         precision: DTypeLike = np.float32,
     ) -> None:
         self.seed = int(seed)
-        self.device = _device.resolve(device)
+        self.device = resolve(device)
         self.transport = transport.on(self.device)
         self.precision = np.dtype(precision)
         self.real = wp.float64 if self.precision == np.float64 else wp.float32
@@ -77,7 +76,7 @@ class Problem:
 
     def launch(self, kernel: wp.Kernel, dim: int, *inputs: Any) -> None:
         """Launch one of the problem's kernels on its device."""
-        _device.launch(kernel, dim, inputs, device=self.device)
+        launch(kernel, dim, inputs, device=self.device)
 
     def batch_at(self, step: int) -> int:
         """Which batch a step uses: all of them once an epoch, in an order that seed and epoch fix."""
@@ -140,5 +139,5 @@ def harmonics(shape: tuple[int, int], real: type, device: DeviceLike) -> wp.arra
     """The 16 real harmonics at every pixel's direction, shape ``(H * W,)`` of 16-vectors, on the device."""
     kernels, toward = _kernels.build(real), pixel_directions(shape).reshape(-1, 3)
     out = wp.zeros(len(toward), dtype=kernels.vec16, device=device)
-    _device.launch(kernels.evaluate_basis, len(toward), [toward, out], device=device)
+    launch(kernels.evaluate_basis, len(toward), [toward, out], device=device)
     return out

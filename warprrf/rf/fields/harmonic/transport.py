@@ -15,9 +15,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf import device as _device
 from warprrf.checks import check_array
-from warprrf.device import DeviceLike, Progress
+from warprrf.device import DeviceLike, Progress, launch, resolve, with_progress
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import Blending, Parameters, Rasterizer
@@ -76,7 +75,7 @@ class Transport:
 
     def on(self, device: DeviceLike) -> Transport:
         """The same on another device."""
-        where = _device.resolve(device)
+        where = resolve(device)
         return replace(self, views=tuple(view.on(where) for view in self.views))
 
     @property
@@ -101,8 +100,8 @@ class Transport:
         out = wp.empty((len(self.views), pixels), dtype=wp.float64, device=self.device)
         for r, view in enumerate(self.views):
             inputs = [view.start, view.weight, out[r]]
-            _device.launch(_kernels.sum_rows, pixels, inputs, device=self.device)
-        return np.asarray(out.numpy().reshape(-1, *self.shape))
+            launch(_kernels.sum_rows, pixels, inputs, device=self.device)
+        return out.numpy().reshape(-1, *self.shape)
 
 
 def cutoffs(range_db: tuple[float, float], rule: str = "product") -> Blending:
@@ -151,7 +150,7 @@ def transport(
     raster = Rasterizer(device=device, blending=cutoffs(range_db, rule))
     scene = raster.upload(gaussians) if uploaded is None else uploaded
     views = []
-    for position in _device.with_progress(positions, "transport", progress):
+    for position in with_progress(positions, "transport", progress):
         views.append(_rows(raster, strongest(raster, scene, position, size, top_k)))
     return Transport(size, positions, tuple(views), len(gaussians), rule)
 
@@ -177,7 +176,7 @@ def kept(device: wp.Device, found: Strongest, share: float) -> tuple[wp.array, i
     dominant = wp.empty(pixels, dtype=int, device=device)
     expected = wp.empty(pixels, dtype=wp.float64, device=device)
     inputs = [share, index, weight, distance, start, dominant, expected]
-    _device.launch(_kernels.count_kept, pixels, inputs, device=device)
+    launch(_kernels.count_kept, pixels, inputs, device=device)
     wp.utils.array_scan(start, start, inclusive=False)
     return start, int(start[pixels:].numpy()[0]), dominant, expected
 
@@ -189,5 +188,5 @@ def _rows(raster: Rasterizer, found: Strongest) -> Rows:
     start, pairs, dominant, expected = kept(device, found, share)
     gaussian, out = (wp.empty(pairs, dtype=kind, device=device) for kind in (int, float))
     inputs = [share, index, weight, alpha, start, gaussian, out]
-    _device.launch(_kernels.write_weights, len(dominant), inputs, device=device)
+    launch(_kernels.write_weights, len(dominant), inputs, device=device)
     return Rows(start, gaussian, out, dominant, expected)
