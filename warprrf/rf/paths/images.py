@@ -18,9 +18,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf import device as _device
 from warprrf.checks import check_positive, warn
-from warprrf.device import DeviceLike, Progress
+from warprrf.device import DeviceLike, Progress, filled, launch, resolve
 from warprrf.geometry.edges import Edges
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.kernels.radio import edges as edge_kernels
@@ -96,7 +95,7 @@ class MirrorImages:
         self.patches = patches
         self.max_chains = check_positive("max_chains", max_chains)
         self.transmitter = np.asarray(transmitter, float)
-        self.device = _device.resolve(device)
+        self.device = resolve(device)
         self._on_device = _patches_on_device(
             patches, patches.tolerance_m if slack_m is None else slack_m, self.device
         )
@@ -188,7 +187,7 @@ class MirrorImages:
                 words = wp.zeros((len(some), len(leaves.radius)), dtype=wp.uint32, device=self.device)
                 inputs = [self._on_device, some.patch, _cones(some, self.device), leaves.on_device]
                 inputs += [wp.vec3d(*point), wp.float64(IN_PLANE), words]
-                _device.launch(find_over_edges, words.size, inputs, device=self.device)
+                launch(find_over_edges, words.size, inputs, device=self.device)
                 chain, leaf, bit = _set_bits(words.numpy())
                 edge = leaves.edge[32 * leaf + bit]
                 # Pieces of an edge share their ends.
@@ -291,7 +290,7 @@ class MirrorImages:
         children.sine = wp.zeros(size, dtype=wp.float64, device=where)
         inputs = [self._on_device, last, _cones(chains, where), wp.vec3d(*middle), wp.float64(reach)]
         inputs += [start, counted, parent, patch, children]
-        _device.launch(kernels.extend_chains, len(chains), inputs, device=where, grain=16)
+        launch(kernels.extend_chains, len(chains), inputs, device=where, grain=16)
         arrays = (counted, parent, patch, children.apex, children.axis, children.sine)
         return tuple(a.numpy() for a in arrays)
 
@@ -299,13 +298,13 @@ class MirrorImages:
         where = self.device
         words = wp.zeros((len(chains), len(ends.leaf_radius)), dtype=wp.uint32, device=where)
         inputs = [self._on_device, chains.patch, _cones(chains, where), *ends.on_device, words]
-        _device.launch(kernels.find_chains, words.size, inputs, device=where)
+        launch(kernels.find_chains, words.size, inputs, device=where)
         chain, leaf, bit = _set_bits(words.numpy())
         row = ends.order[32 * leaf + bit]
         patches = chains.patch[chain]
         point = wp.zeros(patches.shape, dtype=wp.vec3d, device=where)
         inputs = [self._on_device, patches, chains.image[chain], ends.positions[row], point]
-        _device.launch(kernels.unfold_chains, len(row), inputs, device=where)
+        launch(kernels.unfold_chains, len(row), inputs, device=where)
         return row, patches, point.numpy().reshape(*patches.shape, 3)
 
 
@@ -345,7 +344,7 @@ class EdgeLeaves:
         leaf_middle, self.radius = _leaves(middle - half, middle + half)
         below = np.cross(own.along, own.inward), own.n[:, None] * np.pi
         far = np.sin(below[1]) * own.inward - np.cos(below[1]) * below[0]
-        self.on_device = _device.filled(
+        self.on_device = filled(
             edge_kernels.EdgePieces, where, start=start, along=own.along, first=below[0], last=far, length=piece,
             leaf_middle=leaf_middle, leaf_radius=self.radius,
         )  # fmt: skip
@@ -367,7 +366,7 @@ def _set_bits(words: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _cones(chains: Chains, where: wp.Device) -> Any:
-    return _device.filled(kernels.Cones, where, apex=chains.image, axis=chains.axis, sine=chains.sine)
+    return filled(kernels.Cones, where, apex=chains.image, axis=chains.axis, sine=chains.sine)
 
 
 def _patches_on_device(patches: PlanarPatches, slack_m: float, where: wp.Device) -> Any:
@@ -380,7 +379,7 @@ def _patches_on_device(patches: PlanarPatches, slack_m: float, where: wp.Device)
         pairs = np.arange(0, len(low_), 2)
         levels.append((np.minimum.reduceat(low_, pairs), np.maximum.reduceat(high_, pairs)))
     tree_low, tree_high = (np.concatenate(a) for a in zip(*levels, strict=True))
-    return _device.filled(
+    return filled(
         kernels.Patches,
         where,
         normal=patches.normal,

@@ -16,8 +16,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf import device as _device
 from warprrf.checks import check_array, check_count, check_positive, checked, one_line
+from warprrf.device import require
 from warprrf.kernels.radio.records import EDGE, SCATTER, SLAB
 from warprrf.rf.channel.arrays import End
 from warprrf.rf.channel.path_arrays import PathArrays, turned
@@ -274,6 +274,6 @@ def _as(values: np.ndarray, out_type: str) -> Any:
     if out_type == "numpy":
         return values
     if out_type == "torch":
-        torch = _device.require("torch", extra="baselines")
+        torch = require("torch", extra="baselines")
         return torch.from_numpy(values.astype(np.complex64 if np.iscomplexobj(values) else np.float32))
     raise ValueError(f"out_type: got {out_type!r}, expected 'numpy' or 'torch'")

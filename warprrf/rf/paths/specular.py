@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warprrf import device as _device
 from warprrf.checks import LARGEST, LARGEST_M, check_array
-from warprrf.device import DeviceLike
+from warprrf.device import DeviceLike, filled, launch, require, resolve
 from warprrf.kernels.radio import specular as kernels
 from warprrf.rf.em.fresnel import SurfaceTable
 from warprrf.rf.em.materials import ROUGHEST_M, VACUUM_PERMITTIVITY
@@ -83,12 +82,12 @@ class SpecularPaths:
         frequency_hz: float,
         device: DeviceLike,
     ) -> None:
-        self.receiver, self.frequency_hz, self.device = found.receiver, frequency_hz, _device.resolve(device)
+        self.receiver, self.frequency_hz, self.device = found.receiver, frequency_hz, resolve(device)
         self._made_of = found, offset, material
         self._traced, self._shape = {name: traced[name] for name in TYPES}, found.patch.shape
         mirrors = found.patch >= 0
         self._there = mirrors | (found.slab >= 0)
-        self._sequences = _device.filled(
+        self._sequences = filled(
             kernels.Sequences,
             self.device,
             frequency_hz=frequency_hz,
@@ -166,7 +165,7 @@ class SpecularPaths:
         if {"torch", "warp"} <= set(kinds.values()):
             raise TypeError(f"{', '.join(kinds)}: got arrays of Warp and of torch, expected those of one")
         if "torch" in kinds.values():
-            _device.require("torch", extra="baselines")
+            require("torch", extra="baselines")
             from warprrf.rf.paths.torch_functions import evaluate
 
             for name, value in given.items():
@@ -239,7 +238,7 @@ class SpecularPaths:
         if taped:
             wp.launch(kernels.follow_paths, count, [0, self._sequences, *inputs, *arrays], device=self.device)
         else:
-            _device.launch(
+            launch(
                 kernels.follow_paths, count, [self._sequences, *inputs, *arrays], device=self.device, grain=64
             )
         return arrays[1:]

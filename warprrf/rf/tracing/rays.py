@@ -13,9 +13,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf import device as _device
 from warprrf.cache import cached_property
-from warprrf.device import DeviceLike
+from warprrf.device import DeviceLike, launch, resolve
 from warprrf.geometry import rays as mesh_rays
 from warprrf.geometry.mesh import vectors_across
 from warprrf.kernels.radio import illumination
@@ -116,7 +115,7 @@ class RayGrid:
     ) -> None:
         self.surface, self.shape, self.sub_pixels, self.dtype = surface, shape, sub_pixels, np.dtype(dtype)
         self.loss_per_m = float(loss_per_m)
-        self.device = _device.resolve(device)
+        self.device = resolve(device)
         self.directions, solid_angle = sub_pixel_directions(shape, sub_pixels)
         self.solid_angle = solid_angle.astype(self.dtype)
         self.half_width = 0.5 * np.pi / (shape[0] * sub_pixels**2)
@@ -201,5 +200,5 @@ class RayGrid:
             np.reshape(sources, (-1, 3)), hits.origins, each, hits.directions, hits.face, hits.range_m, hits.solid_angle,
             NEAREST_M, self.loss_per_m, *found,
         ]  # fmt: skip
-        _device.launch(illumination.build(real), count, inputs, device=where)
+        launch(illumination.build(real), count, inputs, device=where)
         return Light(*(a.numpy() for a in found))

@@ -16,9 +16,8 @@ from typing import Any, Self
 import numpy as np
 import warp as wp
 
-from warprrf import device as _device
 from warprrf.cache import Cache
-from warprrf.device import DeviceLike
+from warprrf.device import DeviceLike, filled, launch, resolve
 from warprrf.kernels.radio import records as kernels
 from warprrf.rf.em.fresnel import COSINES, SurfaceTable, fresnel_curves, lobe_norm, reciprocal_factor
 from warprrf.rf.tracing.model import Parameters
@@ -120,9 +119,9 @@ class Records(Interactions):
             return np.zeros(0)
         if self.is_sent and not materials.has_sources:
             raise ValueError("materials: got none that elements send by, expected those with their radiance")
-        table, m, launch = self._table(materials)
+        table, m, run = self._table(materials)
         out = wp.empty(len(self), dtype=REALS[self.power.dtype], device=materials.device)
-        launch(
+        run(
             kernels.build(REALS[self.power.dtype]).record_power,
             len(self),
             [table, m, m.weight, m.excess, m.mirror, m.through, out],
@@ -147,8 +146,8 @@ class Records(Interactions):
         real, where = REALS[self.power.dtype], materials.device
         ends = (wp.array(own, dtype=wp.types.vector(2, real), device=where) for own in (sent, heard))
         out, slope = (wp.zeros(shape, dtype=real, device=where) for shape in (len(self), self.index.shape))
-        table, m, launch = self._table(materials)
-        launch(kernels.build(real).record_field, len(self), [table, m, *ends, out, slope])
+        table, m, run = self._table(materials)
+        run(kernels.build(real).record_field, len(self), [table, m, *ends, out, slope])
         return out.numpy(), slope.numpy()
 
     def add_slopes(self, materials: Materials, bins: Bins, place: np.ndarray, slopes: np.ndarray) -> None:
@@ -181,9 +180,9 @@ class Records(Interactions):
             return
         real, where = REALS[self.power.dtype], materials.device
         out = wp.array(sums, dtype=real, device=where, copy=False)
-        table, m, launch = self._table(materials)
+        table, m, run = self._table(materials)
         kernel_of = getattr(kernels.build(real), kernel)
-        launch(kernel_of, bins.count, [bins.first, bins.order, table, m, *more, out])
+        run(kernel_of, bins.count, [bins.first, bins.order, table, m, *more, out])
         if out.ptr != sums.ctypes.data:  # it was a copy: of another precision, or on another device
             sums[...] = out.numpy()
 
@@ -200,7 +199,7 @@ class Records(Interactions):
             return table
 
         table = self._uploaded.get(where, upload)
-        return table, materials.on_device(real), partial(_device.launch, device=where)
+        return table, materials.on_device(real), partial(launch, device=where)
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +252,7 @@ class Materials:
         device: DeviceLike = None,
     ) -> None:
         self.slabs = slabs
-        self.parameters, self.device = parameters, str(_device.resolve(device))
+        self.parameters, self.device = parameters, str(resolve(device))
         self.material = np.arange(len(parameters.log_excess)) if material is None else material
         self._side_group = np.zeros(0, int) if side_group is None else side_group
         self._radiance = np.zeros(0) if radiance is None else radiance
@@ -279,7 +278,7 @@ class Materials:
         even, slope = fresnel_curves().even(p.log_excess)
         eta, thickness = self.slabs
         exponent, scale = _lobes(p.lobes, (p.reciprocal,) * len(p.lobes), real, where, COSINES)
-        return _device.filled(
+        return filled(
             kernels.build(real).Materials, where, weight=p.weight, excess=p.excess, mirror=np.exp(p.log_mirror),
             even_slope=slope / even, radiance=self._radiance, through=np.exp(p.log_through), thickness=thickness,
             permittivity=np.column_stack([eta.real, eta.imag]), row=rows, side_row=rows[self._side_group],

@@ -16,10 +16,9 @@ import numpy as np
 import warp as wp
 from scipy.spatial import cKDTree
 
-from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
 from warprrf.checks import Expected, check_arrays, check_number, index_to, lengths
-from warprrf.device import DeviceLike
+from warprrf.device import DeviceLike, resolve
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh, components, smoothed_normals, vectors_across
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.scans import is_scan, scanned_patches
@@ -339,7 +338,7 @@ class Surface:
 
     def on_device(self, device: DeviceLike, real: Any) -> tuple[wp.array, wp.array]:
         """Normals of the faces, and those that scattering uses in precision ``real``, as kernels take them."""
-        where = _device.resolve(device)
+        where = resolve(device)
 
         def upload() -> tuple[wp.array, wp.array]:
             flat = wp.array(self.mesh.face_normals, dtype=wp.vec3d, device=where)
