@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf.cache import cached_property
+from warprrf.cache import Cache, cached_property
 from warprrf.checks import check_similarity, warn
 from warprrf.device import filled, launch, resolve
 from warprrf.geometry.edges import Edges, mesh_edges
@@ -168,6 +168,9 @@ class PlanarPatches:
         return boxes
 
     @cached_property
+    def _kept(self) -> Cache:
+        return Cache(1)  # which a pickle leaves empty: a structure of Warp's has none
+
     def _by_patch(self) -> PatchFaces:
         """Faces patch by patch on the CPU, with boxes of patches and faces and what lies close beside them."""
         order, ends = self._faces_and_ends
@@ -182,7 +185,7 @@ class PlanarPatches:
         where, inside = resolve("cpu"), np.empty(len(patch), dtype=bool)
         given = partial(wp.array, device=where, copy=False)
         inputs = [
-            self._by_patch, SEAM_M, given(np.asarray(patch, np.int32), dtype=wp.int32),
+            self._kept.get(0, self._by_patch), SEAM_M, given(np.asarray(patch, np.int32), dtype=wp.int32),
             given(np.asarray(points, float), dtype=wp.vec3d), given(inside, dtype=wp.bool),
         ]  # fmt: skip
         launch(lie_in_patches, len(patch), inputs, device=where)
