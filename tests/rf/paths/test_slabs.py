@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from radio_scenes import box_mesh, joined
 from scipy.spatial.transform import Rotation
+from trimesh.remesh import subdivide
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.fresnel import slab_passage, slab_reflection, slab_transmission
@@ -63,12 +64,14 @@ CUT = np.concatenate(
     [[[0, 1, 9], [0, 9, 8], [8, 9, 3], [8, 3, 2]], FACES[2:]]
 )  # the west side, of another one's edges
 AGAIN, PART = joined(FLOOR, (CORNERS, FACES), (CORNERS, FACES[:, ::-1]))
+FINER, PART_OF_FINER = joined(FLOOR, subdivide(CORNERS, np.roll(FACES, 1, axis=0)), (CORNERS, FACES[::-1]))
 WALLS = {
     "solid": room((CORNERS, FACES), thick),
     "solid, wound either way": room((CORNERS, np.where(EAST, FACES[:, ::-1], FACES)), thick),
     "solid, cut on one side": room((np.vstack([CORNERS, [[1.0, 0.0, 0.001], [1.0, 0.0, 6.0]]]), CUT), thick),
     "solid, doubled": Scene(AGAIN, [FLOORING, thick], np.minimum(PART, 1)),
     "solid, doubled of another material": Scene(AGAIN, [FLOORING, thick], PART % 2),
+    "solid, covered by finer faces": Scene(FINER, [FLOORING, thick], np.minimum(PART_OF_FINER, 1)),
     "turned": room((pane(1.0)[0], pane(1.0)[1][:, ::-1])),
     "doubled": room((pane(1.0)[0], np.concatenate([pane(1.0)[1], pane(1.0)[1][:, ::-1]]))),
     "cut up": room(
