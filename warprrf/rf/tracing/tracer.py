@@ -531,7 +531,7 @@ class MirroredLight:
         area = np.stack([np.bincount(own, one) for one in open_m2])
         centre, middle = place[tile], tiles.face[tile]
         shown = None
-        if walls is None:  # else what is behind some mirrors too
+        if walls is None:  # through slabs mirrors are lit that the transmitter does not see
             clear = s.mesh.visible(tracer.transmitter, tiles.off_centre, clearance=s.position_error_m)
             shown = np.unique(s.patch[tiles.face[clear]])
         ways = tracer.images.candidates(centre, 1, first=shown)
