@@ -25,7 +25,6 @@ PACKAGES = (
     "numpy",
     "pycolmap",
     "open3d",
-    "xarray",
     "h5netcdf",
     "safetensors",
     "torch",
