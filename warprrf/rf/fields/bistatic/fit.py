@@ -135,12 +135,12 @@ def _learned(
         )
         tracing_s += time.perf_counter() - again
         t = t.and_at(others, more)
-    residual, errors = cross_validate(t, choice)
-    choice, model = everyone(t, choice, residual)
+    errors = cross_validate(t, choice)
+    choice, model = everyone(t, choice)
     wrong, noise_db = t.unexplained(model)
     if wrong:
         t = t.without(wrong)
-        choice, model = everyone(t, choice, residual)
+        choice, model = everyone(t, choice)
     if errors is not None:
         errors = replace(errors, covariance=covariance_of(t, choice))
     missed = left_out(t, model)
@@ -242,43 +242,26 @@ def _name(effects: Effects) -> str:
     return (known or [str(effects)])[0]
 
 
-def cross_validate(t: Training, choice: Solution) -> tuple[bool, ErrorModel | None]:
-    """Whether the residual is wanted, or does not clearly raise the error of places held out, and the errors that then
-    remain: of those held out; where they are few, of all, held out in turn. No errors where no whole spectra were measured."""
-    free = isinstance(t.options.effects, str) and choice.effects.residual
-    if not len(t.held):
-        return choice.effects.residual, None
-    places = np.stack([o.place.receiver for o in t.observations.values()])
-    tried = (False, True) if free else (choice.effects.residual,)
-    power: dict[bool, list[np.ndarray]] = {residual: [] for residual in tried}
-    order: list[int] = []
-    gaps, most_to_judge = [], 200  # receivers that a residual is learned from: more make it no worse
-    for held in _folds(t):
-        kept = evenly(np.setdiff1d(np.arange(len(places)), held), most_to_judge)
-        own = choice if held is t.held else t.refined(choice, kept, SHORT_STEPS)
-        order += held.tolist()
-        gaps += [np.linalg.norm(places[kept] - places[r], axis=1).min() for r in held]
-        for residual, found in power.items():
-            model = t.model(own, residual=residual)
-            learned = with_residual(t, model, kept) if residual else model
-            found += t.predicted(learned, held)
-    loss = {residual: t.mean_loss(order, own) for residual, own in power.items()}
-    clearly_worse = 1.05  # one that is learned from all receivers gains more
-    keep = loss[True] < clearly_worse * loss[False] if free else choice.effects.residual
-    for residual, error in loss.items():
-        t.note("residual" if residual else "no residual", residual == keep, error)
-    if not all(
+def cross_validate(t: Training, choice: Solution) -> ErrorModel | None:
+    """The errors of places held out; where they are few, of all, held out in turn. None where no whole spectra were measured."""
+    whole = (
         isinstance(o.measured, SpectrumPixels) and (o.target.trust == 1.0).all()
         for o in t.observations.values()
-    ):
-        return keep, None
-    shapes = [t.observations[k].place.shape for k in order]
-    images = [(NEPER * np.log1p(x)).reshape(shape) for x, shape in zip(power[keep], shapes, strict=True)]
-    missed = [
-        t.observations[k].target.error(x).reshape(shape)
-        for k, x, shape in zip(order, power[keep], shapes, strict=True)
-    ]
-    return keep, learn_errors(images, missed, np.array(gaps), places, covariance_of(t, choice))
+    )
+    if not len(t.held) or not all(whole):
+        return None
+    places = np.stack([o.place.receiver for o in t.observations.values()])
+    images, missed, gaps = list[np.ndarray](), list[np.ndarray](), list[float]()
+    most_to_judge = 200  # receivers that a residual is learned from: more make it no worse
+    for held in _folds(t):
+        kept = evenly(np.setdiff1d(np.arange(len(places)), held), most_to_judge)
+        model = with_residual(t, choice if held is t.held else t.refined(choice, kept, SHORT_STEPS), kept)
+        for k, power in zip(held, t.predicted(model, held), strict=True):
+            o = t.observations[k]
+            images.append((NEPER * np.log1p(power)).reshape(o.place.shape))
+            missed.append(o.target.error(power).reshape(o.place.shape))
+            gaps.append(float(np.linalg.norm(places[kept] - places[k], axis=1).min()))
+    return learn_errors(images, missed, np.array(gaps), places, covariance_of(t, choice))
 
 
 def _folds(t: Training) -> list[np.ndarray]:
@@ -290,18 +273,25 @@ def _folds(t: Training) -> list[np.ndarray]:
     return folds
 
 
-def everyone(t: Training, choice: Solution, residual: bool) -> tuple[Solution, Model]:
-    """The choice fitted to all places, and its model with the residual, if wanted."""
+def everyone(t: Training, choice: Solution) -> tuple[Solution, Model]:
+    """The choice fitted to all places, and its model."""
     choice = t.refined(choice, t.telling, t.options.iterations)
-    model = t.model(choice, residual=residual)
-    return choice, with_residual(t, model, list(t.observations)) if residual else model
+    return choice, with_residual(t, choice, list(t.observations))
 
 
-def with_residual(t: Training, model: Model, places: Sequence[int] | np.ndarray) -> Model:
-    """``model`` with gains of surface cells that readings at ``places`` tell."""
+def with_residual(t: Training, choice: Solution, places: Sequence[int] | np.ndarray) -> Model:
+    """The model of ``choice``, with gains of surface cells that readings at ``places`` tell if it has a residual.
+
+    That is not tried on places held out: a few of them often say that a residual harms, though it helped wherever it was tried.
+    """
+    model = t.model(choice)
+    if not choice.effects.residual:
+        return model
     shares = [shares_of(t.observations[k], model) for k in places]
     t.step()
-    return replace(model, residual=fit_residual(shares, t.surface, quick=t.options.quick))
+    return replace(
+        model, effects=choice.effects, residual=fit_residual(shares, t.surface, quick=t.options.quick)
+    )
 
 
 def _offsets(t: Training, found: Model) -> dict[int, list[tuple[Place, np.ndarray]]]:

@@ -310,9 +310,9 @@ class Training:
             **({"energy": 1.0} if self.totals else {}),
         )  # fmt: skip
 
-    def model(self, choice: Solution, *, residual: bool = False) -> Model:
+    def model(self, choice: Solution) -> Model:
         """That of groups, without a residual yet."""
-        effects = replace(choice.effects, residual=residual)
+        effects = replace(choice.effects, residual=False)
         none = np.zeros((2, len(self.surface.cells)))
         return Model(effects, choice.parameters.take(choice.material), none, self.transmitter)
 
