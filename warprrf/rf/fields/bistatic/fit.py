@@ -32,7 +32,6 @@ from warprrf.rf.fields.bistatic.training import (
     FEW_RECEIVERS,
     MERGES,
     MOST_KEPT,
-    MOST_TO_CHOOSE,
     Training,
     check_rays,
     rays_of,
@@ -176,16 +175,16 @@ def choose(t: Training) -> Solution:
         best, least = trial, loss
     if best is None:
         raise ValueError("effects: got none to choose from")
-    best, least = _spared(t, best, least)
+    best = _spared(t, best)
     if np.isfinite(t.surface.appearance).all() and material.max() > 0 and not t.totals:
-        best = merged(t, best, least)
+        best = merged(t, best)
     return best
 
 
-def _spared(t: Training, best: Solution, least: float) -> tuple[Solution, float]:
-    """``best`` and its loss without those of :data:`RARE` that readings are predicted better without. Places held out are too
-    few to say so alone: none of them may be behind a wall."""
-    chosen, places = best, np.union1d(t.few(1), t.held)
+def _spared(t: Training, chosen: Solution) -> Solution:
+    """``chosen`` without those of :data:`RARE` that readings are predicted better without. Places held out are too few to say so
+    alone: none of them may be behind a wall."""
+    places = np.union1d(t.few(1), t.held)
     for name, on in RARE.items() if t.options.effects == "auto" and t.options.relevance is None else ():
         off: dict[str, Any] = dict.fromkeys(on, 0)
         fewer = replace(chosen.effects, **off)
@@ -195,7 +194,7 @@ def _spared(t: Training, best: Solution, least: float) -> tuple[Solution, float]
             kept = loss < BETTER * t.part_loss(chosen, places)
             t.note(f"no {name}", kept, loss)
             chosen = trial if kept else chosen
-    return chosen, least if chosen is best else t.held_loss(chosen)
+    return chosen
 
 
 def _choose_of_few(t: Training, trials: list[Solution]) -> Solution:
@@ -214,8 +213,8 @@ def _choose_of_few(t: Training, trials: list[Solution]) -> Solution:
     return single if fewer else room
 
 
-def merged(t: Training, best: Solution, least: float) -> Solution:
-    """Materials by what the readings say, if that lowers the error of the places held out."""
+def merged(t: Training, best: Solution) -> Solution:
+    """Materials by what the readings say. Places held out are not asked: too few of them tell by chance whether that is better."""
     trial, by_shape = best, t.surface.by_shape
     problem = t.problem(best.effects, best.material, t.few(2), best.parameters)
     for _ in range(MERGES):
@@ -224,14 +223,8 @@ def merged(t: Training, best: Solution, least: float) -> Solution:
         problem = replace(problem, material=material, known_through=t.known_through(material))
         trial = gauss_newton(problem, start, SHORT_STEPS)
         t.step()
-    loss = t.held_loss(trial)
-    # Few receivers held out say little, fewer materials that describe the others better say much.
-    same = len(t.kept) <= MOST_TO_CHOOSE  # receivers of both fits
-    simpler = same and trial.losses[-1:] < best.losses[-1:]
-    not_much_worse = 1.25
-    keep = loss < least or (simpler and loss < not_much_worse * least)
-    t.note(f"{best.material.max() + 1} materials as {trial.material.max() + 1}", keep, loss)
-    return trial if keep else best
+    t.note(f"{best.material.max() + 1} materials as {trial.material.max() + 1}", True, t.held_loss(trial))
+    return trial
 
 
 def _name(effects: Effects) -> str:
