@@ -20,7 +20,7 @@ from warprrf.cache import Cache, cached_property
 from warprrf.checks import check_similarity, warn
 from warprrf.device import filled, launch, resolve
 from warprrf.geometry.edges import Edges, mesh_edges
-from warprrf.geometry.mesh import Mesh, components, edge_pairs, vectors_across
+from warprrf.geometry.mesh import Mesh, boxes_of, components, edge_pairs, vectors_across
 from warprrf.kernels.rays.mesh import OverlapFaces, find_overlaps
 from warprrf.kernels.rays.patches import PatchFaces, lie_in_patches
 
@@ -159,13 +159,8 @@ class PlanarPatches:
     @cached_property
     def boxes(self) -> np.ndarray:
         """Lowest and highest corner of each patch [m], shape ``(P, 2, 3)``."""
-        boxes = np.empty((len(self), 2, 3))
-        boxes[:, 0], boxes[:, 1] = np.inf, -np.inf
         own = self.face_patch >= 0
-        corners = self.mesh.triangles[own]
-        np.minimum.at(boxes[:, 0], self.face_patch[own], corners.min(axis=1))
-        np.maximum.at(boxes[:, 1], self.face_patch[own], corners.max(axis=1))
-        return boxes
+        return boxes_of(self.mesh.triangles[own], self.face_patch[own], len(self))
 
     @cached_property
     def _kept(self) -> Cache:

@@ -64,11 +64,25 @@ CUT = np.concatenate(
     [[[0, 1, 9], [0, 9, 8], [8, 9, 3], [8, 3, 2]], FACES[2:]]
 )  # the west side, of another one's edges
 AGAIN, PART = joined(FLOOR, (CORNERS, FACES), (CORNERS, FACES[:, ::-1]))
+
+
+def sides():
+    """The solid, its sides cut into pieces whose corners do not meet."""
+    parts = []
+    for k in range(6):
+        parts.append((CORNERS, FACES[2 * k : 2 * k + 2]))
+        for _ in range(k // 2):
+            parts[-1] = subdivide(*parts[-1])
+    mesh = joined(*parts)[0]
+    return mesh.vertices, mesh.faces
+
+
 FINER, PART_OF_FINER = joined(FLOOR, subdivide(CORNERS, np.roll(FACES, 1, axis=0)), (CORNERS, FACES[::-1]))
 WALLS = {
     "solid": room((CORNERS, FACES), thick),
     "solid, wound either way": room((CORNERS, np.where(EAST, FACES[:, ::-1], FACES)), thick),
     "solid, cut on one side": room((np.vstack([CORNERS, [[1.0, 0.0, 0.001], [1.0, 0.0, 6.0]]]), CUT), thick),
+    "solid, each side cut by itself": room(sides(), thick),
     "solid, doubled": Scene(AGAIN, [FLOORING, thick], np.minimum(PART, 1)),
     "solid, doubled of another material": Scene(AGAIN, [FLOORING, thick], PART % 2),
     "solid, covered by finer faces": Scene(FINER, [FLOORING, thick], np.minimum(PART_OF_FINER, 1)),
@@ -119,6 +133,15 @@ def test_a_corner_lets_the_same_through_however_it_is_turned(turn, swapped):
     power = 0.5 * sum(np.abs(a * b) ** 2 for a, b in zip(front, side, strict=True))
     free = SPEED_OF_LIGHT / F / (4 * np.pi * np.linalg.norm(ends[1] - ends[0]))
     assert found.power[0] == pytest.approx(power * free**2, rel=1e-6)
+
+
+def test_a_solid_one_metre_thick_is_one_slab_wherever_it_stands():
+    """More is two sheets: rounding of coordinates does not decide."""
+    rng, (vertices, faces) = np.random.default_rng(0), box_mesh([-0.5, -2.0, -2.0], [0.5, 2.0, 2.0])
+    for turn, shift in zip(Rotation.random(8, rng=0).as_matrix(), rng.uniform(-50, 50, (8, 3)), strict=True):
+        scene = Scene(Mesh(vertices @ turn.T + shift, faces), [GLASS], np.zeros(len(faces), np.int32))
+        ends = np.array([[-2.0, 0.3, 0.1], [2.0, -0.2, 0.4]]) @ turn.T + shift
+        assert paths(scene, ends).interactions[0].tolist() == [4, 0, 0, 0]
 
 
 def test_five_panes_let_through_what_each_does():
