@@ -190,6 +190,18 @@ def test_ways_through_slabs_are_the_same_both_ways_and_as_many_as_asked_for():
     assert len(paths(room(pane(1.0), metal)).tau) == 0
 
 
+def test_free_paths_come_first_then_those_through_slabs_each_by_order_and_length():
+    """Slabs delay: by their delays paths of one order stand otherwise."""
+    scene, order = room(pane(1.0), replace(GLASS, thickness_m=0.05)), []
+    mesh = joined(FLOOR, pane(1.0), pane(3.0))
+    found = paths(Scene(mesh[0], scene.materials, np.minimum(mesh[1], 1)), (TX, RX), diffractions=1)
+    for over, met, *way in zip(found.kind == "edge", found.interactions, found.vertices, strict=True):
+        points = np.vstack([TX, way[0][met > 0], RX])
+        length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
+        order.append((over, (met == 4).any() and not over, (met == 1).sum() * (not over), round(length, 9)))
+    assert order == sorted(order) and {o[:2] for o in order} == {(False, True), (True, False)}
+
+
 def test_what_scatters_before_and_behind_a_slab_is_the_integral_over_the_floor():
     """Lambertian scattering of a floor, lit through the pane, from a metal ceiling too, or seen through it."""
     effects = Effects(mirrors=1, scatterings=1, mirror_scatter=True, diffractions=0, residual=False)
