@@ -79,8 +79,7 @@ def mesh_edges(mesh: Mesh, normal: np.ndarray | None = None, groups: np.ndarray 
 def _candidates(mesh: Mesh, normal: np.ndarray) -> np.ndarray:
     """Sides of triangles that may be on an edge: all but those of two faces in one plane; pairs of places ``(S, 2)``."""
     face = mesh.distinct_faces[(normal[mesh.distinct_faces] != 0).any(axis=1)]
-    corner = mesh.welded_faces[face]
-    sides = sides_of(corner)
+    sides = sides_of(mesh.welded_faces[face])
     owner, third = np.repeat(face, 3), mesh.triangles[face][:, [2, 0, 1]].reshape(-1, 3)
     start = mesh.triangles[face].reshape(-1, 3)
     once, _, count = distinct_rows(sides)
@@ -99,15 +98,12 @@ def _candidates(mesh: Mesh, normal: np.ndarray) -> np.ndarray:
 
 def _split(mesh: Mesh, sides: np.ndarray, place: np.ndarray, reach: float) -> np.ndarray:
     """The pieces into which ends of other ``sides`` cut them, each once, as pairs of places ``(P, 2)``."""
-    corner, count = mesh.welded_faces, len(place)
-    point = np.unique(sides)
+    point, key = np.unique(sides), [len(place), 1]
     row, face = mesh.faces_at(place[point], reach)
-    row, face = np.repeat(point[row], 3), np.repeat(face, 3)
-    beside = sides_of(corner[face[::3]])
-    key = sides[:, 0] * count + sides[:, 1]
-    which = np.searchsorted(key, beside[:, 0] * count + beside[:, 1]).clip(max=len(key) - 1)
+    beside = sides_of(mesh.welded_faces[face])
+    which = np.searchsorted(sides @ key, beside @ key).clip(max=len(sides) - 1)
     own = (sides[which] == beside).all(axis=1)
-    pieces = cut(sides, which[own], row[own], place, reach)[0]
+    pieces = cut(sides, which[own], np.repeat(point[row], 3)[own], place, reach)[0]
     pieces = pieces[distinct_rows(pieces)[0]]
     return pieces[pieces[:, 0] != pieces[:, 1]]
 

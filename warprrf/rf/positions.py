@@ -215,10 +215,8 @@ def check_dataset(mesh: Mesh | None, ds: SpectrumDataset | PowerTable, *, device
 
     Raises, warns: as :func:`check_positions` and :func:`question_unit`.
     """
-    wavelength_m, name = (
-        SPEED_OF_LIGHT / ds.frequency_hz,
-        "transmitters" if isinstance(ds, PowerTable) else "transmitter",
-    )
+    wavelength_m = SPEED_OF_LIGHT / ds.frequency_hz
+    name = "transmitters" if isinstance(ds, PowerTable) else "transmitter"
     if mesh is not None:
         question_unit(mesh, wavelength_m)
     names = f"ds.{name}", "ds.receivers"
