@@ -45,7 +45,7 @@ def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def couples(rows: np.ndarray) -> np.ndarray:
-    """Indices of equal ``rows`` (N, K) where just two are, in their lexical order, shape ``(2, M)``."""
+    """Indices of equal ``rows`` (N, K) where just two are, shape ``(2, M)``."""
     _, index, count = distinct_rows(rows)
     last = np.cumsum(count)[count == 2] - 1
     return np.argsort(index, kind="stable")[[last - 1, last]]

@@ -63,7 +63,7 @@ def mesh_edges(mesh: Mesh, normal: np.ndarray | None = None, groups: np.ndarray 
     normal = mesh.face_normals if normal is None else normal
     groups = np.zeros(len(mesh.faces), int) if groups is None else groups
     sides, place, reach = _candidates(mesh, normal), mesh.places, mesh.weld_m
-    ends = _split(mesh, sides, place, reach)
+    ends = _split(mesh, sides)
     span = place[ends[:, 1]] - place[ends[:, 0]]
     span *= np.where(span @ _SIDE < 0, -1.0, 1.0)[:, None]
     length = np.linalg.norm(span, axis=1)
@@ -96,14 +96,14 @@ def _candidates(mesh: Mesh, normal: np.ndarray) -> np.ndarray:
     return found[~flat & (found[:, 0] != found[:, 1])]
 
 
-def _split(mesh: Mesh, sides: np.ndarray, place: np.ndarray, reach: float) -> np.ndarray:
+def _split(mesh: Mesh, sides: np.ndarray) -> np.ndarray:
     """The pieces into which ends of other ``sides`` cut them, each once, as pairs of places ``(P, 2)``."""
-    point, key = np.unique(sides), [len(place), 1]
-    row, face = mesh.faces_at(place[point], reach)
+    point, key = np.unique(sides), [len(mesh.places), 1]
+    row, face = mesh.faces_at(mesh.places[point], mesh.weld_m)
     beside = sides_of(mesh.welded_faces[face])
     which = np.searchsorted(sides @ key, beside @ key).clip(max=len(sides) - 1)
     own = (sides[which] == beside).all(axis=1)
-    pieces = cut(sides, which[own], np.repeat(point[row], 3)[own], place, reach)[0]
+    pieces = cut(sides, which[own], np.repeat(point[row], 3)[own], mesh)[0]
     pieces = pieces[distinct_rows(pieces)[0]]
     return pieces[pieces[:, 0] != pieces[:, 1]]
 

@@ -313,7 +313,7 @@ class Mesh:
         radius = np.linalg.norm(end - start, axis=1) / 2 + self.weld_m
         near = cKDTree(self.places[at]).query_ball_point((start + end) / 2, radius)
         row = np.repeat(np.arange(len(near)), [len(n) for n in near])
-        pieces, row = cut(edge[loose], row, at[np.concatenate(near)], self.places, self.weld_m)
+        pieces, row = cut(edge[loose], row, at[np.concatenate(near)], self)
         return np.concatenate([edge[~loose], pieces]), np.concatenate([owner[~loose], owner[loose][row]])
 
     @cached_property
@@ -576,20 +576,18 @@ def components(count: int, pairs: np.ndarray) -> np.ndarray:
 
 
 def sides_of(corner: np.ndarray) -> np.ndarray:
-    """Ends of the three sides of each of the faces ``corner`` (F, 3), the smaller index first, shape ``(3 F, 2)``."""
+    """Sides of the faces ``corner`` (F, 3), the smaller index first, shape ``(3 F, 2)``."""
     return np.sort(corner[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
 
 
-def cut(
-    sides: np.ndarray, row: np.ndarray, at: np.ndarray, place: np.ndarray, reach_m: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pieces (P, 2) into which the indices ``at`` (N,) of ``place`` cut those of the ``sides`` (S, 2) of index ``row`` (N,) that
-    they lie on, to ``reach_m``, their ends among them; and of which side each is, ``(P,)``."""
-    start, end = place[sides.T]
+def cut(sides: np.ndarray, row: np.ndarray, at: np.ndarray, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Pieces (P, 2) of ``sides`` (S, 2) between those places ``at`` (N,) of a mesh that lie on the side ``row`` (N,), its ends
+    among them; and of which side each is, ``(P,)``."""
+    start, end = mesh.places[sides.T]
     along, length = headings(end - start)
-    way = place[at] - start[row]
+    way = mesh.places[at] - start[row]
     far = (way * along[row]).sum(axis=1)
-    on = np.linalg.norm(way - far.clip(0.0, length[row])[:, None] * along[row], axis=1) <= reach_m
+    on = np.linalg.norm(way - far.clip(0.0, length[row])[:, None] * along[row], axis=1) <= mesh.weld_m
     order = np.flatnonzero(on)[np.lexsort((far[on], row[on]))]
     first, last = order[:-1], order[1:]
     same = row[first] == row[last]
@@ -616,9 +614,9 @@ def _sharing(edge: np.ndarray, owner: np.ndarray) -> np.ndarray:
 
 def face_neighbours(faces: np.ndarray) -> np.ndarray:
     """The face across each edge, -1 at a border (and at edges of more than two faces), shape ``(F, 3)`` int64."""
-    a, b = couples(sides_of(faces))
+    pairs = couples(sides_of(faces))
     across = np.full(3 * len(faces), -1, dtype=np.int64)
-    across[a], across[b] = b // 3, a // 3
+    across[pairs] = pairs[::-1] // 3
     return across.reshape(-1, 3)
 
 

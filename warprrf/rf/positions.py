@@ -416,9 +416,7 @@ def _rooms(mesh: Mesh) -> list[int]:
     """Which closed parts of a scene have its air inside: those that hold most of what is left, from the outermost inward,
     or are all that is left: the scene's only surface, or the inner one of its walls."""
     rooms = list[int]()
-    room = 0.1  # least share of the box around a scene that its room takes
-    least = room * _box(mesh)
-    wall = 0.5  # least share of what a room's walls hold that their inner surface does
+    least = 0.1 * _box(mesh)  # that share of the box around a scene its room takes
     samples = 1000  # faces whose places tell what a surface holds
     for k, part in _outermost_first(mesh):
         if _box(part) < least:
@@ -437,7 +435,7 @@ def _rooms(mesh: Mesh) -> list[int]:
         fragments = left <= 0.1 * part.areas.sum() and not _is_amid(part, places)
         if held > 0.5 * left or fragments:
             rooms.append(k)
-            least = wall * volume
+            least = 0.5 * volume  # that share of what its walls hold their inner surface does
     return rooms
 
 
