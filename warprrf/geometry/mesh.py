@@ -282,8 +282,8 @@ class Mesh:
             boxes = boxes_of(points, owner, owner.max(initial=-1) + 1)
             return np.asarray(np.linalg.norm(np.ptp(boxes, axis=1), axis=1))
 
-        edge, owner = self._edges
-        part = components(len(self.cornered_faces), _sharing(edge, owner))
+        (edge, owner), part = self._edges, components(len(self.faces), self.neighbours)[self.cornered_faces]
+        part = np.unique(part, return_inverse=True)[1]
         first, _, count = distinct_rows(edge)
         rim = first[count % 2 == 1]
         own, ends = part[owner[rim]], edge[rim]
@@ -298,6 +298,12 @@ class Mesh:
         found = np.full(len(self.faces), -1)
         found[self.cornered_faces] = np.where(closed, np.cumsum(closed) - 1, -1)[part]
         return found
+
+    @cached_property
+    def neighbours(self) -> np.ndarray:
+        """Pairs of :attr:`cornered_faces` that share a side, or a part of one, shape ``(N, 2)``."""
+        edge, owner = self._edges
+        return _sharing(edge, self.cornered_faces[owner])
 
     @cached_property
     def _edges(self) -> tuple[np.ndarray, np.ndarray]:
@@ -594,10 +600,9 @@ def cut(sides: np.ndarray, row: np.ndarray, at: np.ndarray, mesh: Mesh) -> tuple
     return np.sort(at[np.column_stack([first, last])[same]], axis=1), row[first[same]]
 
 
-def edge_pairs(corner: np.ndarray, face: np.ndarray | None = None) -> np.ndarray:
-    """Pairs of the faces ``corner`` (F, 3), of ``face`` (K,) alone if given, that share an edge, shape ``(N, 2)``."""
-    face = np.arange(len(corner)) if face is None else face
-    return _sharing(sides_of(corner[face]), np.repeat(face, 3))
+def edge_pairs(corner: np.ndarray) -> np.ndarray:
+    """Pairs of the faces ``corner`` (F, 3) that share a side, shape ``(N, 2)``."""
+    return _sharing(sides_of(corner), np.repeat(np.arange(len(corner)), 3))
 
 
 def _sharing(edge: np.ndarray, owner: np.ndarray) -> np.ndarray:
