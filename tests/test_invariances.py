@@ -38,7 +38,7 @@ def found(figure, law=None, name="plain"):
 
 
 SAID_BY_ANOTHER = [
-    "shifted by 1e6 m", "turned by a quarter", "scaled by 0.1", "mixed winding", "unwelded", "subdivided",
+    "shifted by 1e6 m", "turned by a quarter", "scaled by 0.1", "mixed winding", "unwelded", "subdivided", "cut in part",
     *(f"in two sheets 1e{k} m apart" for k in (-6, -5)), "noise of 1e-6 m",
 ]  # fmt: skip
 """Laws whose like, at another size, is asked of spectra too; mirrors are asked about all."""

@@ -44,6 +44,13 @@ def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return order[new], index, np.bincount(index)
 
 
+def couples(rows: np.ndarray) -> np.ndarray:
+    """Indices of equal ``rows`` (N, K) where just two are, shape ``(2, M)``."""
+    _, index, count = distinct_rows(rows)
+    last = np.cumsum(count)[count == 2] - 1
+    return np.argsort(index, kind="stable")[[last - 1, last]]
+
+
 def sums_of(values: np.ndarray, owner: np.ndarray, count: int = 0) -> np.ndarray:
     """Sums of the rows of ``values`` (N, K) that are each owner's, ``owner`` (N,), of at least ``count``: shape ``(C, K)``."""
     return np.stack([np.bincount(owner, column, minlength=count) for column in values.T], axis=1)

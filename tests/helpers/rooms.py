@@ -259,6 +259,14 @@ def subdivided(room: Room) -> Room:
     return replace(room, vertices=welded, faces=index.reshape(-1, 3), part=np.repeat(room.part, 4))
 
 
+def cut_in_part(room: Room) -> Room:
+    """Every other face cut into four, so that corners of a seam do not meet."""
+    fine, some = unwelded(subdivided(room)), np.arange(len(room.faces)) % 2 == 0
+    mesh, _ = joined((room.vertices, room.faces[~some]), (fine.vertices, fine.faces[np.repeat(some, 4)]))
+    part = np.concatenate([room.part[~some], np.repeat(room.part[some], 4)])
+    return replace(room, vertices=mesh.vertices, faces=mesh.faces, part=part)
+
+
 def with_faces_without_area(room: Room) -> Room:
     """Faces with two equal corners, and with all three on a line."""
     face = room.faces[np.random.default_rng(4).integers(0, len(room.faces), 10)]
@@ -311,6 +319,7 @@ EXACT: dict[str, Change] = {
     ),  # the first counts
     "covered by finer faces": lambda room: _with(room, subdivided(room)),
     "subdivided": subdivided,
+    "cut in part": cut_in_part,
     "with faces without area": with_faces_without_area,
 }
 """What must not change a room at all."""

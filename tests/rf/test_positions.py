@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rooms
 from radio_scenes import box_mesh, joined
 from trimesh.remesh import subdivide, subdivide_to_size
 
@@ -161,6 +162,34 @@ def test_only_what_a_closed_surface_holds_is_no_air_however_surfaces_are_wound(s
     off = mesh.distance(places) > 0.01
     for known in (places[~solid & off][0], None):
         np.testing.assert_array_equal(is_free(mesh, places, known)[off], ~solid[off])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_room_is_one_whichever_way_each_face_is_wound(seed):
+    """Of an L-shaped one, whose faces enclose next to nothing by their signs, places beyond the walls were free and none within."""
+    known = rooms.l_shaped().mesh
+    turned = np.random.default_rng(seed).random((len(known.faces), 1)) < 0.5
+    mesh = Mesh(known.vertices, np.where(turned, known.faces[:, ::-1], known.faces))
+    places = np.random.default_rng(1).uniform(*known.bounds, (500, 3))
+    free = is_free(known, places)
+    assert 0.5 < free.mean() < 0.9
+    np.testing.assert_array_equal(is_free(mesh, places), free)
+
+
+def test_a_room_is_closed_though_corners_of_its_sides_do_not_meet():
+    """Each side is cut into pieces by itself, as exporters and remeshers do; with one side missing it is open."""
+    sides = []
+    for k in range(6):
+        vertices, faces = box_mesh(LOW, HIGH, inward=True)
+        sides.append((vertices, faces[2 * k : 2 * k + 2]))
+        for _ in range(k // 2):
+            sides[-1] = subdivide(*sides[-1])
+    beyond = np.array([AIR, HIGH + 0.5])
+    with pytest.raises(ValueError, match=r"receivers\[1\].*outside the scene"):
+        check_positions(joined(*sides)[0], TX, beyond, WAVELENGTH)
+    for k in range(6):
+        mesh = joined(*sides[:k], *sides[k + 1 :])[0]
+        assert not mesh.is_closed and (mesh.closed_part_of < 0).all()
 
 
 def test_a_room_is_one_though_fragments_lie_beside_it():

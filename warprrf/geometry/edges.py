@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warprrf.geometry.mesh import Mesh, components, headings, vectors_across
-from warprrf.rows import Rows, distinct_rows
+from warprrf.geometry.mesh import Mesh, components, cut, headings, sides_of, vectors_across
+from warprrf.rows import Rows, couples, distinct_rows
 
 LEAST_BEND_RAD = np.radians(1.0)
 """Faces that are bent less make no edge."""
@@ -63,7 +63,7 @@ def mesh_edges(mesh: Mesh, normal: np.ndarray | None = None, groups: np.ndarray 
     normal = mesh.face_normals if normal is None else normal
     groups = np.zeros(len(mesh.faces), int) if groups is None else groups
     sides, place, reach = _candidates(mesh, normal), mesh.places, mesh.weld_m
-    ends = _split(mesh, sides, place, reach)
+    ends = _split(mesh, sides)
     span = place[ends[:, 1]] - place[ends[:, 0]]
     span *= np.where(span @ _SIDE < 0, -1.0, 1.0)[:, None]
     length = np.linalg.norm(span, axis=1)
@@ -79,14 +79,11 @@ def mesh_edges(mesh: Mesh, normal: np.ndarray | None = None, groups: np.ndarray 
 def _candidates(mesh: Mesh, normal: np.ndarray) -> np.ndarray:
     """Sides of triangles that may be on an edge: all but those of two faces in one plane; pairs of places ``(S, 2)``."""
     face = mesh.distinct_faces[(normal[mesh.distinct_faces] != 0).any(axis=1)]
-    corner = mesh.welded_faces[face]
-    sides = np.sort(corner[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    sides = sides_of(mesh.welded_faces[face])
     owner, third = np.repeat(face, 3), mesh.triangles[face][:, [2, 0, 1]].reshape(-1, 3)
     start = mesh.triangles[face].reshape(-1, 3)
-    once, index, count = distinct_rows(sides)
-    found, order = sides[once], np.argsort(index, kind="stable")
-    first = order[np.cumsum(count)[count == 2] - 2]
-    second = order[np.cumsum(count)[count == 2] - 1]
+    once, _, count = distinct_rows(sides)
+    found, (first, second) = sides[once], couples(sides)
     a, b = normal[owner[first]], normal[owner[second]]
     cosine, sine = np.abs((a * b).sum(axis=1)), np.linalg.norm(np.cross(a, b), axis=1)
     span = mesh.triangles[face][:, [1, 2, 0]].reshape(-1, 3)[first] - start[first]
@@ -99,32 +96,14 @@ def _candidates(mesh: Mesh, normal: np.ndarray) -> np.ndarray:
     return found[~flat & (found[:, 0] != found[:, 1])]
 
 
-def _split(mesh: Mesh, sides: np.ndarray, place: np.ndarray, reach: float) -> np.ndarray:
+def _split(mesh: Mesh, sides: np.ndarray) -> np.ndarray:
     """The pieces into which ends of other ``sides`` cut them, each once, as pairs of places ``(P, 2)``."""
-    corner, count = mesh.welded_faces, len(place)
-    point = np.unique(sides)
-    row, face = mesh.faces_at(place[point], reach)
-    row, face = np.repeat(point[row], 3), np.repeat(face, 3)
-    beside = np.sort(corner[face[::3]][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    key = sides[:, 0] * count + sides[:, 1]
-    which = np.searchsorted(key, beside[:, 0] * count + beside[:, 1]).clip(max=len(key) - 1)
+    point, key = np.unique(sides), [len(mesh.places), 1]
+    row, face = mesh.faces_at(mesh.places[point], mesh.weld_m)
+    beside = sides_of(mesh.welded_faces[face])
+    which = np.searchsorted(sides @ key, beside @ key).clip(max=len(sides) - 1)
     own = (sides[which] == beside).all(axis=1)
-    row, which = row[own], which[own]
-    start, span = place[sides[:, 0]], place[sides[:, 1]] - place[sides[:, 0]]
-    length = np.linalg.norm(span, axis=1)
-    along = span / np.maximum(length, 1e-300)[:, None]
-    way = place[row] - start[which]
-    at = (way * along[which]).sum(axis=1)
-    on = (at > reach) & (at < length[which] - reach)
-    on &= np.linalg.norm(way - at[:, None] * along[which], axis=1) <= reach
-    each = np.arange(len(sides))
-    side = np.concatenate([each, each, which[on]])
-    at = np.concatenate([np.zeros(len(sides)), length, at[on]])
-    name = np.concatenate([sides[:, 0], sides[:, 1], row[on]])
-    order = np.lexsort((at, side))
-    side, name = side[order], name[order]
-    pieces = np.column_stack([name[:-1], name[1:]])[side[:-1] == side[1:]]
-    pieces = np.sort(pieces, axis=1)
+    pieces = cut(sides, which[own], np.repeat(point[row], 3)[own], mesh)[0]
     pieces = pieces[distinct_rows(pieces)[0]]
     return pieces[pieces[:, 0] != pieces[:, 1]]
 

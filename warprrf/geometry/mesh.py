@@ -11,7 +11,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
@@ -36,7 +35,7 @@ from warprrf.device import DeviceLike, launch, resolve
 from warprrf.geometry.mesh_files import load_mesh
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
 from warprrf.kernels.rays.mesh import closest_faces, find_crossings, find_touching
-from warprrf.rows import distinct_rows
+from warprrf.rows import couples, distinct_rows
 
 ENDPOINT_CLEARANCE = 1e-4
 """Length at both ends of a segment in which :meth:`Mesh.visible` ignores surfaces [m]."""
@@ -254,12 +253,11 @@ class Mesh:
 
     @cached_property
     def is_closed(self) -> bool:
-        """Whether every edge, after welding, belongs to an even number of faces.
+        """Whether every edge, after welding, and cut where others end, belongs to an even number of faces.
 
         Faces whose corners fall together and repeats of a face are left out: they open and close nothing.
         """
-        corner = self.welded_faces[self.cornered_faces]
-        return len(corner) > 0 and self._largest_hole(corner) == 0.0
+        return len(self.cornered_faces) > 0 and not (distinct_rows(self._edges[0])[2] % 2).any()
 
     @cached_property
     def distinct_faces(self) -> np.ndarray:
@@ -279,45 +277,56 @@ class Mesh:
         A connected part is closed, and so has an inside, if all its edges belong to an even number of faces, or if its
         holes are small, as a scan's (:data:`LARGEST_HOLE`). A sheet has none, nor has a room with a doorway.
         """
-        face, corner = self.cornered_faces, self.welded_faces[self.cornered_faces]
-        found, count = np.full(len(self.faces), -1), 0
-        part = components(len(corner), edge_pairs(corner))
-        for own in np.split(np.argsort(part, kind="stable"), np.cumsum(np.bincount(part))[:-1]):
-            share, most = LARGEST_HOLE
-            size = float(np.linalg.norm(np.ptp(self.triangles[face[own]].reshape(-1, 3), axis=0)))
-            if len(own) > 3 and self._largest_hole(corner[own]) <= min(share * size, most):
-                found[face[own]] = count
-                count += 1
+
+        def diagonals(points: np.ndarray, owner: np.ndarray) -> np.ndarray:
+            boxes = boxes_of(points, owner, owner.max(initial=-1) + 1)
+            return np.asarray(np.linalg.norm(np.ptp(boxes, axis=1), axis=1))
+
+        (edge, owner), part = self._edges, components(len(self.faces), self.neighbours)[self.cornered_faces]
+        part = np.unique(part, return_inverse=True)[1]
+        first, _, count = distinct_rows(edge)
+        rim = first[count % 2 == 1]
+        own, ends = part[owner[rim]], edge[rim]
+        # Holes that touch in a vertex are two: borders go on where exactly two edges meet.
+        border = components(len(rim), couples(np.column_stack([own.repeat(2), ends.reshape(-1)])).T // 2)
+        faces = np.bincount(part)
+        hole = np.zeros(len(faces))
+        np.maximum.at(hole, own, diagonals(self.places[ends], border)[border])
+        share, most = LARGEST_HOLE
+        size = diagonals(self.triangles[self.cornered_faces], part)
+        closed = (faces > 3) & (hole <= np.minimum(share * size, most))
+        found = np.full(len(self.faces), -1)
+        found[self.cornered_faces] = np.where(closed, np.cumsum(closed) - 1, -1)[part]
         return found
+
+    @cached_property
+    def neighbours(self) -> np.ndarray:
+        """Pairs of :attr:`cornered_faces` that share a side, or a part of one, shape ``(N, 2)``."""
+        edge, owner = self._edges
+        return _sharing(edge, self.cornered_faces[owner])
+
+    @cached_property
+    def _edges(self) -> tuple[np.ndarray, np.ndarray]:
+        """Edges of :attr:`cornered_faces`, ``(N, 2)``, and which of these each is of; at a border cut where others end."""
+        edge = sides_of(self.welded_faces[self.cornered_faces])
+        owner = np.arange(len(edge)) // 3
+        _, index, count = distinct_rows(edge)
+        loose = count[index] % 2 == 1
+        if not loose.any():
+            return edge, owner
+        at = np.unique(edge[loose])
+        start, end = self.places[edge[loose].T]
+        radius = np.linalg.norm(end - start, axis=1) / 2 + self.weld_m
+        near = cKDTree(self.places[at]).query_ball_point((start + end) / 2, radius)
+        row = np.repeat(np.arange(len(near)), [len(n) for n in near])
+        pieces, row = cut(edge[loose], row, at[np.concatenate(near)], self)
+        return np.concatenate([edge[~loose], pieces]), np.concatenate([owner[~loose], owner[loose][row]])
 
     @cached_property
     def closed_parts(self) -> list[Mesh]:
         """The parts of :attr:`closed_part_of`, each a mesh of its own."""
-        order = np.argsort(self.closed_part_of, kind="stable")
-        starts = np.searchsorted(self.closed_part_of[order], np.arange(self.closed_part_of.max() + 2))
-        return [Mesh(self.vertices, self.faces[order[a:b]]) for a, b in pairwise(starts)]
-
-    def _largest_hole(self, corner: np.ndarray) -> float:
-        """Diagonal of the box around the largest border of faces with the welded vertices ``corner`` (K, 3) [m]; one along a line,
-        as where an edge is cut on one side alone, is no hole."""
-        edge = np.sort(corner[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        first, _, count = distinct_rows(edge)
-        edge = edge[first[count % 2 == 1]]
-        if len(edge) == 0:
-            return 0.0
-        # Holes that touch in a vertex are two: borders go on where exactly two edges meet.
-        _, index, count = np.unique(edge, return_inverse=True, return_counts=True)
-        order = np.argsort(index.reshape(-1), kind="stable") // 2
-        first = np.cumsum(count)[count == 2] - 2
-        border = components(len(edge), np.column_stack([order[first], order[first + 1]]))
-        low, high = (np.full((border.max() + 1, 3), sign * np.inf) for sign in (1, -1))
-        for side in edge.T:
-            np.minimum.at(low, border, self.places[side])
-            np.maximum.at(high, border, self.places[side])
-        way = self.places[edge[:, 1]] - self.places[edge[:, 0]]
-        along = headings(way[np.unique(border, return_index=True)[1]])[0][border]
-        bent = np.linalg.norm(np.cross(along, way), axis=1) > self.weld_m
-        return float((np.linalg.norm(high - low, axis=1) * (np.bincount(border, bent) > 0)).max())
+        count = self.closed_part_of.max() + 1
+        return [Mesh(self.vertices, self.faces[self.closed_part_of == k]) for k in range(count)]
 
     @cached_property
     def center(self) -> np.ndarray:
@@ -486,17 +495,11 @@ class Mesh:
 
     def cross_section(self, height: Number) -> np.ndarray:
         """Line segments in which the surface meets the plane z = ``height`` [m]: a floor plan, shape ``(S, 2, 2)`` [m]."""
-        above = self.triangles[:, :, 2] > height
-        cut = (above.sum(axis=1) % 3) > 0
-        corners, above = self.triangles[cut], above[cut]
-        ends = []
-        for first, second in ((0, 1), (1, 2), (2, 0)):
-            a, b = corners[:, first], corners[:, second]
-            crosses = above[:, first] != above[:, second]
-            share = np.where(crosses, (height - a[:, 2]) / np.where(crosses, b[:, 2] - a[:, 2], 1.0), np.nan)
-            ends.append(a[:, :2] + share[:, None] * (b - a)[:, :2])
-        points = np.stack(ends, axis=1)  # exactly two of the three edges cross
-        return points[~np.isnan(points[:, :, 0])].reshape(-1, 2, 2)
+        a, b = self.triangles, np.roll(self.triangles, -1, axis=1)
+        crosses = (a[:, :, 2] > height) != (b[:, :, 2] > height)  # two edges of a face, or none
+        a, way = a[crosses], (b - a)[crosses]
+        share = (height - a[:, 2:]) / way[:, 2:]
+        return (a + share * way)[:, :2].reshape(-1, 2, 2)
 
 
 def vectors_across(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -564,17 +567,46 @@ def _closest_on_triangles(p: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return best
 
 
+def boxes_of(points: np.ndarray, owner: np.ndarray, count: int) -> np.ndarray:
+    """Lowest and highest corner of the ``points`` (N, K, 3) of each of ``count`` owners, shape ``(count, 2, 3)``."""
+    boxes = np.full((count, 2, 3), np.inf) * [[1.0], [-1.0]]
+    np.minimum.at(boxes[:, 0], owner, points.min(axis=1))
+    np.maximum.at(boxes[:, 1], owner, points.max(axis=1))
+    return boxes
+
+
 def components(count: int, pairs: np.ndarray) -> np.ndarray:
     """Number of the connected component of each of ``count`` things, of which ``pairs`` (N, 2) are linked, ``(count,)``."""
     link = sparse.coo_array((np.ones(len(pairs), bool), pairs.T), shape=(count, count))
     return csgraph.connected_components(link, directed=False)[1]
 
 
-def edge_pairs(corner: np.ndarray, face: np.ndarray | None = None) -> np.ndarray:
-    """Pairs of the faces ``corner`` (F, 3), of ``face`` (K,) alone if given, that share an edge, shape ``(N, 2)``."""
-    face = np.arange(len(corner)) if face is None else face
-    edge = np.sort(corner[face][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    owner = np.repeat(face, 3)
+def sides_of(corner: np.ndarray) -> np.ndarray:
+    """Sides of the faces ``corner`` (F, 3), the smaller index first, shape ``(3 F, 2)``."""
+    return np.sort(corner[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+
+
+def cut(sides: np.ndarray, row: np.ndarray, at: np.ndarray, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Pieces (P, 2) of ``sides`` (S, 2) between those places ``at`` (N,) of a mesh that lie on the side ``row`` (N,), its ends
+    among them; and of which side each is, ``(P,)``."""
+    start, end = mesh.places[sides.T]
+    along, length = headings(end - start)
+    way = mesh.places[at] - start[row]
+    far = (way * along[row]).sum(axis=1)
+    on = np.linalg.norm(way - far.clip(0.0, length[row])[:, None] * along[row], axis=1) <= mesh.weld_m
+    order = np.flatnonzero(on)[np.lexsort((far[on], row[on]))]
+    first, last = order[:-1], order[1:]
+    same = row[first] == row[last]
+    return np.sort(at[np.column_stack([first, last])[same]], axis=1), row[first[same]]
+
+
+def edge_pairs(corner: np.ndarray) -> np.ndarray:
+    """Pairs of the faces ``corner`` (F, 3) that share a side, shape ``(N, 2)``."""
+    return _sharing(sides_of(corner), np.repeat(np.arange(len(corner)), 3))
+
+
+def _sharing(edge: np.ndarray, owner: np.ndarray) -> np.ndarray:
+    """Pairs of the ``owner`` (E,) of equal rows of ``edge`` (E, 2), shape ``(N, 2)``."""
     order = np.lexsort((owner, edge[:, 1], edge[:, 0]))
     edge, owner = edge[order], owner[order]
     # Where more than two faces share an edge, neighbours in sorted order are not all pairs: look three ahead.
@@ -587,14 +619,9 @@ def edge_pairs(corner: np.ndarray, face: np.ndarray | None = None) -> np.ndarray
 
 def face_neighbours(faces: np.ndarray) -> np.ndarray:
     """The face across each edge, -1 at a border (and at edges of more than two faces), shape ``(F, 3)`` int64."""
-    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64), axis=1)
-    key = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
-    order = np.argsort(key, kind="stable")
-    same = key[order][1:] == key[order][:-1]
-    lone = ~np.concatenate([[False], same[:-1]]) & same & ~np.concatenate([same[1:], [False]])
-    a, b = order[:-1][lone], order[1:][lone]
-    across = np.full(len(key), -1, dtype=np.int64)
-    across[a], across[b] = b // 3, a // 3
+    pairs = couples(sides_of(faces))
+    across = np.full(3 * len(faces), -1, dtype=np.int64)
+    across[pairs] = pairs[::-1] // 3
     return across.reshape(-1, 3)
 
 

@@ -20,7 +20,7 @@ from warprrf.cache import Cache, cached_property
 from warprrf.checks import check_similarity, warn
 from warprrf.device import filled, launch, resolve
 from warprrf.geometry.edges import Edges, mesh_edges
-from warprrf.geometry.mesh import Mesh, components, edge_pairs, vectors_across
+from warprrf.geometry.mesh import Mesh, boxes_of, components, vectors_across
 from warprrf.kernels.rays.mesh import OverlapFaces, find_overlaps
 from warprrf.kernels.rays.patches import PatchFaces, lie_in_patches
 
@@ -137,8 +137,8 @@ class PlanarPatches:
     def curved_m2(self) -> float:
         """Area of the patches that are facets of smooth surfaces, as a round pillar's [m^2]: :data:`FACETS` or more that
         meet one after the other at angles between :data:`FACET_BEND_RAD`."""
-        own = np.flatnonzero((self.face_patch >= 0) & self.once)
-        pair = self.face_patch[edge_pairs(self.mesh.welded_faces, own)]
+        pair = self.face_patch[self.mesh.neighbours]
+        pair = pair[(pair >= 0).all(axis=1)]
         bend = np.arccos(
             np.abs((self.normal[pair[:, 0]] * self.normal[pair[:, 1]]).sum(axis=1)).clip(0.0, 1.0)
         )
@@ -159,13 +159,8 @@ class PlanarPatches:
     @cached_property
     def boxes(self) -> np.ndarray:
         """Lowest and highest corner of each patch [m], shape ``(P, 2, 3)``."""
-        boxes = np.empty((len(self), 2, 3))
-        boxes[:, 0], boxes[:, 1] = np.inf, -np.inf
         own = self.face_patch >= 0
-        corners = self.mesh.triangles[own]
-        np.minimum.at(boxes[:, 0], self.face_patch[own], corners.min(axis=1))
-        np.maximum.at(boxes[:, 1], self.face_patch[own], corners.max(axis=1))
-        return boxes
+        return boxes_of(self.mesh.triangles[own], self.face_patch[own], len(self))
 
     @cached_property
     def _kept(self) -> Cache:
@@ -212,7 +207,7 @@ def planar_patches(mesh: Mesh, groups: ArrayLike | None = None) -> PlanarPatches
     group = np.full(count, -1, np.int32) if groups is None else np.asarray(groups, np.int32)
     if group.shape != (count,):
         raise ValueError(f"groups: got shape {group.shape}, expected ({count},), one index a face")
-    rounding, corner, first = mesh.rounding_m, mesh.welded_faces, mesh.first_at_place
+    rounding, first = mesh.rounding_m, mesh.first_at_place
     if differ := int((group[first] != group).sum()):
         warn(
             f"mesh: {differ} faces lie on another of a different material or group; the first of each is taken"
@@ -221,7 +216,8 @@ def planar_patches(mesh: Mesh, groups: ArrayLike | None = None) -> PlanarPatches
     height = 2.0 * mesh.areas / np.maximum(longest, 1e-300)
     own = mesh.cornered_faces
     own = own[height[own] > 4.0 * rounding]  # less is made by rounding alone, and has no plane of its own
-    pairs, once = edge_pairs(corner, own), np.isin(np.arange(count), own)
+    once = np.isin(np.arange(count), own)
+    pairs = mesh.neighbours[once[mesh.neighbours].all(axis=1)]
     noise = vertex_noise(mesh, pairs, rounding)
     faces = _Faces(mesh, group, height, FLAT_M + 6.0 * noise, 3.0 * noise)
     piece = _pieces(faces, once, pairs)

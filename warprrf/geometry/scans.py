@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from warprrf.checks import Count, checked, positive
-from warprrf.geometry.mesh import Mesh, connected_pieces, edge_pairs, face_neighbours, smoothed_normals
+from warprrf.geometry.mesh import Mesh, connected_pieces, face_neighbours, smoothed_normals
 from warprrf.geometry.planar_patches import PlanarPatches, vertex_noise
 from warprrf.geometry.planes import Plane, PlaneConfig, detect_planes, drawn_by_place
 from warprrf.rows import distinct_rows, sums_of
@@ -135,8 +135,7 @@ def snapped(mesh: Mesh, planes: Sequence[Plane], config: SurfaceConfig) -> Plana
 
 def is_scan(mesh: Mesh) -> bool:
     """Whether the vertices of ``mesh`` have errors like a scanner's: more than :data:`SCAN_NOISE_M`."""
-    pairs = edge_pairs(mesh.welded_faces, np.flatnonzero(mesh.areas > 0))
-    return vertex_noise(mesh, pairs, mesh.rounding_m) > SCAN_NOISE_M
+    return vertex_noise(mesh, mesh.neighbours, mesh.rounding_m) > SCAN_NOISE_M
 
 
 def scanned_patches(mesh: Mesh) -> PlanarPatches:

@@ -215,10 +215,8 @@ def check_dataset(mesh: Mesh | None, ds: SpectrumDataset | PowerTable, *, device
 
     Raises, warns: as :func:`check_positions` and :func:`question_unit`.
     """
-    wavelength_m, name = (
-        SPEED_OF_LIGHT / ds.frequency_hz,
-        "transmitters" if isinstance(ds, PowerTable) else "transmitter",
-    )
+    wavelength_m = SPEED_OF_LIGHT / ds.frequency_hz
+    name = "transmitters" if isinstance(ds, PowerTable) else "transmitter"
     if mesh is not None:
         question_unit(mesh, wavelength_m)
     names = f"ds.{name}", "ds.receivers"
@@ -245,9 +243,7 @@ def parted(
     own, rooms = points[asked], _rooms(mesh) if known is None else ()
     entered, left = np.zeros(len(own), int), np.zeros(len(own), int)
     solids: list[Mesh] = []
-    for k, part in sorted(
-        enumerate(mesh.closed_parts), key=lambda item: -np.ptp(item[1].bounds, axis=0).prod()
-    ):
+    for k, part in _outermost_first(mesh):
         inside = holds(part, own, device=device)
         if k in rooms or (known is not None and holds(part, known[None], device=device)[0]):
             left += ~inside
@@ -420,18 +416,18 @@ def _rooms(mesh: Mesh) -> list[int]:
     """Which closed parts of a scene have its air inside: those that hold most of what is left, from the outermost inward,
     or are all that is left: the scene's only surface, or the inner one of its walls."""
     rooms = list[int]()
-    volume = [abs(_volume(part)) for part in mesh.closed_parts]
-    room = 0.1  # least share of the box around a scene that its room takes
-    least = room * float(np.ptp(mesh.bounds, axis=0).prod())
-    wall = 0.5  # least share of what a room's walls hold that their inner surface does
+    least = 0.1 * _box(mesh)  # that share of the box around a scene its room takes
     samples = 1000  # faces whose places tell what a surface holds
-    for k in sorted(range(len(volume)), key=lambda k: -volume[k]):
-        if volume[k] < least:
+    for k, part in _outermost_first(mesh):
+        if _box(part) < least:
             break
+        volume = _box(part) * holds(part, _spread(part)).mean()
+        if volume < least:
+            continue
         rest = mesh.distinct_faces
         rest = rest[~np.isin(mesh.closed_part_of[rest], [*rooms, k])]
         rest = rest[np.argsort(-mesh.areas[rest], kind="stable")][:samples]
-        places, area, part = mesh.triangles[rest].mean(axis=1), mesh.areas[rest], mesh.closed_parts[k]
+        places, area = mesh.triangles[rest].mean(axis=1), mesh.areas[rest]
         off = part.distance(places) > WALL_CLEARANCE_M  # what covers it is neither in it nor beside it
         places, area = places[off], area[off]
         held, left = area[holds(part, places)].sum(), area.sum()
@@ -439,8 +435,18 @@ def _rooms(mesh: Mesh) -> list[int]:
         fragments = left <= 0.1 * part.areas.sum() and not _is_amid(part, places)
         if held > 0.5 * left or fragments:
             rooms.append(k)
-            least = wall * volume[k]
+            least = 0.5 * volume  # that share of what its walls hold their inner surface does
     return rooms
+
+
+def _outermost_first(mesh: Mesh) -> list[tuple[int, Mesh]]:
+    """Closed parts with their numbers."""
+    return sorted(enumerate(mesh.closed_parts), key=lambda item: -_box(item[1]))
+
+
+def _box(mesh: Mesh) -> float:
+    """Volume of the box around a mesh [m^3]."""
+    return float(np.ptp(mesh.bounds, axis=0).prod())
 
 
 def _is_amid(part: Mesh, points: np.ndarray) -> bool:

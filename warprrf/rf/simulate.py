@@ -76,9 +76,7 @@ def simulate(
         beam_sigma_rad: Receiver beam width, kappa = 1 / sigma^2 [rad].
         refraction: Whether Sionna's paths go through slabs.
         seed: Seed of Sionna's rays, of directions that are sampled, and of the roles if none are given.
-        gas: Absorption of the air (ITU-R P.676) over every path's length: False for none, True for the standard
-            atmosphere, :class:`Air`, or a :class:`Relevance`, which says whether it is worth its tolerance. Attributes
-            ``air_...`` of the data set say which.
+        gas: Absorption of the air: see :meth:`Paths.with_gas`. Attributes ``air_...`` of the data set say which.
         roles: "train" or "test" for each receiver, shape ``(R,)``; an eighth is for test by default.
         floor: N0 [linear]; median over views of the view's maximum, less 60 dB, by default.
         workspace: Folder that keeps each finished receiver, so that a killed run goes on where it stopped.

@@ -64,11 +64,25 @@ CUT = np.concatenate(
     [[[0, 1, 9], [0, 9, 8], [8, 9, 3], [8, 3, 2]], FACES[2:]]
 )  # the west side, of another one's edges
 AGAIN, PART = joined(FLOOR, (CORNERS, FACES), (CORNERS, FACES[:, ::-1]))
+
+
+def sides():
+    """The solid, its sides cut into pieces whose corners do not meet."""
+    parts = []
+    for k in range(6):
+        parts.append((CORNERS, FACES[2 * k : 2 * k + 2]))
+        for _ in range(k // 2):
+            parts[-1] = subdivide(*parts[-1])
+    mesh = joined(*parts)[0]
+    return mesh.vertices, mesh.faces
+
+
 FINER, PART_OF_FINER = joined(FLOOR, subdivide(CORNERS, np.roll(FACES, 1, axis=0)), (CORNERS, FACES[::-1]))
 WALLS = {
     "solid": room((CORNERS, FACES), thick),
     "solid, wound either way": room((CORNERS, np.where(EAST, FACES[:, ::-1], FACES)), thick),
     "solid, cut on one side": room((np.vstack([CORNERS, [[1.0, 0.0, 0.001], [1.0, 0.0, 6.0]]]), CUT), thick),
+    "solid, each side cut by itself": room(sides(), thick),
     "solid, doubled": Scene(AGAIN, [FLOORING, thick], np.minimum(PART, 1)),
     "solid, doubled of another material": Scene(AGAIN, [FLOORING, thick], PART % 2),
     "solid, covered by finer faces": Scene(FINER, [FLOORING, thick], np.minimum(PART_OF_FINER, 1)),
@@ -121,6 +135,15 @@ def test_a_corner_lets_the_same_through_however_it_is_turned(turn, swapped):
     assert found.power[0] == pytest.approx(power * free**2, rel=1e-6)
 
 
+def test_a_solid_one_metre_thick_is_one_slab_wherever_it_stands():
+    """More is two sheets: rounding of coordinates does not decide."""
+    rng, (vertices, faces) = np.random.default_rng(0), box_mesh([-0.5, -2.0, -2.0], [0.5, 2.0, 2.0])
+    for turn, shift in zip(Rotation.random(8, rng=0).as_matrix(), rng.uniform(-50, 50, (8, 3)), strict=True):
+        scene = Scene(Mesh(vertices @ turn.T + shift, faces), [GLASS], np.zeros(len(faces), np.int32))
+        ends = np.array([[-2.0, 0.3, 0.1], [2.0, -0.2, 0.4]]) @ turn.T + shift
+        assert paths(scene, ends).interactions[0].tolist() == [4, 0, 0, 0]
+
+
 def test_five_panes_let_through_what_each_does():
     """A floor of offices has as many between two ends; one of them asked for too few, and nothing arrives."""
     panes, part = joined(*(pane(x) for x in np.linspace(-1.0, 1.0, 5)))
@@ -165,6 +188,18 @@ def test_ways_through_slabs_are_the_same_both_ways_and_as_many_as_asked_for():
     assert len(paths(scene, most=1).tau) == 0
     metal = replace(itu_material("metal"), thickness_m=0.001)
     assert len(paths(room(pane(1.0), metal)).tau) == 0
+
+
+def test_free_paths_come_first_then_those_through_slabs_each_by_order_and_length():
+    """Slabs delay: by their delays paths of one order stand otherwise."""
+    scene, order = room(pane(1.0), replace(GLASS, thickness_m=0.05)), []
+    mesh = joined(FLOOR, pane(1.0), pane(3.0))
+    found = paths(Scene(mesh[0], scene.materials, np.minimum(mesh[1], 1)), (TX, RX), diffractions=1)
+    for over, met, *way in zip(found.kind == "edge", found.interactions, found.vertices, strict=True):
+        points = np.vstack([TX, way[0][met > 0], RX])
+        length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
+        order.append((over, (met == 4).any() and not over, (met == 1).sum() * (not over), round(length, 9)))
+    assert order == sorted(order) and {o[:2] for o in order} == {(False, True), (True, False)}
 
 
 def test_what_scatters_before_and_behind_a_slab_is_the_integral_over_the_floor():

@@ -210,11 +210,8 @@ class RadioField(ABC):
 
     @abstractmethod
     def with_gas(self, gas: Gas = True) -> Self:
-        """The same field with the absorption of ``gas`` over every path's length, in place of what it had.
-
-        Args:
-            gas: False for none, True for the standard atmosphere, :class:`Air`, or a :class:`Relevance`, which says
-                whether the absorption is worth its tolerance.
+        """The same field with the absorption of ``gas``, as of :meth:`Paths.with_gas`, over every path's length, in place of
+        what it had.
 
         Raises:
             ValueError: for a carrier outside ITU-R P.676; for an ``rf3dgs`` field, which has no lengths.

@@ -188,7 +188,7 @@ class Walls:
             along, left, entered = direction[row[again]], normal[face[again]], normal[before[again]]
             turned = np.sign(_dot(left, along) * _dot(entered, along))  # however they are wound
             alike = turned * _dot(left, entered)
-            back = (apart <= THICKEST_M) & (alike > ALIKE)
+            back = (apart <= THICKEST_M + self.clearance_m) & (alike > ALIKE)
             slabs.thickness_m[r[back], k[back]] = apart[back]
             out = np.zeros(len(row), bool)
             out[again[back]] = True

@@ -76,8 +76,8 @@ def trace_paths(
         device: Where chains are tried and rays cast.
 
     Returns:
-        Arrays ``(L,)`` for one receiver and transmitter, else ``(R, L)``; line of sight first, then by order, then by delay;
-        then paths over edges.
+        Arrays ``(L,)`` for one receiver and transmitter, else ``(R, L)``: free paths, then those through slabs, each by order,
+        then by length; then those over edges.
 
     Raises:
         ValueError: on a position that is NaN, outside a closed room, inside a solid, or within the reactive near

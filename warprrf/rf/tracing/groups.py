@@ -209,7 +209,7 @@ def shape_groups(mesh: Mesh, patch: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     """
     shell = 0.5  # share of the mesh's extents along all axes that the room's shell has at least
     body_m2 = 0.5  # smaller bodies are taken for the material of the larger one that is most like them
-    pairs = edge_pairs(mesh.welded_faces)
+    pairs = np.concatenate([edge_pairs(mesh.welded_faces), mesh.neighbours])
     part = components(len(mesh.faces), pairs)
     group = _without_crumbs(mesh, _pieces(mesh, patch, pairs), part)
     _, first = np.unique(group, return_index=True)

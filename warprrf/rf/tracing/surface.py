@@ -9,7 +9,7 @@ what differs within a group is told apart at both scales.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -129,6 +129,9 @@ class Surface:
         check_number("position_error_m", self.position_error_m, 0.0, 10.0)
         if len(self.cells.axis) != sizes["F"]:
             raise ValueError(f"cells: got those of {len(self.cells.axis)} faces, expected {sizes['F']}")
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {f.name: getattr(self, f.name) for f in fields(self)}
 
     @cached_property
     def front_normal(self) -> np.ndarray:

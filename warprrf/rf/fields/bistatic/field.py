@@ -159,7 +159,8 @@ class BistaticField(RadioField):
 
         Args:
             geometry: Reconstruction, Scene (its materials name the groups and say what slabs are, no more) or Mesh.
-            ds: training set: spectra, readings, or a list of them. The field's own transmitter and carrier are the first.
+            ds: training set: spectra, readings, or a list of them. The field's own transmitter and carrier are the first
+                spectra's, if there are any, else the first.
                 Without any receiver the field is what is known beforehand.
             model: ``"bistatic"``.
             options: what is modelled and how it is fitted.
