@@ -136,6 +136,11 @@ class Plane:
         np.add.at(counts, tuple(p[inside] for p in place), 1)
         return counts
 
+    def spanning(self, low: np.ndarray, high: np.ndarray) -> Plane:
+        """The plane with occupied cells from in-plane coordinates ``low`` to ``high`` [m], shape ``(2,)`` each."""
+        shape = np.ceil((high - low) / self.cell_m).astype(int)
+        return replace(self, corner=low, occupied=np.ones(shape, dtype=bool))
+
     def widened(self, cells: int) -> Plane:
         """The plane with ``cells`` more rows and columns of empty cells on every side."""
         return replace(

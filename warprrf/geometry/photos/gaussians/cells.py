@@ -41,10 +41,8 @@ def occupancy(
     for plane in planes:
         uv = plane.to_plane(points[plane.inliers])
         rim = config.margin_m + config.cell_m
-        corner = uv.min(axis=0) - rim
-        shape = np.ceil((uv.max(axis=0) + rim - corner) / config.cell_m).astype(int)
-        grid = replace(plane, corner=corner, cell_m=config.cell_m, occupied=np.ones(shape, dtype=bool))
-        inside = _in_hull(grid.to_plane(grid.cells()), uv, config.margin_m).reshape(shape)
+        grid = replace(plane, cell_m=config.cell_m).spanning(uv.min(axis=0) - rim, uv.max(axis=0) + rim)
+        inside = _in_hull(grid.to_plane(grid.cells()), uv, config.margin_m).reshape(grid.occupied.shape)
         supported = grid.count(points[plane.inliers]) > 0
         lines = grid.seen_through(eyes, targets, BEHIND_M)
         empty = dilate(lines > 0, 2) & ~dilate(supported, 1)

@@ -23,12 +23,10 @@ from warprrf.geometry.photos.gaussians.cells import BEHIND_M, plane_mesh, with_c
 from warprrf.geometry.photos.posed.photo_files import spread
 from warprrf.geometry.photos.surface.boxes import (
     FaceLevels,
-    claim_proven,
     closed_sides,
     divide,
     known_levels,
     least_surface,
-    proven_levels,
     seen_share,
     surface_of,
     votes,
@@ -63,13 +61,10 @@ def complete(
     axes = directions(patches.normal, patches.area, float(mesh.areas.sum()))
     if axes is None:
         return _without_gaps(patches, cameras), False
-    levels, faces = known_levels(patches, planes, axes)
-    proven = proven_levels(planes, axes, levels)
-    claim_proven(mesh, faces, axes, proven)
-
+    levels, faces, proven = known_levels(patches, planes, axes)
     grid = divide(mesh, axes, levels)
     free, solid = votes(grid, mesh, faces, proven, cameras, depths)
-    filled = least_surface(grid, free, solid, closed_sides(grid, mesh, faces))
+    filled = least_surface(grid, free, solid, closed_sides(grid, faces))
     if filled.all():
         return _without_gaps(patches, cameras), False
     whole, known = surface_of(grid, filled, patches.tolerance_m)
@@ -143,11 +138,8 @@ def _gaps(patches: PlanarPatches, k: int, points: np.ndarray) -> Plane:
     plane = Plane(patches.normal[k], float(patches.offset[k]), cell_m=CELL_M)
     uv = plane.to_plane(points)
     gap_m = 2.0  # gaps narrower than this are closed
-    reach = 0.5 * gap_m / CELL_M
-    low = uv.min(axis=0) - 0.5 * gap_m - CELL_M
-    shape = np.ceil((uv.max(axis=0) - low) / CELL_M + reach + 1).astype(int)
-    grid = replace(plane, corner=low, occupied=np.zeros(shape, dtype=bool))
-    own = grid.count(points) > 0
+    grid = plane.spanning(uv.min(axis=0) - 0.5 * gap_m - CELL_M, uv.max(axis=0) + 0.5 * gap_m + CELL_M)
+    own, reach = grid.count(points) > 0, 0.5 * gap_m / CELL_M
     grown = ndimage.distance_transform_edt(~own) <= reach
     closed = (ndimage.distance_transform_edt(grown) > reach) & ~own
     return replace(grid, occupied=closed)
