@@ -92,7 +92,7 @@ class _Refinement:
         # 0.2: weight of 1 - SSIM; L1 has the rest
         self.loss = PhotoLoss(device, 0.2)
         self.targets = Targets(photos, self.loss)
-        self.exposures = Exposures(len(self.targets), config.fit_exposure)
+        self.exposures = Exposures(len(self.targets))
         self.iteration = 0
         self.raster = Rasterizer(device=self.device, blending=Blending())
         table = np.array([[*p.normal, p.offset] for p in self.planes], dtype=np.float32).reshape(-1, 4)
@@ -201,7 +201,8 @@ class _Refinement:
         self.exposures.show(image.features, target, self.loss.canvas(shape))
         score, slope = self.loss(target.pixels, target.moments, shape)
         self.exposures.adjoint(image.features, target, slope)
-        self.exposures.fit(image.features, target, self.iteration // len(self.targets))
+        if self.config.fit_exposure:
+            self.exposures.fit(image.features, target, self.iteration // len(self.targets))
         weight = adjoint()
         self.raster.colors_adjoint(self.means, self.sh, origin, colors)
         scales, opacities = self.scales, self.opacities

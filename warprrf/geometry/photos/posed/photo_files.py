@@ -46,11 +46,11 @@ def find_photos(photos: Photos) -> dict[str, Path]:
         found = (p for p in root.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES and p.is_file())
         every = sorted(p for p in found if not p.name.startswith(".") and not _of_workspace(p, root))
         files = [p for p in every if not p.name.lower().endswith(MASK_SUFFIX)]
-        masked = {mask_name(p) for p in files}
-        stray = [p.relative_to(root).as_posix() for p in every if p not in masked and p not in set(files)]
+        stray = sorted(set(every) - set(files) - {mask_name(p) for p in files})
         if stray:
+            named_so = some([p.relative_to(root).as_posix() for p in stray])
             raise ValueError(
-                f"photos: {len(stray)} masks are of no photo: {some(stray)}; the mask of 0007.jpg is 0007.mask.png"
+                f"photos: {len(stray)} masks are of no photo: {named_so}; the mask of 0007.jpg is 0007.mask.png"
             )
     else:
         if odd := [p for p in photos if not isinstance(p, str | os.PathLike)]:
@@ -174,20 +174,13 @@ def check_photos(named: Mapping[str, Path]) -> None:
 
 def match_names(argument: str, wanted: Iterable[str], names: Sequence[str]) -> list[str]:
     """Full photo names of ``wanted``: each is a name, or a file name that only one of ``names`` has."""
-    by_file: dict[str, list[str]] = {}
-    for name in names:
-        by_file.setdefault(name.rsplit("/", 1)[-1], []).append(name)
-    found: list[str] = []
-    unknown: list[str] = []
-    shared: list[str] = []
-    for key in wanted:
-        key = str(key)
-        if key in names:
-            found.append(key)
-        elif len(by_file.get(Path(key).name, ())) == 1:
-            found.append(by_file[Path(key).name][0])
+    found, unknown, shared = list[str](), list[str](), list[str]()
+    for key in map(str, wanted):
+        hits = [key] if key in names else [n for n in names if n.rpartition("/")[2] == Path(key).name]
+        if len(hits) == 1:
+            found.append(hits[0])
         else:
-            (shared if Path(key).name in by_file else unknown).append(key)
+            (shared if hits else unknown).append(key)
     if unknown:
         raise ValueError(
             f"{argument}: no such photo: {some(unknown)}; photos are named like {some(list(names), 2)}"

@@ -245,8 +245,9 @@ def neighbours(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     return index, distance
 
 
-def clean_points(sparse: SparseModel, worst_px: float = np.inf) -> np.ndarray:
-    """Which points to keep, shape ``(P,)`` bool: seen often enough, reprojected well, not far from all others.
+def cleaned(sparse: SparseModel, worst_px: float = np.inf) -> SparseModel:
+    """``sparse`` with the points that are seen often enough, reprojected well and not far from all others; with all where
+    fewer than three are, as of a handful of photos.
 
     A point is an outlier when its mean distance to its neighbours exceeds the average of that figure over all points
     by 2.5 standard deviations (Rusu et al., "Towards 3D point cloud based object maps", 2008).
@@ -258,7 +259,7 @@ def clean_points(sparse: SparseModel, worst_px: float = np.inf) -> np.ndarray:
     if len(chosen) > NEIGHBOURS:
         spacing = neighbours(sparse.points[chosen], NEIGHBOURS)[1].mean(axis=1)
         keep[chosen[spacing > spacing.mean() + deviations * spacing.std()]] = False
-    return keep
+    return sparse if keep.sum() < 3 else sparse.subset(keep)
 
 
 def estimate_normals(points: np.ndarray, viewpoints: np.ndarray, count: int) -> np.ndarray:

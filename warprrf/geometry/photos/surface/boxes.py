@@ -320,15 +320,12 @@ def surface_of(grid: Grid, filled: np.ndarray, tolerance_m: float) -> tuple[Plan
     for a in range(3):
         b, c = (a + 1) % 3, (a + 2) % 3
         step = np.diff(filled.astype(np.int8), axis=a)
+        square = np.zeros((4, 3), dtype=int)
+        square[:, [b, c]] = [[0, 0], [1, 0], [1, 1], [0, 1]]
         for sign in (1, -1):
             index = np.argwhere(step == -sign)
             index[:, a] += 1
-            quad = []
-            for along in ((0, 0), (1, 0), (1, 1), (0, 1)):
-                corner = index.copy()
-                corner[:, [b, c]] += along
-                quad.append(np.ravel_multi_index(tuple(corner.T), nodes))
-            corners = np.stack(quad[::sign], axis=1)
+            corners = np.ravel_multi_index(tuple((index[:, None] + square[::sign]).T), nodes).T
             faces += [corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]]
             tags += [np.stack([np.full(len(index), a), index[:, a], np.full(len(index), sign)], axis=1)] * 2
     used, face = np.unique(np.concatenate(faces), return_inverse=True)

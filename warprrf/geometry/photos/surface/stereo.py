@@ -87,12 +87,10 @@ def ahead(camera: Camera) -> np.ndarray:
 
 def kept_pixels(photos: PosedPhotos, number: int, camera: Camera) -> np.ndarray:
     """The pixels of a photo that are not masked, at the size of ``camera``, bool."""
-    mask = photos.masks[number]
-    if mask is None:
-        return np.full((camera.height, camera.width), True)
+    mask = photos.mask(number)
     rows, columns = ((np.arange(n) + 0.5) / n for n in (camera.height, camera.width))
     inside = (rows * mask.shape[0]).astype(int), (columns * mask.shape[1]).astype(int)
-    return np.asarray(np.asarray(mask)[np.ix_(*inside)] == 0)
+    return ~mask[np.ix_(*inside)]
 
 
 def _sharpness(pixels: Sequence[np.ndarray]) -> np.ndarray:
