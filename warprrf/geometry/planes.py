@@ -13,11 +13,10 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from warprrf.cache import cached_property
-from warprrf.checks import check_array, checked, positive
+from warprrf.checks import checked, positive
 
 
 @checked
@@ -184,10 +183,10 @@ def fit_plane(points: np.ndarray, weights: np.ndarray, normal: np.ndarray) -> tu
 
 
 def detect_planes(
-    points: ArrayLike,
-    normals: ArrayLike,
+    points: np.ndarray,
+    normals: np.ndarray,
     *,
-    weights: ArrayLike | None = None,
+    weights: np.ndarray | None = None,
     config: PlaneConfig | None = None,
     seed: int = 0,
 ) -> list[Plane]:
@@ -201,9 +200,7 @@ def detect_planes(
         seed: seed of the draws.
     """
     config = config or PlaneConfig()
-    points = check_array("points", points, (None, 3))
-    normals = check_array("normals", normals, (len(points), 3))
-    weight = np.ones(len(points)) if weights is None else check_array("weights", weights, (len(points),))
+    weight = np.ones(len(points)) if weights is None else weights
     free = np.arange(len(points))
     found: list[Plane] = []
     misses = 0

@@ -146,7 +146,7 @@ def scanned_patches(mesh: Mesh) -> PlanarPatches:
         mesh: noisy, with holes, of any number of faces.
     """
     patches = simplified(snapped(mesh, (), SurfaceConfig()))
-    return replace(largest_first(patches, MIN_PATCH_M2), two_sided=True)
+    return replace(largest_first(patches), two_sided=True)
 
 
 def _smoothed(mesh: Mesh) -> Mesh:
@@ -251,10 +251,10 @@ def _gathered(patches: PlanarPatches) -> np.ndarray:
     return target
 
 
-def largest_first(patches: PlanarPatches, min_area_m2: float) -> PlanarPatches:
-    """``patches`` in the order of their area, without those that are smaller."""
+def largest_first(patches: PlanarPatches) -> PlanarPatches:
+    """``patches`` in the order of their area, without those below :data:`MIN_PATCH_M2`."""
     order = np.argsort(-patches.area, kind="stable")
-    order = order[patches.area[order] >= min_area_m2]
+    order = order[patches.area[order] >= MIN_PATCH_M2]
     number = np.full(len(patches) + 1, -1)
     number[order] = np.arange(len(order))
     return PlanarPatches.from_planes(

@@ -26,13 +26,7 @@ from warprrf.geometry.photos.surface.stereo import kept_pixels, mended
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.planes import Plane
 from warprrf.geometry.rays import open3d
-from warprrf.geometry.scans import (
-    MIN_PATCH_M2,
-    SurfaceConfig,
-    largest_first,
-    simplified,
-    snapped,
-)
+from warprrf.geometry.scans import SurfaceConfig, largest_first, simplified, snapped
 from warprrf.geometry.splats.camera import Camera, slopes_of
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.render import render
@@ -149,7 +143,7 @@ def fuse_maps(
     if config.completion:
         patches, whole = complete(patches, views, depths, planes=planes)
     report("surface", 3, 4)
-    result = largest_first(simplified(patches), MIN_PATCH_M2)
+    result = largest_first(simplified(patches))
     report("surface", 4, 4)
     return result, whole
 
