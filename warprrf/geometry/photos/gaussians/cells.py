@@ -89,8 +89,8 @@ def _in_hull(queries: np.ndarray, points: np.ndarray, margin: float) -> np.ndarr
     try:
         sides = ConvexHull(points).equations
     except (QhullError, ValueError):  # points on one line
-        return np.asarray(cKDTree(points).query(queries)[0] <= margin)
-    return np.asarray((queries @ sides[:, :2].T + sides[:, 2] <= margin).all(axis=1))
+        return cKDTree(points).query(queries)[0] <= margin
+    return (queries @ sides[:, :2].T + sides[:, 2] <= margin).all(axis=1)
 
 
 def quarters(plane: Plane) -> np.ndarray:

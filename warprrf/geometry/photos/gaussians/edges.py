@@ -142,8 +142,7 @@ class Segments:
 
     def alike(self, k: int) -> np.ndarray:
         """Which have the colour of segment ``k`` on one side at least (an occluding edge keeps only one)."""
-        gap = np.abs(self.sides - self.sides[..., k : k + 1]).max(axis=1).min(axis=0)
-        return np.asarray(gap < ALIKE)
+        return np.abs(self.sides - self.sides[..., k : k + 1]).max(axis=1).min(axis=0) < ALIKE
 
 
 def find_segments(
@@ -208,7 +207,7 @@ def lines_through(
 def _colour(image: np.ndarray, positions: np.ndarray) -> np.ndarray:
     x, y = positions.astype(int).T
     taken = image[np.clip(y, 0, image.shape[0] - 1), np.clip(x, 0, image.shape[1] - 1)]
-    return np.asarray(np.median(taken, axis=0))
+    return np.median(taken, axis=0)
 
 
 def find_lines(

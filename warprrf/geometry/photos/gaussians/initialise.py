@@ -125,10 +125,8 @@ def _median_colors(points: np.ndarray, views: np.ndarray, photos: PosedPhotos) -
         rows, slots = np.nonzero(views == c)
         if len(rows):
             at = camera.project(points[rows])[0].T[::-1] - 0.5
-            for channel in range(3):
-                taken[rows, slots, channel] = ndimage.map_coordinates(
-                    image[..., channel], at, order=1, mode="nearest"
-                )
+            colours = [ndimage.map_coordinates(image[..., c], at, order=1, mode="nearest") for c in range(3)]
+            taken[rows, slots] = np.transpose(colours)
     return np.nan_to_num(np.nanmedian(taken, axis=1), nan=0.5)
 
 

@@ -73,7 +73,7 @@ class Pane:
         share = np.where(crossing, before / np.where(crossing, before - behind, 1.0), 0.0)[:, None]
         at = eyes + share * (targets - eyes)
         across = np.arange(3) != self.axis
-        return np.asarray(crossing & ((at >= self.low) & (at <= self.high))[:, across].all(axis=1))
+        return crossing & ((at >= self.low) & (at <= self.high))[:, across].all(axis=1)
 
 
 def plain_surfaces(
@@ -120,7 +120,7 @@ def plain_surfaces(
 
 def _plain(edgels: Edgels) -> np.ndarray:
     """The pixels of a photo near which nothing changes, shape ``(H, W)`` bool."""
-    return np.asarray(ndimage.maximum_filter(edgels.strength, PLAIN_PX) < FLAT)
+    return ndimage.maximum_filter(edgels.strength, PLAIN_PX) < FLAT
 
 
 def _heights(lines: Sequence[Line]) -> list[Height]:
@@ -183,7 +183,7 @@ def _only_through(pane: Pane, lines: Sequence[Line], positions: np.ndarray) -> n
     targets = np.repeat(points, views, axis=0)
     crossing = pane.between(np.repeat(eyes, points.shape[1], axis=0), targets.reshape(-1, 3))
     share = np.bincount(np.repeat(np.arange(len(lines)), views), crossing.reshape(len(eyes), -1).mean(axis=1))
-    return np.asarray(share > 0.8 * np.array(views))
+    return share > 0.8 * np.array(views)
 
 
 def _has_twin(pane: Pane, line: Line, lines: Sequence[Line]) -> bool:

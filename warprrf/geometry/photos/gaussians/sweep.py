@@ -220,7 +220,7 @@ def _peaks(agreement: np.ndarray) -> np.ndarray:
 
     def around(*steps: int) -> np.ndarray:
         footprint = np.isin(np.arange(-4, 5), steps)[:, None, None]
-        return np.asarray(ndimage.maximum_filter(agreement, footprint=footprint, mode="constant", cval=-1.0))
+        return ndimage.maximum_filter(agreement, footprint=footprint, mode="constant", cval=-1.0)
 
     return (agreement > AGREES) & (agreement >= around(-1, 1)) & (agreement > around(-4, -3, 3, 4) + 0.15)
 
@@ -284,5 +284,4 @@ def _majority(mask: np.ndarray, of_nine: int) -> np.ndarray:
 
 def _closed(mask: np.ndarray) -> np.ndarray:
     """``mask`` with gaps of up to two cells closed."""
-    grown = np.pad(mask, 2)
-    return np.asarray(ndimage.binary_closing(grown, AROUND)[2:-2, 2:-2]) | mask
+    return ndimage.binary_closing(np.pad(mask, 2), AROUND)[2:-2, 2:-2] | mask

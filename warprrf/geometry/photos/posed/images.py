@@ -84,7 +84,7 @@ def block_means(pixels: np.ndarray, side: int, dtype: DTypeLike | None = None) -
     rows, columns = pixels.shape[0] // side, pixels.shape[1] // side
     whole = pixels[: rows * side, : columns * side]
     blocks = whole.reshape(rows, side, columns, side, *pixels.shape[2:])
-    return np.asarray(blocks.mean(axis=(1, 3), dtype=dtype))
+    return blocks.mean(axis=(1, 3), dtype=dtype)
 
 
 def layout(cameras: Sequence[Camera]) -> np.ndarray:

@@ -269,7 +269,7 @@ def estimate_normals(points: np.ndarray, viewpoints: np.ndarray, count: int) -> 
     weight = 1 / (1 + (gap / np.maximum(np.median(gap, axis=1, keepdims=True), 1e-9)) ** 2)
     local = points[index] - points[:, None]
     local -= (weight[..., None] * local).sum(axis=1, keepdims=True) / weight.sum(axis=1)[:, None, None]
-    normals: np.ndarray = np.linalg.eigh(np.einsum("nk,nki,nkj->nij", weight, local, local))[1][:, :, 0]
+    normals = np.linalg.eigh(np.einsum("nk,nki,nkj->nij", weight, local, local))[1][:, :, 0]
     away = ((viewpoints - points) * normals).sum(axis=1) < 0
     normals[away] *= -1
     return normals

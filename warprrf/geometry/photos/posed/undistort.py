@@ -103,7 +103,7 @@ def stored_pixels(lens: Lens, slopes: np.ndarray, turns: int) -> np.ndarray:
     if lens.straight:
         return slopes * [lens.fx, lens.fy] + [lens.cx, lens.cy]
     rays = np.column_stack([slopes, np.ones(len(slopes))])
-    return np.asarray(colmap_camera(lens).img_from_cam(rays))
+    return colmap_camera(lens).img_from_cam(rays)
 
 
 def write_undistorted(source: Path, target: Path, lens: Lens, max_pixels: int) -> None:

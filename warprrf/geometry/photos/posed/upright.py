@@ -76,7 +76,7 @@ def held_up(cameras: Sequence[Camera]) -> np.ndarray:
 
 def _least(cost: np.ndarray, near: np.ndarray) -> np.ndarray:
     """The unit vector ``x`` of least ``x . cost x``, of symmetric ``cost`` (3, 3), that points the way of ``near``."""
-    found: np.ndarray = np.linalg.eigh(cost)[1][:, 0]
+    found = np.linalg.eigh(cost)[1][:, 0]
     return found if found @ near > 0 else -found
 
 

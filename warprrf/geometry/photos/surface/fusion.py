@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 
@@ -194,31 +192,27 @@ def fuse_depth(
     raw = grid.extract_triangle_mesh(min_views - 0.5).to_legacy() if filled else None
     if raw is None or len(raw.triangles) == 0:
         raise ValueError("depths: no surface came out; are the maps ranges in metres and the poses right?")
-    return _without_debris(_ordered(o3d, raw), config)
+    return _without_debris(np.asarray(raw.vertices), np.asarray(raw.triangles), config)
 
 
-def _without_debris(raw: Any, config: SurfaceConfig) -> Mesh:
-    raw.merge_close_vertices(1e-4 * config.voxel_m)
-    raw.remove_degenerate_triangles()
-    label, count, _ = raw.cluster_connected_triangles()
-    raw.remove_triangles_by_mask(np.asarray(count)[np.asarray(label)] < config.min_component_faces)
-    raw.remove_unreferenced_vertices()
-    if len(raw.triangles) == 0:
-        raise ValueError(f"min_component_faces: no connected piece has {config.min_component_faces} faces")
-    return Mesh(np.asarray(raw.vertices), np.asarray(raw.triangles))
-
-
-def _ordered(o3d: ModuleType, raw: Any) -> Any:
-    """The mesh with vertices and faces in an order of their own, not in that in which threads found them."""
-    vertices, faces = np.asarray(raw.vertices), np.asarray(raw.triangles)
+def _without_debris(vertices: np.ndarray, faces: np.ndarray, config: SurfaceConfig) -> Mesh:
+    """The mesh without small pieces, in an order of its own, not in that in which threads found vertices and faces."""
     order = np.lexsort(vertices.T[::-1])
     faces = np.argsort(order)[faces]
     turn = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
     faces = np.take_along_axis(faces, turn, axis=1)
-    faces = faces[np.lexsort(faces.T[::-1])]
-    return o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(vertices[order]), o3d.utility.Vector3iVector(faces.astype(np.int32))
-    )
+    faces = faces[np.lexsort(faces.T[::-1])].astype(np.int32)
+    o3d = open3d()
+    vectors = o3d.utility.Vector3dVector(vertices[order]), o3d.utility.Vector3iVector(faces)
+    found = o3d.geometry.TriangleMesh(*vectors)
+    found.merge_close_vertices(1e-4 * config.voxel_m)
+    found.remove_degenerate_triangles()
+    label, count, _ = found.cluster_connected_triangles()
+    found.remove_triangles_by_mask(np.asarray(count)[np.asarray(label)] < config.min_component_faces)
+    found.remove_unreferenced_vertices()
+    if len(found.triangles) == 0:
+        raise ValueError(f"min_component_faces: no connected piece has {config.min_component_faces} faces")
+    return Mesh(np.asarray(found.vertices), np.asarray(found.triangles))
 
 
 def _smooth(z: np.ndarray, tolerance: float) -> np.ndarray:

@@ -81,8 +81,7 @@ def mended(
 
 def ahead(camera: Camera) -> np.ndarray:
     """Depth along the optical axis over range, shape ``(height, width)``."""
-    cosine: np.ndarray = camera.directions() @ camera.rotation[2]
-    return cosine
+    return camera.directions() @ camera.rotation[2]
 
 
 def kept_pixels(photos: PosedPhotos, number: int, camera: Camera) -> np.ndarray:
