@@ -117,7 +117,7 @@ class Steps:
     def run(
         self,
         name: str,
-        make: Callable[[Attempt], Mapping[str, Any]],
+        make: Callable[[Attempt], Mapping[str, Any] | None],
         *,
         version: int,
         inputs: Iterable[Any],
@@ -127,7 +127,7 @@ class Steps:
 
         Args:
             name: of the step, fit for a file name, once in a folder.
-            make: does the step and returns figures that JSON holds (arrays come back as lists, NaN as None).
+            make: does the step and returns figures, if any, that JSON holds (arrays come back as lists, NaN as None).
             version: counted up by hand when ``make`` computes something else.
             inputs: all that the step reads; see :func:`digest`.
             outputs: files that it leaves, relative to the folder, each written in one go
@@ -177,7 +177,7 @@ class Steps:
         missing = [file for file in outputs if not (self.folder / file).exists()]
         if missing:
             raise RuntimeError(f"step {name} ended without writing {', '.join(missing)}")
-        write(finished=True, figures=plain(figures))
+        write(finished=True, figures=plain(figures or {}))
         shutil.rmtree(scratch)
         return dict(record["figures"])
 

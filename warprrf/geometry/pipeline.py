@@ -328,9 +328,8 @@ def _kept(steps: Steps, name: str, make: Callable[[Attempt], Arrays], inputs: Se
     """Arrays of a step, from its file if it was made from the same inputs."""
     path = steps.folder / f"{name}.safetensors"
 
-    def write(attempt: Attempt) -> dict[str, Any]:
+    def write(attempt: Attempt) -> None:
         tensor_files.write(path, make(attempt), {}, None)
-        return {}
 
     steps.run(name, write, version=VERSIONS[name], inputs=inputs, outputs=[path.name])
     return tensor_files.read(path, None)[0]

@@ -21,7 +21,6 @@ from warprrf.geometry.photos.config import RefineConfig
 from warprrf.geometry.photos.gaussians.initialise import SPREAD, discs
 from warprrf.geometry.photos.posed.images import PosedPhotos, block_means
 from warprrf.geometry.splats.gaussians import Gaussians, rotations_of
-from warprrf.geometry.splats.rasterizer import Blending
 from warprrf.geometry.splats.render import render
 
 Arrays = dict[str, np.ndarray]
@@ -116,7 +115,7 @@ def _missing(gaussians: Gaussians, photos: PosedPhotos, number: int, device: Dev
     share = min(1.0, (60_000 / (camera.width * camera.height)) ** 0.5)
     rows, columns = (max(1, round(share * n / BLOCK)) for n in (camera.height, camera.width))
     small = camera.resized(columns * BLOCK, rows * BLOCK)
-    seen = render(gaussians, small, device=device, blending=Blending())
+    seen = render(gaussians, small, device=device)
     alpha = block_means(seen.alpha, BLOCK, np.float64)
     nearness = block_means(seen.alpha / np.maximum(seen.depth, 1e-6), BLOCK, np.float64)  # 1 / m
     nearness /= np.maximum(alpha, 1e-6)

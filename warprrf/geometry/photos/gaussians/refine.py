@@ -33,7 +33,7 @@ from warprrf.geometry.photos.posed.images import PosedPhotos
 from warprrf.geometry.planes import Plane
 from warprrf.geometry.splats.gaussians import Gaussians, quaternions_of, rotations_of
 from warprrf.geometry.splats.photo_loss import PhotoLoss
-from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
+from warprrf.geometry.splats.rasterizer import Rasterizer
 from warprrf.kernels import adam as optimize
 from warprrf.kernels.raster.sh import COEFFICIENTS
 
@@ -94,7 +94,7 @@ class _Refinement:
         self.targets = Targets(photos, self.loss)
         self.exposures = Exposures(len(self.targets))
         self.iteration = 0
-        self.raster = Rasterizer(device=self.device, blending=Blending())
+        self.raster = Rasterizer(device=device)
         table = np.array([[*p.normal, p.offset] for p in self.planes], dtype=np.float32).reshape(-1, 4)
         self.plane_table = wp.array(table, dtype=wp.vec4, device=self.device)
 
@@ -210,10 +210,8 @@ class _Refinement:
         launch(optimize.activate_adjoint, n, [scales, opacities, *slopes], device=device)
         scales.grad.zero_()
         opacities.grad.zero_()
-        statistics = [state[name] for name in ("pull", "hits", "seen")]
-        position = wp.vec3(camera.position)
-        gathered = [position, self.means, self.means.grad, weight, *statistics]
-        launch(optimize.accumulate, n, gathered, device=device)
+        seen = [wp.vec3(camera.position), self.means, self.means.grad, weight]
+        launch(optimize.accumulate, n, [*seen, *(state[name] for name in STATISTICS)], device=device)
         return score
 
     def move(self) -> None:
@@ -228,9 +226,16 @@ class _Refinement:
         }  # fmt: skip
         adam = optimize.build_adam(wp.float32)
         for name, width in self.widths.items():
-            rate = wp.array(rates[name], dtype=float, device=self.device)
             moments = [self.state[f"first.{name}"], self.state[f"second.{name}"]]
-            inputs = [width, rate, *optimize.corrections(t), None, None, self.gradients[name], *moments]
+            inputs = [
+                width,
+                np.array(rates[name]),
+                *optimize.corrections(t),
+                None,
+                None,
+                self.gradients[name],
+                *moments,
+            ]
             launch(adam, self.count, [*inputs, self.state[name]], device=self.device)
         plane_strength = 0.1  # share of the deviation from its plane removed after every step
         strength = plane_strength if t < c.iterations else 1.0  # in the end exactly flat

@@ -124,10 +124,10 @@ def structure_from_motion(
         if match:
             masks = {name: mask for name, path in named.items() if (mask := mask_beside(path))}
             inputs = [list(named), list(named.values()), masks, max_features, first_lens, colmap.__version__]
-            make = partial(_extract, folder, named, max_features, first_lens)
-            steps.run("features", make, version=VERSIONS["features"], inputs=inputs, outputs=["features.db"])
-            inputs, make = [steps.key("features"), seed], partial(_match, folder, list(named), seed)
-            steps.run("matches", make, version=VERSIONS["matches"], inputs=inputs, outputs=["matches.db"])
+            find = partial(_extract, folder, named, max_features, first_lens)
+            steps.run("features", find, version=VERSIONS["features"], inputs=inputs, outputs=["features.db"])
+            inputs, compare = [steps.key("features"), seed], partial(_match, folder, list(named), seed)
+            steps.run("matches", compare, version=VERSIONS["matches"], inputs=inputs, outputs=["matches.db"])
             inputs = [steps.key("matches"), lens, seed]
         if known is None:
             make = partial(_map, folder, named, lens, seed)
@@ -147,10 +147,10 @@ def structure_from_motion(
             causes |= dict.fromkeys(piece, text)
         pieces = tuple(map(tuple, made["pieces"]))
         result = replace(result, unposed=tuple(unposed), causes=causes, pieces=pieces)
-        said = posed_in_words(result)
-        if said:
+        if said := posed_in_words(result):
             warnings.warn(said, stacklevel=3)
-        return replace(result, guessed=(*result.guessed, *filter(None, [said])))
+            result = replace(result, guessed=(said,))
+        return result
 
 
 def _straightened(steps: Steps, named: Mapping[str, Path], max_pixels: int) -> SparseModel:
@@ -158,13 +158,12 @@ def _straightened(steps: Steps, named: Mapping[str, Path], max_pixels: int) -> S
     model, kept = load_colmap().Reconstruction(str(steps.folder / "model")), steps.folder / "photos"
     lenses = lenses_of(model)
 
-    def straight(attempt: Attempt) -> dict[str, Any]:
+    def straight(attempt: Attempt) -> None:
         shutil.rmtree(kept, ignore_errors=True)  # of other photos, or with masks that are gone
         for k, name in enumerate(lenses):
             attempt.progress("undistorting", k, len(lenses))
             write_undistorted(named[name], kept / name, lenses[name], max_pixels)
         attempt.progress("undistorting", len(lenses), len(lenses))
-        return {}
 
     outputs = [f"photos/{name}" for name in lenses]
     inputs = [steps.key("model"), max_pixels]
@@ -275,18 +274,17 @@ def _fresh(folder: Path) -> Path:
     return folder
 
 
-def _settled(working: Path, final: Path) -> dict[str, Any]:
-    """Move a finished database into place, with nothing left in SQLite's write-ahead log; a step's figures: none."""
+def _settled(working: Path, final: Path) -> None:
+    """Move a finished database into place, with nothing left in SQLite's write-ahead log."""
     with closing(sqlite3.connect(working)) as connection:
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         connection.execute("PRAGMA journal_mode=DELETE")
     os.replace(working, final)
-    return {}
 
 
 def _extract(
     folder: Path, named: Mapping[str, Path], max_features: int, lens: str | dict[str, Lens], attempt: Attempt
-) -> dict[str, Any]:
+) -> None:
     """Features of the photos, into ``features.db``; ``lens``: lenses, or the model of all lenses."""
     check_photos(named)
     colmap, names, images = load_colmap(), list(named), _root(named)
@@ -320,7 +318,7 @@ def _extract(
             device=colmap.Device.cpu,
         )
     attempt.progress("features", len(names), len(names))
-    return _settled(working, folder / "features.db")
+    _settled(working, folder / "features.db")
 
 
 def _write_masks(named: Mapping[str, Path], folder: Path) -> Path:
@@ -337,7 +335,7 @@ def _write_masks(named: Mapping[str, Path], folder: Path) -> Path:
     return folder
 
 
-def _match(folder: Path, names: list[str], seed: int, attempt: Attempt) -> dict[str, Any]:
+def _match(folder: Path, names: list[str], seed: int, attempt: Attempt) -> None:
     """Verified matches of pairs of photos, into ``matches.db``."""
     colmap = load_colmap()
     working = shutil.copyfile(folder / "features.db", _fresh(attempt.folder) / "matches.db")
@@ -370,7 +368,7 @@ def _match(folder: Path, names: list[str], seed: int, attempt: Attempt) -> dict[
             device=colmap.Device.cpu,
         )
     attempt.progress("matching", len(chosen), len(chosen))
-    return _settled(working, folder / "matches.db")
+    _settled(working, folder / "matches.db")
 
 
 def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[tuple[str, str]]:
