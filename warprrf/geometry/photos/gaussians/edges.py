@@ -93,12 +93,10 @@ class Line:
 
 def find_edgels(image: np.ndarray) -> Edgels:
     """Edge pixels of a photo ``(H, W, 3)`` in [0, 1], to a fraction of a pixel (the scheme of Canny, 1986)."""
-    change = [
-        np.stack([ndimage.gaussian_filter(c, BLUR_PX, order=order) for c in np.moveaxis(image, 2, 0)])
-        for order in ((0, 1), (1, 0))
-    ]
-    main = (change[0] ** 2 + change[1] ** 2).argmax(axis=0)[None]
-    dx, dy = (np.take_along_axis(c, main, axis=0)[0].astype(np.float64) for c in change)
+    blur = [BLUR_PX, BLUR_PX, 0]
+    change = [ndimage.gaussian_filter(image, blur, order=order) for order in ((0, 1, 0), (1, 0, 0))]
+    main = (change[0] ** 2 + change[1] ** 2).argmax(axis=2)[..., None]
+    dx, dy = (np.take_along_axis(c, main, axis=2)[..., 0].astype(np.float64) for c in change)
     strength = np.hypot(dx, dy)
     inside = np.zeros(strength.shape, dtype=bool)
     inside[2:-2, 2:-2] = True
