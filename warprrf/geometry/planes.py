@@ -187,7 +187,7 @@ def detect_planes(
     normals: np.ndarray,
     *,
     weights: np.ndarray | None = None,
-    config: PlaneConfig | None = None,
+    config: PlaneConfig,
     seed: int = 0,
 ) -> list[Plane]:
     """Planes among oriented points, the best supported first.
@@ -199,7 +199,6 @@ def detect_planes(
         config: widths and limits.
         seed: seed of the draws.
     """
-    config = config or PlaneConfig()
     weight = np.ones(len(points)) if weights is None else weights
     free = np.arange(len(points))
     found: list[Plane] = []

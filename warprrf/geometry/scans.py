@@ -55,15 +55,12 @@ SMOOTHED = 5  # rounds of smoothing
 SHRINK, GROW = 0.5, -0.53  # Taubin (1995): noise goes, nothing shrinks
 
 
-def find_patches(
-    mesh: Mesh, planes: Sequence[Plane] = (), config: SurfaceConfig | None = None
-) -> PlanarPatches:
+def find_patches(mesh: Mesh, planes: Sequence[Plane], config: SurfaceConfig) -> PlanarPatches:
     """Which faces of ``mesh`` lie on which of the given planes, and which others on planes found among them.
 
     A patch gathers the faces near its plane that face its way; islands too small to matter are left out. Patch k lies
     on ``planes[k]``, turned where it is nearly parallel to a larger one; those of planes found here come after them.
     """
-    config = config or SurfaceConfig()
     normals, areas = smoothed_normals(mesh, 3), mesh.areas
     centres = mesh.triangles.mean(axis=1)
     label = np.full(len(centres), -1, dtype=np.int64)

@@ -25,7 +25,7 @@ def occupancy(
     eyes: np.ndarray,
     targets: np.ndarray,
     *,
-    config: PlaneConfig | None = None,
+    config: PlaneConfig,
 ) -> list[Plane]:
     """``planes`` with the cells where a surface may be.
 
@@ -36,7 +36,6 @@ def occupancy(
         points: the points that the planes' ``inliers`` index, shape ``(P, 3)`` [m].
         eyes, targets: lines of sight, from a camera to a point it sees, shape ``(L, 3)`` each [m].
     """
-    config = config or PlaneConfig()
     result = []
     for plane in planes:
         uv = plane.to_plane(points[plane.inliers])

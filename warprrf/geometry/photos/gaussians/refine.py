@@ -53,7 +53,7 @@ def refine(
     gaussians: Gaussians,
     photos: PosedPhotos,
     *,
-    config: RefineConfig | None = None,
+    config: RefineConfig,
     planes: Sequence[Plane] = (),
     progress: Progress | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
@@ -65,7 +65,6 @@ def refine(
         planes: detected planes; Gaussians on them are kept flat.
         checkpoint: file to continue from if it exists and to keep up to date; of the same arguments.
     """
-    config = config or RefineConfig()
     run = _Refinement(photos, config, planes, resolve(device))
     if checkpoint is not None and Path(checkpoint).exists():
         run.restore(Path(checkpoint))

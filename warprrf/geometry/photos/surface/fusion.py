@@ -51,7 +51,7 @@ def depth_maps(
     *,
     photos: PosedPhotos | None = None,
     planes: Sequence[Plane] = (),
-    config: ReconstructionConfig | None = None,
+    config: ReconstructionConfig,
     progress: Progress | None = None,
     device: DeviceLike = None,
 ) -> list[np.ndarray]:
@@ -61,7 +61,6 @@ def depth_maps(
         photos: what ``cameras`` saw, in the same order; the depth maps are mended by them.
         planes: that Gaussians were kept on: elsewhere only what photos prove is reliable.
     """
-    config = config or ReconstructionConfig()
     report = progress or (lambda stage, done, total: None)
     views, depths = depth_views(cameras, config.surface), []
     alpha = 0.6  # a depth counts where at least so much light is blocked,
@@ -121,7 +120,7 @@ def fuse_maps(
     depths: Sequence[np.ndarray],
     *,
     planes: Sequence[Plane] = (),
-    config: ReconstructionConfig | None = None,
+    config: ReconstructionConfig,
     progress: Progress | None = None,
 ) -> tuple[PlanarPatches, bool]:
     """Mesh of depth maps with its planar patches, the largest first; and whether its holes were closed.
@@ -130,7 +129,6 @@ def fuse_maps(
         depths: ranges [m], 0 where unknown, each of one of ``views``.
         planes: known beforehand; the mesh is snapped to them.
     """
-    config = config or ReconstructionConfig()
     report = progress or (lambda stage, done, total: None)
     report("surface", 0, 4)
     mesh = fuse_depth(depths, views, config=_with_voxels(config.surface, views, depths))
@@ -157,15 +155,12 @@ def _with_voxels(
     return replace(config, voxel_m=min(config.voxel_m, voxel_pixels * float(np.median(pixel_m))))
 
 
-def fuse_depth(
-    depths: Sequence[np.ndarray], cameras: Sequence[Camera], *, config: SurfaceConfig | None = None
-) -> Mesh:
+def fuse_depth(depths: Sequence[np.ndarray], cameras: Sequence[Camera], *, config: SurfaceConfig) -> Mesh:
     """One mesh from depth maps of pinhole cameras, by a truncated signed distance field.
 
     Args:
         depths: Euclidean range per pixel [m], each ``(height, width)`` of its camera; inf, NaN or 0 where unknown.
     """
-    config = config or SurfaceConfig()
     o3d = open3d()
     core = o3d.core
     grid = o3d.t.geometry.VoxelBlockGrid(
