@@ -30,6 +30,7 @@ from warprrf.files import check_seal, plain, read_arrays, read_json, write_array
 _RECORDED = {
     "key": str, "finished": bool, "seconds": float, "attempts": int, "stages": dict, "figures": dict,
 }  # fmt: skip
+RECORDS = ".steps"  # of records, scratch and lock: the folder that tells a workspace from others
 HEARTBEAT_S = 5.0  # how much time of a killed attempt may go unrecorded
 
 
@@ -89,7 +90,7 @@ class Steps:
         shared: bool = False,
     ) -> None:
         self.folder = Path(folder)
-        self._own = self.folder / ".steps"  # records, scratch and lock
+        self._own = self.folder / RECORDS
         self._fresh, self._progress, self._shared = fresh, progress, shared
         self._lock: IO[str] | None = None
         self.records: dict[str, dict[str, Any]] = {}

@@ -44,13 +44,6 @@ class Edgels:
     across: np.ndarray
     strength: np.ndarray
 
-    @property
-    def pixel(self) -> tuple[np.ndarray, np.ndarray]:
-        """Row and column of each."""
-        height, width = self.strength.shape
-        x, y = self.position.astype(int).T
-        return np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)
-
 
 @dataclass(frozen=True)
 class Line:

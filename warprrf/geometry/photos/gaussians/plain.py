@@ -256,11 +256,11 @@ def _shown(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The line that each edgel lies on (-1: none), and the pixels that part regions: lines, where enough of them shows
     in whole, else their shown parts with gaps bridged."""
-    height, width = edgels.strength.shape
-    place = np.full((height, width), -1)
-    place[edgels.pixel] = np.arange(len(edgels.position))
+    place = np.full(edgels.strength.shape, -1)
+    x, y = edgels.position.astype(int).T
+    place[y, x] = np.arange(len(edgels.position))
     off, (row, column) = ndimage.distance_transform_edt(place < 0, return_indices=True)
-    of_line, barrier = np.full(len(edgels.position), -1), np.zeros((height, width), dtype=bool)
+    of_line, barrier = np.full(len(edgels.position), -1), np.zeros(place.shape, dtype=bool)
     points, number = traced
     inside, pixels = camera.in_frame(points, 0.1)
     steps = np.c_[number[inside], pixels[inside]]

@@ -12,7 +12,6 @@ import itertools
 import os
 import shutil
 import sqlite3
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -22,6 +21,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from warprrf.checks import some_of, warn
 from warprrf.device import Progress, require
 from warprrf.files import folder_in_place
 from warprrf.geometry.photos.config import ReconstructionConfig
@@ -34,7 +34,6 @@ from warprrf.geometry.photos.posed.photo_files import (
     mask_beside,
     open_photo,
     photo_facts,
-    some,
 )
 from warprrf.geometry.photos.posed.poses import KnownCamera, KnownPoses
 from warprrf.geometry.photos.posed.sparse import SparseModel, fit_similarity, posed_in_words
@@ -148,7 +147,7 @@ def structure_from_motion(
         pieces = tuple(map(tuple, made["pieces"]))
         result = replace(result, unposed=tuple(unposed), causes=causes, pieces=pieces)
         if said := posed_in_words(result):
-            warnings.warn(said, stacklevel=3)
+            warn(said)
             result = replace(result, guessed=(said,))
         return result
 
@@ -346,7 +345,7 @@ def _match(folder: Path, names: list[str], seed: int, attempt: Attempt) -> None:
         if len(names) - len(blank) < MIN_PHOTOS:
             raise ValueError(
                 f"photos: {len(blank)} of {len(names)} photos show fewer than {FEWEST_FEATURES} features (blank, dark or "
-                f"blurred?), too few remain to work with: {some(blank)}"
+                f"blurred?), too few remain to work with: {some_of(blank)}"
             )
         chosen = list(itertools.combinations(names, 2))
         if len(chosen) > MAX_EXHAUSTIVE_PAIRS:
@@ -456,7 +455,7 @@ def _map(folder: Path, named: Mapping[str, Path], lens: str, seed: int, attempt:
         raise ValueError(
             f"photos: too few matches between the {len(named)} photos to pose any "
             f"({(inliers >= options.min_num_matches).sum()} pairs of photos match); expected photos of one textured "
-            f"place that overlap by half or more: {some(list(named))}"
+            f"place that overlap by half or more: {some_of(list(named))}"
         )
     kept: list[Any] = []
     for model in best:
