@@ -75,10 +75,7 @@ def complete(
 
 
 def _with_rest(
-    whole: PlanarPatches,
-    known: np.ndarray,
-    patches: PlanarPatches,
-    faces: FaceLevels,
+    whole: PlanarPatches, known: np.ndarray, patches: PlanarPatches, faces: FaceLevels
 ) -> PlanarPatches:
     """The completed surface with round or oblique pieces of the old mesh in place of the steps made for them."""
     new, old = whole.mesh, patches.mesh
@@ -92,15 +89,11 @@ def _with_rest(
     rest &= np.bincount(piece, weights=old.areas * rest)[piece] >= keep_m2
     if not rest.any():
         return whole
-    stays = known.copy()
-    if not known.all():
-        steps = new.triangles[~known].mean(axis=1)
-        stays[~known] = Mesh(old.vertices, old.faces[rest]).distance(steps) > keep_m
-    corners = np.concatenate([new.faces[stays], old.faces[rest] + len(new.vertices)])
-    used, corners = np.unique(corners, return_inverse=True)
+    stays, steps = known.copy(), new.triangles[~known].mean(axis=1)
+    stays[~known] = Mesh(old.vertices, old.faces[rest]).distance(steps) > keep_m
     own = patches.face_patch[rest]
     return PlanarPatches.from_planes(
-        Mesh(np.concatenate([new.vertices, old.vertices])[used], corners.reshape(-1, 3)),
+        joined([(new.vertices, new.faces[stays]), (old.vertices, old.faces[rest])]),
         np.concatenate([whole.face_patch[stays], np.where(own >= 0, own + len(whole), -1)]),
         np.concatenate([whole.normal, patches.normal]),
         np.concatenate([whole.offset, patches.offset]),

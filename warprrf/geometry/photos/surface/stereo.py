@@ -199,7 +199,7 @@ def _votes(
     known = depth > 0
     agreed, crossed = (np.zeros(depth.shape, dtype=np.int64) for _ in range(2))
     cameras, ranges = [other for other, _ in others], [seen.ravel() for _, seen in others]
-    if not known.any() or not cameras:
+    if not cameras:
         return agreed, crossed
     points = camera.position + depth[known][:, None] * camera.directions()[known]
     eyes = np.array([c.position for c in cameras])
