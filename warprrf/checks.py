@@ -249,11 +249,9 @@ def warn(text: str) -> None:
     warnings.warn(text, UserWarning, stacklevel=users_level())
 
 
-def some_of(rows: Sequence[int] | np.ndarray) -> str:
-    """Rows of a table, for a message: the first ones and how many more."""
-    most = 8
-    text = ", ".join(str(int(row)) for row in rows[:most])
-    return text + f" and {len(rows) - most} more" * (len(rows) > most)
+def some_of(items: Sequence[object] | np.ndarray, most: int = 8) -> str:
+    """Names, or rows of a table, for a message: the first ones and how many more."""
+    return ", ".join(map(str, items[:most])) + f" and {len(items) - most} more" * (len(items) > most)
 
 
 LARGEST_M = 1e8

@@ -30,6 +30,7 @@ from warprrf.files import check_seal, plain, read_arrays, read_json, write_array
 _RECORDED = {
     "key": str, "finished": bool, "seconds": float, "attempts": int, "stages": dict, "figures": dict,
 }  # fmt: skip
+RECORDS = ".steps"  # of records, scratch and lock: the folder that tells a workspace from others
 HEARTBEAT_S = 5.0  # how much time of a killed attempt may go unrecorded
 
 
@@ -89,7 +90,7 @@ class Steps:
         shared: bool = False,
     ) -> None:
         self.folder = Path(folder)
-        self._own = self.folder / ".steps"  # records, scratch and lock
+        self._own = self.folder / RECORDS
         self._fresh, self._progress, self._shared = fresh, progress, shared
         self._lock: IO[str] | None = None
         self.records: dict[str, dict[str, Any]] = {}
@@ -117,7 +118,7 @@ class Steps:
     def run(
         self,
         name: str,
-        make: Callable[[Attempt], Mapping[str, Any]],
+        make: Callable[[Attempt], Mapping[str, Any] | None],
         *,
         version: int,
         inputs: Iterable[Any],
@@ -127,7 +128,7 @@ class Steps:
 
         Args:
             name: of the step, fit for a file name, once in a folder.
-            make: does the step and returns figures that JSON holds (arrays come back as lists, NaN as None).
+            make: does the step and returns figures, if any, that JSON holds (arrays come back as lists, NaN as None).
             version: counted up by hand when ``make`` computes something else.
             inputs: all that the step reads; see :func:`digest`.
             outputs: files that it leaves, relative to the folder, each written in one go
@@ -177,7 +178,7 @@ class Steps:
         missing = [file for file in outputs if not (self.folder / file).exists()]
         if missing:
             raise RuntimeError(f"step {name} ended without writing {', '.join(missing)}")
-        write(finished=True, figures=plain(figures))
+        write(finished=True, figures=plain(figures or {}))
         shutil.rmtree(scratch)
         return dict(record["figures"])
 

@@ -214,7 +214,7 @@ def _known_poses(poses: Path, depth: Path | None, photos: Mapping[str, Path], ev
     """
     model = poses if poses.is_dir() and sfm.is_colmap(poses) else None
     cameras = sfm.read_known(poses) if model else read_poses(poses)
-    names = match_photos(cameras, photos, warn=every)
+    names = match_photos(cameras, photos, every=every)
     found = {photo: cameras[name] for photo, name in names.items()}
     files = {photo: camera.depth for photo, camera in found.items() if camera.depth is not None}
     if depth is not None:
@@ -328,9 +328,8 @@ def _kept(steps: Steps, name: str, make: Callable[[Attempt], Arrays], inputs: Se
     """Arrays of a step, from its file if it was made from the same inputs."""
     path = steps.folder / f"{name}.safetensors"
 
-    def write(attempt: Attempt) -> dict[str, Any]:
+    def write(attempt: Attempt) -> None:
         tensor_files.write(path, make(attempt), {}, None)
-        return {}
 
     steps.run(name, write, version=VERSIONS[name], inputs=inputs, outputs=[path.name])
     return tensor_files.read(path, None)[0]

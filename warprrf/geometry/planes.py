@@ -13,11 +13,10 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from warprrf.cache import cached_property
-from warprrf.checks import check_array, checked, positive
+from warprrf.checks import checked, positive
 
 
 @checked
@@ -136,6 +135,11 @@ class Plane:
         np.add.at(counts, tuple(p[inside] for p in place), 1)
         return counts
 
+    def spanning(self, low: np.ndarray, high: np.ndarray) -> Plane:
+        """The plane with occupied cells from in-plane coordinates ``low`` to ``high`` [m], shape ``(2,)`` each."""
+        shape = np.ceil((high - low) / self.cell_m).astype(int)
+        return replace(self, corner=low, occupied=np.ones(shape, dtype=bool))
+
     def widened(self, cells: int) -> Plane:
         """The plane with ``cells`` more rows and columns of empty cells on every side."""
         return replace(
@@ -179,11 +183,11 @@ def fit_plane(points: np.ndarray, weights: np.ndarray, normal: np.ndarray) -> tu
 
 
 def detect_planes(
-    points: ArrayLike,
-    normals: ArrayLike,
+    points: np.ndarray,
+    normals: np.ndarray,
     *,
-    weights: ArrayLike | None = None,
-    config: PlaneConfig | None = None,
+    weights: np.ndarray | None = None,
+    config: PlaneConfig,
     seed: int = 0,
 ) -> list[Plane]:
     """Planes among oriented points, the best supported first.
@@ -195,10 +199,7 @@ def detect_planes(
         config: widths and limits.
         seed: seed of the draws.
     """
-    config = config or PlaneConfig()
-    points = check_array("points", points, (None, 3))
-    normals = check_array("normals", normals, (len(points), 3))
-    weight = np.ones(len(points)) if weights is None else check_array("weights", weights, (len(points),))
+    weight = np.ones(len(points)) if weights is None else weights
     free = np.arange(len(points))
     found: list[Plane] = []
     misses = 0

@@ -80,11 +80,8 @@ def holds_gaussians(path: str | os.PathLike[str]) -> bool:
         return False
     with Path(path).open("rb") as file:
         data = file.read(_LONGEST_HEADER)
-    end = data.find(b"\n" + _END)
     try:
-        if not data.startswith(b"ply") or end < 0:
-            raise ValueError("not a PLY file (no 'ply' ... 'end_header')")
-        stated = _header(data[:end].decode("ascii", "replace"))[1]
+        _, stated, _ = _header(data)
     except ValueError as error:
         raise ValueError(f"{os.fspath(path)}: {error}") from error
     return any(e.name == "vertex" and "scale_0" in [name for name, _, _ in e.columns] for e in stated)
@@ -107,11 +104,7 @@ def write_ply(
 
 
 def _elements(data: bytes) -> dict[str, Element]:
-    end = data.find(b"\n" + _END)
-    body = data.find(b"\n", end + 1) + 1
-    if not data.startswith(b"ply") or end < 0 or body == 0 or data[end + 1 : body].strip() != _END:
-        raise ValueError("not a PLY file (no 'ply' ... 'end_header')")
-    order, stated = _header(data[:end].decode("ascii", "replace"))
+    order, stated, body = _header(data)
     if order:
         rest = np.frombuffer(data, np.uint8, offset=body)
     else:
@@ -141,11 +134,15 @@ def _set_types(stated: _Stated, element: Element) -> None:
         element[name] = Lists(column.lengths, values) if isinstance(column, Lists) else values
 
 
-def _header(text: str) -> tuple[str, list[_Stated]]:
-    """Byte order ("" for ASCII) and elements."""
+def _header(data: bytes) -> tuple[str, list[_Stated], int]:
+    """Byte order ("" for ASCII), elements, and where these begin."""
+    end = data.find(b"\n" + _END)
+    body = data.find(b"\n", end + 1) + 1
+    if not data.startswith(b"ply") or end < 0 or body == 0 or data[end + 1 : body].strip() != _END:
+        raise ValueError("not a PLY file (no 'ply' ... 'end_header')")
     order: str | None = None
     stated: list[_Stated] = []
-    for line in text.splitlines()[1:]:
+    for line in data[:end].decode("ascii", "replace").splitlines()[1:]:
         words = line.split()
         match words:
             case [] | ["comment" | "obj_info", *_]:
@@ -170,7 +167,7 @@ def _header(text: str) -> tuple[str, list[_Stated]]:
             raise ValueError(f"element {element.name!r} has no property, or one twice")
     if len({element.name for element in stated}) < len(stated):
         raise ValueError("it states an element twice")
-    return order, stated
+    return order, stated, body
 
 
 def _rows(element: _Stated, order: str, rest: np.ndarray) -> tuple[Element, np.ndarray]:

@@ -55,15 +55,12 @@ SMOOTHED = 5  # rounds of smoothing
 SHRINK, GROW = 0.5, -0.53  # Taubin (1995): noise goes, nothing shrinks
 
 
-def find_patches(
-    mesh: Mesh, planes: Sequence[Plane] = (), config: SurfaceConfig | None = None
-) -> PlanarPatches:
+def find_patches(mesh: Mesh, planes: Sequence[Plane], config: SurfaceConfig) -> PlanarPatches:
     """Which faces of ``mesh`` lie on which of the given planes, and which others on planes found among them.
 
     A patch gathers the faces near its plane that face its way; islands too small to matter are left out. Patch k lies
     on ``planes[k]``, turned where it is nearly parallel to a larger one; those of planes found here come after them.
     """
-    config = config or SurfaceConfig()
     normals, areas = smoothed_normals(mesh, 3), mesh.areas
     centres = mesh.triangles.mean(axis=1)
     label = np.full(len(centres), -1, dtype=np.int64)
@@ -145,7 +142,7 @@ def scanned_patches(mesh: Mesh) -> PlanarPatches:
         mesh: noisy, with holes, of any number of faces.
     """
     patches = simplified(snapped(mesh, (), SurfaceConfig()))
-    return replace(largest_first(patches, MIN_PATCH_M2), two_sided=True)
+    return replace(largest_first(patches), two_sided=True)
 
 
 def _smoothed(mesh: Mesh) -> Mesh:
@@ -250,10 +247,10 @@ def _gathered(patches: PlanarPatches) -> np.ndarray:
     return target
 
 
-def largest_first(patches: PlanarPatches, min_area_m2: float) -> PlanarPatches:
-    """``patches`` in the order of their area, without those that are smaller."""
+def largest_first(patches: PlanarPatches) -> PlanarPatches:
+    """``patches`` in the order of their area, without those below :data:`MIN_PATCH_M2`."""
     order = np.argsort(-patches.area, kind="stable")
-    order = order[patches.area[order] >= min_area_m2]
+    order = order[patches.area[order] >= MIN_PATCH_M2]
     number = np.full(len(patches) + 1, -1)
     number[order] = np.arange(len(order))
     return PlanarPatches.from_planes(

@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike
 
 from warprrf.checks import (
     Count,
+    Number,
+    Shaped,
     check_array,
     check_number,
     check_positive,
@@ -46,25 +48,21 @@ class Camera:
     kind: Annotated[str, one_of(*KINDS)]
     width: Count
     height: Count
-    world_to_camera: np.ndarray = field(repr=False)
+    world_to_camera: Annotated[np.ndarray, Shaped("4 4")] = field(repr=False)
     fx: float = 0.0
     fy: float = 0.0
-    cx: float = 0.0
-    cy: float = 0.0
+    cx: Number = 0.0
+    cy: Number = 0.0
 
     def __post_init__(self) -> None:
-        checked: dict[str, object] = {"world_to_camera": _check_pose(self.world_to_camera)}
+        _check_pose(self.world_to_camera)
+        if self.kind == "pinhole":
+            for name in ("fx", "fy"):
+                check_positive(name, getattr(self, name), "focal length in pixels")
+            return
         for name in ("fx", "fy", "cx", "cy"):
-            value = getattr(self, name)
-            if self.kind == "spherical":
-                checked[name] = check_number(f"{name} of a spherical camera", value, 0.0, 0.0)
-            elif name in ("fx", "fy"):
-                checked[name] = check_positive(name, value, "focal length in pixels")
-            else:
-                checked[name] = check_number(name, value)
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
-        if self.kind == "spherical" and not np.allclose(self.rotation, np.eye(3), atol=1e-12):
+            check_number(f"{name} of a spherical camera", getattr(self, name), 0.0, 0.0)
+        if not np.allclose(self.rotation, np.eye(3), atol=1e-12):
             raise ValueError(
                 "world_to_camera: got a spherical camera that is turned, expected axes along the world's"
             )
@@ -82,8 +80,7 @@ class Camera:
         world_to_camera: ArrayLike,
     ) -> Camera:
         """A pinhole camera without distortion."""
-        pose = check_array("world_to_camera", world_to_camera, (4, 4))
-        return cls("pinhole", width, height, pose, fx, fy, cx, cy)
+        return cls("pinhole", width, height, np.asarray(world_to_camera), fx, fy, cx, cy)
 
     @classmethod
     def spherical(cls, width: int, height: int, *, position: ArrayLike) -> Camera:
@@ -174,15 +171,13 @@ def check_camera(cam: object) -> None:
     check_type("cam", cam, Camera, " (Camera.pinhole or Camera.spherical)")
 
 
-def _check_pose(pose: ArrayLike) -> np.ndarray:
-    """``pose`` as a rigid transform, shape ``(4, 4)``."""
-    found = check_array("world_to_camera", pose, (4, 4))
-    rotation = found[:3, :3]
+def _check_pose(pose: np.ndarray) -> None:
+    """Refuse what is no rigid transform."""
+    rotation = pose[:3, :3]
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
         raise ValueError(
             "world_to_camera: its upper left 3x3 block is not a rotation; expected a rigid transform with OpenCV "
             "axes (x right, y down, z forward); a scaled or mirrored pose must be normalised first"
         )
-    if not np.allclose(found[3], [0, 0, 0, 1]):
-        raise ValueError(f"world_to_camera: got last row {found[3]}, expected [0, 0, 0, 1]")
-    return found
+    if not np.allclose(pose[3], [0, 0, 0, 1]):
+        raise ValueError(f"world_to_camera: got last row {pose[3]}, expected [0, 0, 0, 1]")

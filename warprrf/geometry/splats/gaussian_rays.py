@@ -143,7 +143,7 @@ class GaussianRays:
         Raises:
             TypeError, ValueError: naming the argument: wrong shape, NaN, a direction of length zero, ``k`` below 1.
         """
-        found = self._trace(origins, directions, k, order, requires_grad=False)[0]
+        found, _ = self.trace_with_adjoint(origins, directions, k, order=order, gradients=False)
         return RayHits(found.index.numpy(), *(array.numpy() for array in found.outputs))
 
     def transmittance(self, a: ArrayLike, b: ArrayLike) -> np.ndarray:
@@ -154,14 +154,16 @@ class GaussianRays:
         Raises:
             TypeError, ValueError: naming the argument that does not fit.
         """
-        return self._transmit(a, b, requires_grad=False)[0].numpy()
+        return self.transmit_with_adjoint(a, b, gradients=False)[0].numpy()
 
     def trace(
         self, origins: ArrayLike, directions: ArrayLike, k: int = 16, *, order: str = "peak"
     ) -> RayHits:
         """:meth:`hits` as Warp arrays, differentiable on an active tape in the parameters (not in the rays)."""
         tape = active_tape()
-        found, adjoint = self._trace(origins, directions, k, order, requires_grad=tape is not None)
+        found, adjoint = self.trace_with_adjoint(
+            origins, directions, k, order=order, gradients=tape is not None
+        )
         if tape is not None:
             record(tape, adjoint, self.inputs, found.outputs)
         return found
@@ -169,24 +171,22 @@ class GaussianRays:
     def transmit(self, a: ArrayLike, b: ArrayLike) -> wp.array:
         """:meth:`transmittance` as a Warp array, differentiable on an active tape in the parameters."""
         tape = active_tape()
-        values, adjoint = self._transmit(a, b, requires_grad=tape is not None)
+        values, adjoint = self.transmit_with_adjoint(a, b, gradients=tape is not None)
         if tape is not None:
             record(tape, adjoint, self.inputs, (values,))
         return values
 
     def trace_with_adjoint(
-        self, origins: ArrayLike, directions: ArrayLike, k: int = 16, *, order: str = "peak"
+        self,
+        origins: ArrayLike,
+        directions: ArrayLike,
+        k: int = 16,
+        *,
+        order: str = "peak",
+        gradients: bool = True,
     ) -> tuple[RayHits, Callable[[], None]]:
-        """:meth:`trace` without a tape: the hits, and the function that adds the parameters' gradients."""
-        return self._trace(origins, directions, k, order, requires_grad=True)
-
-    def transmit_with_adjoint(self, a: ArrayLike, b: ArrayLike) -> tuple[wp.array, Callable[[], None]]:
-        """:meth:`transmit` without a tape: the values, and the function that adds the parameters' gradients."""
-        return self._transmit(a, b, requires_grad=True)
-
-    def _trace(
-        self, origins: ArrayLike, directions: ArrayLike, k: int, order: str, *, requires_grad: bool
-    ) -> tuple[RayHits, Callable[[], None]]:
+        """:meth:`trace` without a tape: the hits, and the function that adds the parameters' gradients, which only
+        hits with ``gradients`` have."""
         start, toward = _pairs("origins", origins, "directions", directions)
         places = check_count("k", k)
         check_choice("order", order, ORDERS)
@@ -198,10 +198,10 @@ class GaussianRays:
         real = {"dtype": wp.float64, "device": on}
         found = RayHits(
             wp.full(shape, -1, dtype=int, device=on),
-            wp.full(shape, np.inf, requires_grad=requires_grad, **real),
-            wp.zeros(shape, requires_grad=requires_grad, **real),
-            wp.zeros(shape, requires_grad=requires_grad, **real),
-            wp.empty(count, requires_grad=requires_grad, **real),
+            wp.full(shape, np.inf, requires_grad=gradients, **real),
+            wp.zeros(shape, requires_grad=gradients, **real),
+            wp.zeros(shape, requires_grad=gradients, **real),
+            wp.empty(count, requires_grad=gradients, **real),
         )
         rays = [wp.array(start, dtype=wp.vec3d, device=on), wp.array(toward, dtype=wp.vec3d, device=on)]
         launch(
@@ -213,18 +213,20 @@ class GaussianRays:
         )  # fmt: skip
 
         def adjoint() -> None:
-            gradients = [array.grad for array in found.outputs]
-            inputs = [self._scene, self._rules, *rays, found.index, found.alpha, found.weight, *gradients]
+            slopes = [array.grad for array in found.outputs]
+            inputs = [self._scene, self._rules, *rays, found.index, found.alpha, found.weight, *slopes]
             self._chain(kernels.collect_adjoint, count, inputs)
 
         return found, adjoint
 
-    def _transmit(
-        self, a: ArrayLike, b: ArrayLike, *, requires_grad: bool
+    def transmit_with_adjoint(
+        self, a: ArrayLike, b: ArrayLike, *, gradients: bool = True
     ) -> tuple[wp.array, Callable[[], None]]:
+        """:meth:`transmit` without a tape: the values, and the function that adds the parameters' gradients, which only
+        values with ``gradients`` have."""
         start, end = _pairs("a", a, "b", b)
         count, on = _rows(start, end), self.device
-        values = wp.empty(count, dtype=wp.float64, device=on, requires_grad=requires_grad)
+        values = wp.empty(count, dtype=wp.float64, device=on, requires_grad=gradients)
         parts = [wp.empty(count, dtype=wp.float64, device=on), wp.empty(count, dtype=int, device=on)]
         ends = [wp.array(start, dtype=wp.vec3d, device=on), wp.array(end, dtype=wp.vec3d, device=on)]
         launch(kernels.transmit, count, [self._scene, self._rules, *ends, values, *parts], device=on)

@@ -8,13 +8,14 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from warprrf.checks import LARGEST_M, check_array, check_count, check_similarity, checked, one_line
+from warprrf.checks import LARGEST_M, Shaped, check_count, check_similarity, checked, one_line
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.ply_files import read_ply, write_ply
 from warprrf.kernels.raster import sh as _sh
@@ -51,31 +52,23 @@ class Gaussians:
 
     __repr__ = one_line
 
-    means: np.ndarray
-    quaternions: np.ndarray
-    scales: np.ndarray
-    opacities: np.ndarray
-    sh: np.ndarray
+    means: Annotated[np.ndarray, Shaped("N 3", np.float32)]
+    quaternions: Annotated[np.ndarray, Shaped("N 4")]
+    scales: Annotated[np.ndarray, Shaped("N 3", np.float32)]
+    opacities: Annotated[np.ndarray, Shaped("N", np.float32)]
+    sh: Annotated[np.ndarray, Shaped("N K C", np.float32)]
 
     def __post_init__(self) -> None:
-        means = check_array("means", self.means, (None, 3), np.float32)
-        n = len(means)
-        quaternions = check_array("quaternions", self.quaternions, (n, 4), np.float64)
-        scales = check_array("scales", self.scales, (n, 3), np.float32)
-        opacities = check_array("opacities", self.opacities, (n,), np.float32)
-        sh = check_array("sh", self.sh, (n, None, None), np.float32)
-        if sh.shape[1] not in COEFFICIENTS.values():
-            raise ValueError(f"sh: got {sh.shape[1]} coefficients, expected 1, 4, 9 or 16 (degree 0 to 3)")
-        for name, array, most in (
-            ("means", means, LARGEST_M),
-            ("scales", scales, LARGEST_M),
-            ("sh", sh, LARGEST_SH),
-        ):
-            if np.abs(array).max(initial=0.0) > most:
-                raise ValueError(
-                    f"{name}: got values up to {np.abs(array).max():g}, expected at most {most:g}"
-                )
-        norm = np.linalg.norm(quaternions, axis=1, keepdims=True)
+        scales, opacities = self.scales, self.opacities
+        if self.sh.shape[1] not in COEFFICIENTS.values():
+            raise ValueError(
+                f"sh: got {self.sh.shape[1]} coefficients, expected 1, 4, 9 or 16 (degree 0 to 3)"
+            )
+        for name, most in (("means", LARGEST_M), ("scales", LARGEST_M), ("sh", LARGEST_SH)):
+            largest = np.abs(getattr(self, name)).max(initial=0.0)
+            if largest > most:
+                raise ValueError(f"{name}: got values up to {largest:g}, expected at most {most:g}")
+        norm = np.linalg.norm(self.quaternions, axis=1, keepdims=True)
         if (norm < 1e-12).any():
             raise ValueError(
                 f"quaternions: {int((norm < 1e-12).sum())} are zero, expected wxyz rotations; (1, 0, 0, 0) is none"
@@ -93,11 +86,7 @@ class Gaussians:
             raise ValueError(
                 f"opacities: got values from {opacities.min()} to {opacities.max()}, expected [0, 1] (not logits)"
             )
-        for name, value in (
-            ("means", means), ("quaternions", (quaternions / norm).astype(np.float32)), ("scales", scales),
-            ("opacities", opacities), ("sh", sh),
-        ):  # fmt: skip
-            object.__setattr__(self, name, value)
+        object.__setattr__(self, "quaternions", (self.quaternions / norm).astype(np.float32))
 
     def __len__(self) -> int:
         return len(self.means)

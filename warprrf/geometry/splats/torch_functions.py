@@ -19,7 +19,6 @@ from warprrf.device import resolve
 from warprrf.geometry.splats.camera import Camera, check_camera
 from warprrf.geometry.splats.gaussian_rays import GaussianRays
 from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
-from warprrf.kernels.raster.sh import COEFFICIENTS
 
 try:
     import torch
@@ -76,8 +75,6 @@ def colors(means: torch.Tensor, sh: torch.Tensor, cam: Camera) -> torch.Tensor:
     check_camera(cam)
     _check("means", means, (None, 3), None)
     _check("sh", sh, (len(means), None, None), means)
-    if sh.shape[1] not in COEFFICIENTS.values():
-        raise ValueError(f"sh: got {sh.shape[1]} coefficients, expected 1, 4, 9 or 16 (degree 0 to 3)")
     return _Colors.apply(cam, means, sh)
 
 

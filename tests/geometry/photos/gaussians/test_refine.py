@@ -173,7 +173,7 @@ def test_gains_of_photos_are_recovered_whatever_is_masked_or_clipped():
     photos[1][mask] = 0.3
     camera = Camera.pinhole(30, 20, fx=30, fy=30, cx=15, cy=10, world_to_camera=np.eye(4))
     targets = Targets(PosedPhotos(photos, [camera] * 4, [None, mask, None, None]), PhotoLoss(resolve(), 0.2))
-    exposures = Exposures(4, fitted=True)
+    exposures = Exposures(4)
     rendered = wp.array(image, dtype=float)
     for visit in range(20):
         for view in range(4):

@@ -115,7 +115,7 @@ def test_the_focal_length_is_known_before_any_photo_has_a_pose(posed, tmp_path):
         return camera.mean_focal_length()
 
     assert focal() == pytest.approx(1.2 * 640)
-    sfm._calibrate(pycolmap, matches, tmp_path / "scratch.db", 0)
+    sfm._calibrate(matches, tmp_path / "scratch.db", 0)
     assert focal() == pytest.approx(395, rel=0.05)  # one in a hundred of the whole walk
 
 
@@ -135,7 +135,7 @@ def test_models_that_share_a_photo_become_one_and_others_stay_apart(posed, tmp_p
         first, second = part(VIEWS[:6]), part(VIEWS[6 - shared :])
         second.transform(pycolmap.Sim3d(2.5, pycolmap.Rotation3d([0.1, 0.2, 0.3]), [3.0, -1.0, 2.0]))
         source = folder / "matches.db", PHOTOS[0].parent, options
-        both = sfm._joined(pycolmap, first, second, source, tmp_path)
+        both = sfm._joined(first, second, source, tmp_path)
         assert (both is not None) == joined
         if both is not None:
             centres = {i.name: i.projection_center() for i in both.images.values()}
@@ -201,7 +201,7 @@ def test_matches_repeat_themselves_to_the_bit(tmp_path, monkeypatch):
     scratch.mkdir()
     found = []
     for _ in range(4):
-        sfm._match(pycolmap, tmp_path, names, 0, Attempt(lambda *_: None, scratch))
+        sfm._match(tmp_path, names, 0, Attempt(lambda *_: None, scratch))
         with closing(sqlite3.connect(tmp_path / "matches.db")) as database:
             found.append(
                 database.execute("SELECT pair_id, rows, data FROM matches ORDER BY pair_id").fetchall()
@@ -248,7 +248,7 @@ def test_why_a_photo_has_no_pose_is_said(posed):
     workspace, sparse = posed
     cameras = {name: camera for name, camera in sparse.cameras.items() if name != VIEWS[4]}
     lost = replace(sparse, cameras=cameras, unposed=(VIEWS[4], "black.jpg"))
-    causes = sfm._causes(pycolmap, workspace / "sfm" / "matches.db", lost)
+    causes = sfm._causes(workspace / "sfm" / "matches.db", lost)
     assert list(causes) == [VIEWS[4], "black.jpg"] and causes["black.jpg"].startswith("shows 0 features")
     assert any(f"matches {name} in" in causes[VIEWS[4]] for name in cameras)
 

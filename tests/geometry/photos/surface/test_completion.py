@@ -12,7 +12,7 @@ from views import look
 import warprrf as wr
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.surface import completion
-from warprrf.geometry.scans import find_patches
+from warprrf.geometry.scans import SurfaceConfig, find_patches
 from warprrf.geometry.splats.gaussians import discs_on_mesh
 
 pytest.importorskip("open3d")
@@ -127,7 +127,7 @@ def test_gaps_of_planes_are_closed_unless_they_are_wide_or_a_photo_looks_through
     mesh = without(joined(floor, shelf, table)[0], beneath, seen_through, wide, corner, of_table)
     mesh = wr.Mesh(mesh.vertices @ turn.T, mesh.faces)
     cameras = [look(turn @ [x, 2, 2], turn @ [x, 2.1, 0]) for x in (1.7, 5.7, 8.7, 11.5)]
-    after = completion._without_gaps(find_patches(mesh), cameras)
+    after = completion._without_gaps(find_patches(mesh, (), SurfaceConfig()), cameras)
     eyes = np.array(
         [[1.2, 1.2, 0.3], [1.7, 1.7, 1], [5.7, 2, 1], [8.7, 2, 1], [11.6, 1, 1], [11.6, 3.5, 1], [1, 1, 1]]
     )

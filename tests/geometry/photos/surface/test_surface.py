@@ -8,13 +8,15 @@ from views import pinhole
 
 from warprrf.geometry import pipeline
 from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.gaussians.cells import occupancy
 from warprrf.geometry.photos.gaussians.initialise import discs
 from warprrf.geometry.photos.posed.images import PosedPhotos
 from warprrf.geometry.photos.surface.fusion import _sure, depth_maps, depth_views, fuse_depth, fuse_maps
-from warprrf.geometry.planes import Plane, detect_planes, plane_axes
+from warprrf.geometry.planes import Plane, PlaneConfig, detect_planes, plane_axes
 from warprrf.geometry.scans import SurfaceConfig, find_patches
 
+CONFIG = ReconstructionConfig()
 CAMERA = pinhole(64, 48, focal=50)
 WALL = 2.0 / CAMERA.directions()[..., 2]  # its range, at z = 2
 
@@ -39,7 +41,7 @@ def test_planes_are_found_in_noisy_points_with_outliers():
     points.append(rng.uniform(-2, 2, (800, 3)))
     stray = rng.standard_normal((800, 3))
     normals.append(stray / np.linalg.norm(stray, axis=1, keepdims=True))
-    found = detect_planes(np.concatenate(points), np.concatenate(normals))
+    found = detect_planes(np.concatenate(points), np.concatenate(normals), config=PlaneConfig())
     assert len(found) == len(truth)
     for k, (normal, offset) in enumerate(truth):
         match = max(found, key=lambda p: p.normal @ normal)
@@ -55,7 +57,7 @@ def test_the_two_sides_of_a_thin_wall_are_two_planes():
     front, back = grid_on([1, 0, 0], 0.005), grid_on([1, 0, 0], -0.005)
     points = np.concatenate([front, back])
     normals = np.repeat([[1.0, 0, 0], [-1.0, 0, 0]], [len(front), len(back)], axis=0)
-    found = detect_planes(points, normals)
+    found = detect_planes(points, normals, config=PlaneConfig())
     assert sorted(np.round(p.normal @ [1, 0, 0]) for p in found) == [-1, 1]
     for plane in found:
         assert plane.offset == pytest.approx(0.005, abs=1e-9)
@@ -65,11 +67,11 @@ def test_noise_around_a_plane_is_no_second_plane_but_a_poster_is():
     rng = np.random.default_rng(3)
     wall = np.concatenate([rng.uniform(-2, 2, (4000, 2)), 0.02 * rng.standard_normal((4000, 1))], axis=1)
     up = np.tile([0.0, 0, 1], (4000, 1))
-    assert len(detect_planes(wall, up)) == 1
+    assert len(detect_planes(wall, up, config=PlaneConfig())) == 1
     inside = (np.abs(wall[:, :2]) < 0.5).all(axis=1)
     poster = wall * [1, 1, 0.05]
     poster[inside, 2] += 0.08
-    offsets = sorted(p.offset for p in detect_planes(poster, up))
+    offsets = sorted(p.offset for p in detect_planes(poster, up, config=PlaneConfig()))
     assert offsets == pytest.approx([0, 0.08], abs=1e-3)
 
 
@@ -87,7 +89,7 @@ def test_rounding_and_a_point_more_or_less_decide_nothing():
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
 
     def planes(points, normals):
-        return np.array([[*p.normal, p.offset] for p in detect_planes(points, normals)])
+        return np.array([[*p.normal, p.offset] for p in detect_planes(points, normals, config=PlaneConfig())])
 
     usual, back, less = planes(points, normals), slice(None, None, -1), slice(1, None)
     assert len(usual) == 8
@@ -102,12 +104,12 @@ def test_a_plane_is_empty_where_one_sees_through_it():
     plane = Plane(np.array([0.0, 1, 0]), 0.0, np.flatnonzero(~window))
     eyes = np.tile([0.0, 3, 0], (int(window.sum()), 1))
     targets = frame[window] * [2, 1, 2] - [0, 3, 0]  # three metres behind, straight through the window
-    (found,) = occupancy([plane], frame, eyes, targets)
+    (found,) = occupancy([plane], frame, eyes, targets, config=PlaneConfig())
     assert not found.covers(np.array([[0.0, 0, 0], [0.2, 0, -0.2]])).any()
     assert found.covers(np.array([[0.8, 0, 0.8], [-0.7, 0, 0.0], [0.0, 0, 0.9]])).all()
     assert not found.covers(np.array([[1.8, 0, 0]])).any()
     # Nobody looks further than the plane: the hole is filled, as a bare patch of wall would be.
-    (closed,) = occupancy([plane], frame, eyes, frame[window])
+    (closed,) = occupancy([plane], frame, eyes, frame[window], config=PlaneConfig())
     assert closed.covers(np.array([[0.0, 0, 0]])).all()
     assert closed.area() > found.area() + 0.5
 
@@ -116,7 +118,7 @@ def test_faces_go_to_the_planes_that_are_given_and_others_to_planes_of_their_own
     vertices, faces = subdivide_to_size(*box_mesh([0, 0, 0], [4, 3, 2.5], inward=True), 0.2)
     mesh = Mesh(vertices + 0.004 * np.random.default_rng(0).standard_normal(vertices.shape), faces)
     planes = [Plane(np.eye(3)[a], 0.0, np.zeros(0, dtype=int)) for a in (2, 0)]
-    patches = find_patches(mesh, planes)
+    patches = find_patches(mesh, planes, SurfaceConfig())
     np.testing.assert_array_equal(patches.normal[:2], [[0, 0, 1], [1, 0, 0]])
     assert patches.area[:2] == pytest.approx([12, 7.5], rel=0.05)
     rest = np.argsort(-patches.area[2:]) + 2  # ceiling, two long walls and a short one
@@ -131,7 +133,7 @@ def test_faces_of_a_given_plane_do_not_go_to_one_that_is_found_near_it():
     step = floor[0] * [0.5, 0.5, 1] + [1, 1, 0.05], floor[1] + len(floor[0])
     mesh = Mesh(np.concatenate([floor[0], step[0]]), np.concatenate([floor[1], step[1]]))
     given = Plane(np.array([0.0, 0, 1]), -0.015, np.zeros(0, dtype=int))
-    patches = find_patches(mesh, [given])
+    patches = find_patches(mesh, [given], SurfaceConfig())
     assert patches.area == pytest.approx([12, 3])
     assert patches.offset == pytest.approx([-0.015, 0.05])
 
@@ -168,7 +170,7 @@ def test_small_planes_are_parallel_to_larger_ones_that_they_are_nearly_parallel_
         vertices = np.concatenate([v for v, _, _ in boards])
         faces = np.concatenate([f + first for (_, f, _), first in zip(boards, start, strict=False)])
         given = [plane for _, _, plane in boards]
-        return given, find_patches(Mesh(vertices, faces), given)
+        return given, find_patches(Mesh(vertices, faces), given, SurfaceConfig())
 
     small, long = built([0.0, 5, 1], (1, 1), 1.5), built([0.0, 12, 2], (9, 0.5), 1.5)
     given, patches = turned(built([0.0, 0, 0], (4, 4), 0.0), small, built([0.0, 8, 3], (1, 1), 4.0), long)
@@ -204,7 +206,9 @@ def test_depth_maps_of_gaussians_end_where_neither_photos_nor_planes_hold_them()
     photos = PosedPhotos([np.full((48, 64, 3), 0.5, np.float32)], [CAMERA])  # one photo proves nothing
     plane = Plane(np.array([0, 0, -1.0]), -2.0, np.zeros(0, np.int64), occupied=np.ones((80, 80), bool),
                   corner=np.array([-4.0, -4.0]))  # fmt: skip
-    kept, none = (depth_maps(wall, [CAMERA], photos=photos, planes=p)[0] for p in ([plane], []))
+    kept, none = (
+        depth_maps(wall, [CAMERA], photos=photos, planes=p, config=CONFIG)[0] for p in ([plane], [])
+    )
     assert (kept > 0).mean() > 0.9 and np.abs(kept / WALL - 1)[kept > 0].max() < 0.02
     assert (none == 0).all()
 
@@ -213,12 +217,12 @@ def test_a_depth_map_with_few_known_pixels_does_not_end_the_fusion():
     few = np.zeros_like(WALL)
     few[9:12, 9:12] = WALL[9:12, 9:12]
     few[8, 8] = 100.0  # beyond the largest range
-    mesh = fuse_depth([WALL, few, WALL], [CAMERA] * 3)
+    mesh = fuse_depth([WALL, few, WALL], [CAMERA] * 3, config=SurfaceConfig())
     assert np.abs(mesh.vertices[:, 2] - 2).max() < 0.01
 
 
 def test_holes_that_stay_open_are_said_to():
-    patches, whole = fuse_maps([CAMERA] * 2, [WALL] * 2)
+    patches, whole = fuse_maps([CAMERA] * 2, [WALL] * 2, config=CONFIG)
     assert len(patches.mesh.faces) and not whole  # one plane is no room
     said = pipeline._said_of_surface(0.1, 0.0, True)
     assert [text.split(":")[0] for text in said] == ["surface", "holes"]

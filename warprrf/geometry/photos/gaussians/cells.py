@@ -25,7 +25,7 @@ def occupancy(
     eyes: np.ndarray,
     targets: np.ndarray,
     *,
-    config: PlaneConfig | None = None,
+    config: PlaneConfig,
 ) -> list[Plane]:
     """``planes`` with the cells where a surface may be.
 
@@ -36,15 +36,12 @@ def occupancy(
         points: the points that the planes' ``inliers`` index, shape ``(P, 3)`` [m].
         eyes, targets: lines of sight, from a camera to a point it sees, shape ``(L, 3)`` each [m].
     """
-    config = config or PlaneConfig()
     result = []
     for plane in planes:
         uv = plane.to_plane(points[plane.inliers])
         rim = config.margin_m + config.cell_m
-        corner = uv.min(axis=0) - rim
-        shape = np.ceil((uv.max(axis=0) + rim - corner) / config.cell_m).astype(int)
-        grid = replace(plane, corner=corner, cell_m=config.cell_m, occupied=np.ones(shape, dtype=bool))
-        inside = _in_hull(grid.to_plane(grid.cells()), uv, config.margin_m).reshape(shape)
+        grid = replace(plane, cell_m=config.cell_m).spanning(uv.min(axis=0) - rim, uv.max(axis=0) + rim)
+        inside = _in_hull(grid.to_plane(grid.cells()), uv, config.margin_m).reshape(grid.occupied.shape)
         supported = grid.count(points[plane.inliers]) > 0
         lines = grid.seen_through(eyes, targets, BEHIND_M)
         empty = dilate(lines > 0, 2) & ~dilate(supported, 1)
@@ -91,8 +88,8 @@ def _in_hull(queries: np.ndarray, points: np.ndarray, margin: float) -> np.ndarr
     try:
         sides = ConvexHull(points).equations
     except (QhullError, ValueError):  # points on one line
-        return np.asarray(cKDTree(points).query(queries)[0] <= margin)
-    return np.asarray((queries @ sides[:, :2].T + sides[:, 2] <= margin).all(axis=1))
+        return cKDTree(points).query(queries)[0] <= margin
+    return (queries @ sides[:, :2].T + sides[:, 2] <= margin).all(axis=1)
 
 
 def quarters(plane: Plane) -> np.ndarray:

@@ -20,9 +20,7 @@ from warprrf.device import DeviceLike
 from warprrf.geometry.photos.config import RefineConfig
 from warprrf.geometry.photos.gaussians.initialise import SPREAD, discs
 from warprrf.geometry.photos.posed.images import PosedPhotos, block_means
-from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians, rotations_of
-from warprrf.geometry.splats.rasterizer import Blending
 from warprrf.geometry.splats.render import render
 
 Arrays = dict[str, np.ndarray]
@@ -103,22 +101,21 @@ def filled(gaussians: Gaussians, photos: PosedPhotos, *, device: DeviceLike = No
     Args:
         photos: each is looked at once, in order; masked pixels ask for nothing.
     """
-    for k, (image, camera) in enumerate(zip(photos.images, photos.cameras, strict=True)):
-        found = _missing(gaussians, image, photos.masks[k], camera, device)
+    for k in range(len(photos.images)):
+        found = _missing(gaussians, photos, k, device)
         if found is not None:
             gaussians = _joined(gaussians, found)
     return gaussians
 
 
-def _missing(
-    gaussians: Gaussians, image: np.ndarray, mask: np.ndarray | None, camera: Camera, device: DeviceLike
-) -> Gaussians | None:
+def _missing(gaussians: Gaussians, photos: PosedPhotos, number: int, device: DeviceLike) -> Gaussians | None:
     """Discs for the holes of one photo; None if there are none, or nothing around them is known."""
+    image, camera = photos.images[number], photos.cameras[number]
     # 60_000: of a rendering in which holes are looked for, about
     share = min(1.0, (60_000 / (camera.width * camera.height)) ** 0.5)
     rows, columns = (max(1, round(share * n / BLOCK)) for n in (camera.height, camera.width))
     small = camera.resized(columns * BLOCK, rows * BLOCK)
-    seen = render(gaussians, small, device=device, blending=Blending())
+    seen = render(gaussians, small, device=device)
     alpha = block_means(seen.alpha, BLOCK, np.float64)
     nearness = block_means(seen.alpha / np.maximum(seen.depth, 1e-6), BLOCK, np.float64)  # 1 / m
     nearness /= np.maximum(alpha, 1e-6)
@@ -127,9 +124,7 @@ def _missing(
     if not known.any():
         return None
     shown = np.stack([_shrunk(image[..., c], known.shape) for c in range(3)], axis=-1)
-    hole = ~known
-    if mask is not None:
-        hole &= _shrunk(np.asarray(mask, dtype=np.float32), known.shape) == 0
+    hole = ~known & (_shrunk(photos.mask(number).astype(np.float32), known.shape) == 0)
     if not hole.any():
         return None
     depth = 1 / _continued(nearness, known)[hole]

@@ -16,6 +16,7 @@ import numpy as np
 from scipy import ndimage
 
 from warprrf.geometry.splats.camera import Camera
+from warprrf.rows import Rows
 
 BLUR_PX = 1.5  # photos are smoothed by so much before they are differentiated
 EDGE = 0.009  # an edge changes some colour by this part of white per pixel,
@@ -42,13 +43,6 @@ class Edgels:
     position: np.ndarray
     across: np.ndarray
     strength: np.ndarray
-
-    @property
-    def pixel(self) -> tuple[np.ndarray, np.ndarray]:
-        """Row and column of each."""
-        height, width = self.strength.shape
-        x, y = self.position.astype(int).T
-        return np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)
 
 
 @dataclass(frozen=True)
@@ -92,12 +86,10 @@ class Line:
 
 def find_edgels(image: np.ndarray) -> Edgels:
     """Edge pixels of a photo ``(H, W, 3)`` in [0, 1], to a fraction of a pixel (the scheme of Canny, 1986)."""
-    change = [
-        np.stack([ndimage.gaussian_filter(c, BLUR_PX, order=order) for c in np.moveaxis(image, 2, 0)])
-        for order in ((0, 1), (1, 0))
-    ]
-    main = (change[0] ** 2 + change[1] ** 2).argmax(axis=0)[None]
-    dx, dy = (np.take_along_axis(c, main, axis=0)[0].astype(np.float64) for c in change)
+    blur = [BLUR_PX, BLUR_PX, 0]
+    change = [ndimage.gaussian_filter(image, blur, order=order) for order in ((0, 1, 0), (1, 0, 0))]
+    main = (change[0] ** 2 + change[1] ** 2).argmax(axis=2)[..., None]
+    dx, dy = (np.take_along_axis(c, main, axis=2)[..., 0].astype(np.float64) for c in change)
     strength = np.hypot(dx, dy)
     inside = np.zeros(strength.shape, dtype=bool)
     inside[2:-2, 2:-2] = True
@@ -116,8 +108,8 @@ def find_edgels(image: np.ndarray) -> Edgels:
 
 
 @dataclass(frozen=True)
-class Segments:
-    """Segments of photos along one direction.
+class Segments(Rows):
+    """N segments of photos along one direction.
 
     Attributes:
         camera: which camera shows it, shape ``(N,)``.
@@ -127,7 +119,7 @@ class Segments:
         towards: unit vector of the bearing, shape ``(N, 2)``.
         pixel: radians of bearing that a pixel is worth, shape ``(N,)``.
         length: [pixels], shape ``(N,)``.
-        sides: colours on the side of smaller and of larger bearing, shape ``(2, 3, N)``.
+        sides: colours on the side of smaller and of larger bearing, shape ``(N, 2, 3)``.
     """
 
     camera: np.ndarray
@@ -142,8 +134,7 @@ class Segments:
 
     def alike(self, k: int) -> np.ndarray:
         """Which have the colour of segment ``k`` on one side at least (an occluding edge keeps only one)."""
-        gap = np.abs(self.sides - self.sides[..., k : k + 1]).max(axis=1).min(axis=0)
-        return np.asarray(gap < ALIKE)
+        return np.abs(self.sides - self.sides[k]).max(axis=2).min(axis=1) < ALIKE
 
 
 def find_segments(
@@ -208,7 +199,7 @@ def lines_through(
 def _colour(image: np.ndarray, positions: np.ndarray) -> np.ndarray:
     x, y = positions.astype(int).T
     taken = image[np.clip(y, 0, image.shape[0] - 1), np.clip(x, 0, image.shape[1] - 1)]
-    return np.asarray(np.median(taken, axis=0))
+    return np.median(taken, axis=0)
 
 
 def find_lines(
@@ -225,10 +216,8 @@ def find_lines(
         ]
         if rows:
             camera, bearing, rise, pixel, length, sides = map(np.array, zip(*rows, strict=True))
-            eye = positions[camera]
+            eye, towards = positions[camera], np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
             place = eye[:, [(axis + 1) % 3, (axis + 2) % 3]], eye[:, axis]
-            towards = np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
-            sides = np.moveaxis(sides, 0, 2).copy()
             lines += _placed(Segments(camera, bearing, rise, pixel, length, sides, *place, towards), axis)
     return lines
 
@@ -247,10 +236,11 @@ def _placed(segments: Segments, axis: int) -> list[Line]:
         distance = guesses[k][1]
         alike = np.flatnonzero(free & segments.alike(k))
         place = segments.across[k] + distance * segments.towards[k]
-        place, chosen = _fitted(segments, alike, place, segments.along[k] + distance * segments.rise[k])
-        line = _extent(segments, place, chosen, axis)
-        if line is not None and len(line.views) >= LINE_VIEWS:
-            free[chosen] = False
+        ends = segments.along[k] + distance * segments.rise[k]
+        place, chosen = _fitted(segments.take(alike), place, ends)
+        line = _extent(segments.take(alike[chosen]), place, axis)
+        if line is not None:
+            free[alike[chosen]] = False
             lines.append(line)
     return lines
 
@@ -281,42 +271,40 @@ def _met(segments: Segments, k: int) -> tuple[float, float]:
     return float(total[best]), float(stop[order][best : best + 2].mean())
 
 
-def _fitted(
-    segments: Segments, alike: np.ndarray, place: np.ndarray, ends: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Place in the cross-section that those of the segments ``alike`` near a first guess fix, and which segments those are."""
+def _fitted(segments: Segments, place: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Place in the cross-section that those of the segments near a first guess fix, and which these are, shape ``(N,)``."""
     low, high = ends
-    across, along, towards = (of[alike] for of in (segments.across, segments.along, segments.towards))
-    rise, pixel, length = (of[alike] for of in (segments.rise, segments.pixel, segments.length))
+    towards, pixel = segments.towards, segments.pixel
     for step in range(REFITS):
-        reach = place - across
+        reach = place - segments.across
         distance = np.hypot(reach[:, 0], reach[:, 1])
         miss = reach[:, 0] * towards[:, 1] - reach[:, 1] * towards[:, 0]
         near = (2 if step > 1 else 3) * pixel * distance + POSE_M
-        ends = along[:, None] + rise * distance[:, None]
+        ends = segments.along[:, None] + segments.rise * distance[:, None]
         chosen = ((reach * towards).sum(axis=1) > 0.1) & (np.abs(miss) < near)
         chosen &= np.minimum(ends[:, 1], high) - np.maximum(ends[:, 0], low) > -0.3
         if chosen.sum() < 2:
             break
         normal = np.stack([towards[chosen, 1], -towards[chosen, 0]], axis=1)
-        sure = np.minimum(length, 100) / ((pixel * distance) ** 2 + 1e-4)
+        sure = np.minimum(segments.length, 100) / ((pixel * distance) ** 2 + 1e-4)
         w = (sure / (1 + (2 * miss / near) ** 2))[chosen, None] * normal
-        place = np.linalg.lstsq(w.T @ normal, w.T @ (normal * across[chosen]).sum(axis=1), rcond=1e-9)[0]
+        at = (normal * segments.across[chosen]).sum(axis=1)
+        place = np.linalg.lstsq(w.T @ normal, w.T @ at, rcond=1e-9)[0]
         low, high = np.percentile(ends[chosen, 0], 2), np.percentile(ends[chosen, 1], 98)
-    return place, alike[chosen]
+    return place, chosen
 
 
-def _extent(segments: Segments, place: np.ndarray, picked: np.ndarray, axis: int) -> Line | None:
-    """The line at ``place``, from where to where two photos at least show it."""
-    if not len(picked):
+def _extent(segments: Segments, place: np.ndarray, axis: int) -> Line | None:
+    """The line at ``place``, from where to where two photos at least show it; None where too few show any of it."""
+    views = np.unique(segments.camera)
+    if len(views) < LINE_VIEWS:
         return None
-    distance = np.linalg.norm(place - segments.across[picked], axis=1)
-    ends = segments.along[picked, None] + segments.rise[picked] * distance[:, None]
+    distance = np.linalg.norm(place - segments.across, axis=1)
+    ends = segments.along[:, None] + segments.rise * distance[:, None]
     bins = np.arange(ends.min(), ends.max() + 0.05, 0.05)
-    views = np.unique(segments.camera[picked])
     shown = np.zeros(len(bins), dtype=int)
     for view in views:
-        own = ends[segments.camera[picked] == view]
+        own = ends[segments.camera == view]
         shown += ((bins >= own[:, :1]) & (bins <= own[:, 1:])).any(axis=0)
     twice = bins[shown >= 2]
     if not len(twice):

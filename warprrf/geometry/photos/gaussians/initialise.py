@@ -20,7 +20,7 @@ from warprrf.geometry.photos.gaussians.cells import meeting, occupancy, plane_me
 from warprrf.geometry.photos.gaussians.plain import plain_surfaces, with_plain
 from warprrf.geometry.photos.gaussians.sweep import choose_views, joined, level_planes, proven_cells, united
 from warprrf.geometry.photos.posed.images import GreyPhotos, PosedPhotos
-from warprrf.geometry.photos.posed.sparse import SparseModel, clean_points, detect_room_planes
+from warprrf.geometry.photos.posed.sparse import SparseModel, cleaned, detect_room_planes
 from warprrf.geometry.planes import Plane, aligned, directions, plane_axes
 from warprrf.geometry.splats.gaussians import Y00, Gaussians, quaternions_of
 from warprrf.rows import distinct_rows, sums_of
@@ -125,10 +125,8 @@ def _median_colors(points: np.ndarray, views: np.ndarray, photos: PosedPhotos) -
         rows, slots = np.nonzero(views == c)
         if len(rows):
             at = camera.project(points[rows])[0].T[::-1] - 0.5
-            for channel in range(3):
-                taken[rows, slots, channel] = ndimage.map_coordinates(
-                    image[..., channel], at, order=1, mode="nearest"
-                )
+            colours = [ndimage.map_coordinates(image[..., c], at, order=1, mode="nearest") for c in range(3)]
+            taken[rows, slots] = np.transpose(colours)
     return np.nan_to_num(np.nanmedian(taken, axis=1), nan=0.5)
 
 
@@ -152,10 +150,7 @@ def initialise(
         raise ValueError(
             f"photos: only {len(sparse.points)} points were reconstructed; more overlap is needed"
         )
-    keep = clean_points(sparse, worst_px=1.0)
-    if keep.sum() < 3:  # a handful of photos: few points are seen three times
-        keep[:] = True
-    sparse = sparse.subset(keep)
+    sparse = cleaned(sparse, worst_px=1.0)
     points, lines = sparse.points, sparse.lines_of_sight()
     planes, normals = detect_room_planes(sparse, config.planes, seed)
     level = sparse.metric and sparse.upright

@@ -73,7 +73,7 @@ class Pane:
         share = np.where(crossing, before / np.where(crossing, before - behind, 1.0), 0.0)[:, None]
         at = eyes + share * (targets - eyes)
         across = np.arange(3) != self.axis
-        return np.asarray(crossing & ((at >= self.low) & (at <= self.high))[:, across].all(axis=1))
+        return crossing & ((at >= self.low) & (at <= self.high))[:, across].all(axis=1)
 
 
 def plain_surfaces(
@@ -120,7 +120,7 @@ def plain_surfaces(
 
 def _plain(edgels: Edgels) -> np.ndarray:
     """The pixels of a photo near which nothing changes, shape ``(H, W)`` bool."""
-    return np.asarray(ndimage.maximum_filter(edgels.strength, PLAIN_PX) < FLAT)
+    return ndimage.maximum_filter(edgels.strength, PLAIN_PX) < FLAT
 
 
 def _heights(lines: Sequence[Line]) -> list[Height]:
@@ -160,7 +160,7 @@ def _mirrors(lines: list[Line], cameras: Sequence[Camera]) -> tuple[list[Pane], 
             shown = [x for x, only in zip(parts, through, strict=True) if only]
             total = sum(x.weight for x in shown)
             twins = sum(x.weight for x in shown if _has_twin(pane, x, parts))
-            behind = sum(x.weight for x in parts if _is_behind(pane, x))
+            behind = sum(x.weight for x in parts if side * (x.ends.mean(axis=0)[axis] - height) < -0.1)
             # A mirror bounds the room: what lies behind it is seen through it alone.
             if total > max(mirror_m, 0.8 * behind) and twins > mirror_share * total:
                 panes.append(pane)
@@ -175,11 +175,6 @@ def _parted(pane: Pane, line: Line) -> list[Line]:
     return [replace(line, high=pane.height), replace(line, low=pane.height)]
 
 
-def _is_behind(pane: Pane, line: Line) -> bool:
-    """Whether a line lies behind the plane of a pane, by its middle."""
-    return bool(pane.side * (line.ends.mean(axis=0)[pane.axis] - pane.height) < -0.1)
-
-
 def _only_through(pane: Pane, lines: Sequence[Line], positions: np.ndarray) -> np.ndarray:
     """Of which lines nearly all is seen through the pane alone, shape ``(L,)`` bool."""
     points = np.array([line.points(np.linspace(line.low, line.high, 7)[1:-1]) for line in lines])
@@ -188,7 +183,7 @@ def _only_through(pane: Pane, lines: Sequence[Line], positions: np.ndarray) -> n
     targets = np.repeat(points, views, axis=0)
     crossing = pane.between(np.repeat(eyes, points.shape[1], axis=0), targets.reshape(-1, 3))
     share = np.bincount(np.repeat(np.arange(len(lines)), views), crossing.reshape(len(eyes), -1).mean(axis=1))
-    return np.asarray(share > 0.8 * np.array(views))
+    return share > 0.8 * np.array(views)
 
 
 def _has_twin(pane: Pane, line: Line, lines: Sequence[Line]) -> bool:
@@ -227,7 +222,7 @@ def _regions_on(
     size[0] = 0
     region_px, votes_px = 150, 25.0  # fewest pixels of a plain region, and of its border on a plane
     region = np.where(size[region] >= region_px, region, 0)
-    votes, weight = _votes(heights, lines, camera, edgels, of_line, region)
+    votes = _votes(heights, lines, camera, edgels, of_line, region)
     some = slice(STRIDE // 2, None, STRIDE)
     region, rays = region[some, some], camera.directions()[some, some]
     plane, ranges = np.full(region.shape, -1), np.zeros(region.shape)
@@ -238,7 +233,7 @@ def _regions_on(
         rivals = []
         # 0.8: of the planes with at least this share of the most votes, the nearest has the region
         for number in np.flatnonzero(votes[k] >= 0.8 * votes[k].max()).tolist():
-            axis, height, *_ = heights[number]
+            axis, height, weight, _ = heights[number]
             with np.errstate(divide="ignore", invalid="ignore"):
                 t = (height - camera.position[axis]) / rays[own][:, axis]
             good = (t > 0.1) & (t < FARTHEST_M)
@@ -247,7 +242,8 @@ def _regions_on(
             for pane in panes:
                 good &= ~pane.between(eyes, hits)
             if good.mean() > 0.98:
-                rivals.append((float(np.median(t[good])), weight[k, number], number, np.where(good, t, 0.0)))
+                score = votes[k, number] * weight
+                rivals.append((float(np.median(t[good])), score, number, np.where(good, t, 0.0)))
         if rivals:
             nearest = min(rivals, key=lambda r: r[0])[0]
             best = max((r for r in rivals if r[0] < nearest + BEHIND_M), key=lambda r: r[1])
@@ -260,11 +256,11 @@ def _shown(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The line that each edgel lies on (-1: none), and the pixels that part regions: lines, where enough of them shows
     in whole, else their shown parts with gaps bridged."""
-    height, width = edgels.strength.shape
-    place = np.full((height, width), -1)
-    place[edgels.pixel] = np.arange(len(edgels.position))
+    place = np.full(edgels.strength.shape, -1)
+    x, y = edgels.position.astype(int).T
+    place[y, x] = np.arange(len(edgels.position))
     off, (row, column) = ndimage.distance_transform_edt(place < 0, return_indices=True)
-    of_line, barrier = np.full(len(edgels.position), -1), np.zeros((height, width), dtype=bool)
+    of_line, barrier = np.full(len(edgels.position), -1), np.zeros(place.shape, dtype=bool)
     points, number = traced
     inside, pixels = camera.in_frame(points, 0.1)
     steps = np.c_[number[inside], pixels[inside]]
@@ -300,38 +296,31 @@ def _votes(
     edgels: Edgels,
     of_line: np.ndarray,
     region: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """For each region and plane: edgels of the border on the plane less those behind it, shape ``(regions, planes)``,
-    and the same by the weight of the lines."""
+) -> np.ndarray:
+    """For each region and plane: edgels of the border on the plane less those behind it, shape ``(regions, planes)``."""
     on = np.flatnonzero(of_line >= 0)
-    regions, borders = [], []
-    for side in (1, -1):
-        found = np.zeros(len(on), dtype=int)
+    beside = np.zeros((2, len(on)), dtype=int)  # on either side of an edgel
+    for found, side in zip(beside, (1, -1), strict=True):
         for step in range(3, 12):  # pixels: where the smoothing and the square of a plain pixel end
             x, y = (edgels.position[on] + side * step * edgels.across[on]).astype(int).T
             ok = (found == 0) & (x >= 0) & (y >= 0) & (y < region.shape[0]) & (x < region.shape[1])
             found[ok] = region[y[ok], x[ok]]
-        regions.append(found[found > 0])
-        borders.append(on[found > 0])
-    beside, edgel = np.concatenate(regions), np.concatenate(borders)
-    votes, weight = (np.zeros((region.max() + 1, len(heights))) for _ in range(2))
-    if not len(edgel):
-        return votes, weight
+    edgel, beside = np.tile(on, 2)[beside.ravel() > 0], beside[beside > 0]
+    votes = np.zeros((region.max() + 1, len(heights)))
     places = np.array([[line.height(a) if a != line.axis else np.nan for a in range(3)] for line in lines])
     place, axis = places[of_line[edgel]], np.array([line.axis for line in lines])[of_line[edgel]]
     rays = lines_through(camera, edgels.position[edgel], 0)[0]
     across = np.arange(3) != axis[:, None]
     line_at = np.linalg.norm(np.where(across, place - camera.position, 0.0), axis=1)
     line_at /= np.maximum(np.linalg.norm(np.where(across, rays, 0.0), axis=1), 1e-9)
-    for number, (a, height, worth, _) in enumerate(heights):
+    for number, (a, height, *_) in enumerate(heights):
         with np.errstate(divide="ignore", invalid="ignore"):
             lies_on = np.abs(place[:, a] - height) < SAME_M
             plane_at = (height - camera.position[a]) / rays[:, a]
             behind = ~lies_on & (plane_at > 0) & (line_at > 1.03 * plane_at + 0.1)
         score = lies_on.astype(float) - behind
         votes[:, number] = np.bincount(beside, score, len(votes))
-        weight[:, number] = votes[:, number] * worth
-    return votes, weight
+    return votes
 
 
 def _agreed(
@@ -362,9 +351,7 @@ def _agreed(
     high = np.minimum(uv.max(axis=0), edges.max(axis=0) + CELL_M)
     if (low >= high).any():
         return []
-    low = np.floor(low / CELL_M - 1) * CELL_M
-    shape = np.ceil((high - low) / CELL_M).astype(int) + 1
-    plane = replace(empty, corner=low, occupied=np.ones(shape, dtype=bool))
+    plane = empty.spanning(np.floor(low / CELL_M - 1) * CELL_M, high + CELL_M)
     cells = plane.cells()
     yes, no = (np.zeros(len(cells), dtype=int) for _ in range(2))
     for camera, view in photos:
@@ -378,19 +365,16 @@ def _agreed(
         no[own] += ~here & (view.range_m[y, x] > away + BEHIND_M)
     # fewest photos that put a cell on its plane, and fewest cells of a piece of one: 0.1 square metres
     agreeing, piece_cells = 2, 10
-    occupied = pieces(((yes >= agreeing) & (yes > no)).reshape(shape), piece_cells)
+    occupied = pieces(((yes >= agreeing) & (yes > no)).reshape(plane.occupied.shape), piece_cells)
     return [replace(plane, occupied=occupied)] if occupied.any() else []
 
 
 def _in_world(plane: Plane, axes: np.ndarray) -> Plane:
     """A plane of the room's frame in the world's, on a grid of its own."""
-    normal = plane.normal @ axes
-    result = replace(plane, normal=normal, occupied=np.zeros((0, 0), dtype=bool))
     points = quarters(plane).reshape(-1, 3) @ axes
-    uv = result.to_plane(points)
-    corner = np.floor(uv.min(axis=0) / plane.cell_m) * plane.cell_m
-    shape = np.ceil((uv.max(axis=0) - corner) / plane.cell_m).astype(int) + 1
-    grid = replace(result, corner=corner, occupied=np.ones(shape, dtype=bool))
+    turned = replace(plane, normal=plane.normal @ axes)
+    uv = turned.to_plane(points)
+    grid = turned.spanning(np.floor(uv.min(axis=0) / CELL_M) * CELL_M, uv.max(axis=0) + CELL_M)
     return replace(grid, occupied=grid.count(points) >= 2)
 
 

@@ -33,7 +33,7 @@ from warprrf.geometry.photos.posed.images import PosedPhotos
 from warprrf.geometry.planes import Plane
 from warprrf.geometry.splats.gaussians import Gaussians, quaternions_of, rotations_of
 from warprrf.geometry.splats.photo_loss import PhotoLoss
-from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
+from warprrf.geometry.splats.rasterizer import Rasterizer
 from warprrf.kernels import adam as optimize
 from warprrf.kernels.raster.sh import COEFFICIENTS
 
@@ -53,7 +53,7 @@ def refine(
     gaussians: Gaussians,
     photos: PosedPhotos,
     *,
-    config: RefineConfig | None = None,
+    config: RefineConfig,
     planes: Sequence[Plane] = (),
     progress: Progress | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
@@ -65,7 +65,6 @@ def refine(
         planes: detected planes; Gaussians on them are kept flat.
         checkpoint: file to continue from if it exists and to keep up to date; of the same arguments.
     """
-    config = config or RefineConfig()
     run = _Refinement(photos, config, planes, resolve(device))
     if checkpoint is not None and Path(checkpoint).exists():
         run.restore(Path(checkpoint))
@@ -92,9 +91,9 @@ class _Refinement:
         # 0.2: weight of 1 - SSIM; L1 has the rest
         self.loss = PhotoLoss(device, 0.2)
         self.targets = Targets(photos, self.loss)
-        self.exposures = Exposures(len(self.targets), config.fit_exposure)
+        self.exposures = Exposures(len(self.targets))
         self.iteration = 0
-        self.raster = Rasterizer(device=self.device, blending=Blending())
+        self.raster = Rasterizer(device=device)
         table = np.array([[*p.normal, p.offset] for p in self.planes], dtype=np.float32).reshape(-1, 4)
         self.plane_table = wp.array(table, dtype=wp.vec4, device=self.device)
 
@@ -201,7 +200,8 @@ class _Refinement:
         self.exposures.show(image.features, target, self.loss.canvas(shape))
         score, slope = self.loss(target.pixels, target.moments, shape)
         self.exposures.adjoint(image.features, target, slope)
-        self.exposures.fit(image.features, target, self.iteration // len(self.targets))
+        if self.config.fit_exposure:
+            self.exposures.fit(image.features, target, self.iteration // len(self.targets))
         weight = adjoint()
         self.raster.colors_adjoint(self.means, self.sh, origin, colors)
         scales, opacities = self.scales, self.opacities
@@ -209,10 +209,8 @@ class _Refinement:
         launch(optimize.activate_adjoint, n, [scales, opacities, *slopes], device=device)
         scales.grad.zero_()
         opacities.grad.zero_()
-        statistics = [state[name] for name in ("pull", "hits", "seen")]
-        position = wp.vec3(camera.position)
-        gathered = [position, self.means, self.means.grad, weight, *statistics]
-        launch(optimize.accumulate, n, gathered, device=device)
+        seen = [wp.vec3(camera.position), self.means, self.means.grad, weight]
+        launch(optimize.accumulate, n, [*seen, *(state[name] for name in STATISTICS)], device=device)
         return score
 
     def move(self) -> None:
@@ -227,9 +225,16 @@ class _Refinement:
         }  # fmt: skip
         adam = optimize.build_adam(wp.float32)
         for name, width in self.widths.items():
-            rate = wp.array(rates[name], dtype=float, device=self.device)
             moments = [self.state[f"first.{name}"], self.state[f"second.{name}"]]
-            inputs = [width, rate, *optimize.corrections(t), None, None, self.gradients[name], *moments]
+            inputs = [
+                width,
+                np.array(rates[name]),
+                *optimize.corrections(t),
+                None,
+                None,
+                self.gradients[name],
+                *moments,
+            ]
             launch(adam, self.count, [*inputs, self.state[name]], device=self.device)
         plane_strength = 0.1  # share of the deviation from its plane removed after every step
         strength = plane_strength if t < c.iterations else 1.0  # in the end exactly flat

@@ -18,7 +18,7 @@ from warprrf.device import launch
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.gaussians.cells import contested, pieces, plane_mesh, visible_from
 from warprrf.geometry.photos.posed.images import GreyPhotos, projections
-from warprrf.geometry.planes import AROUND, Plane, dilate, plane_axes
+from warprrf.geometry.planes import AROUND, Plane, dilate
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.photo_consistency import SIDE, patch_agreement
 from warprrf.rows import distinct_rows
@@ -162,14 +162,12 @@ def level_planes(
     levels = np.arange(bottom - 0.06, top + 0.06, step_m)
     if len(levels) < 3:
         return []
-    normal = np.array([0.0, 0.0, 1.0 if up else -1.0])
-    shape = np.ceil(np.abs(plane_axes(normal)[:, :2] @ (high - low)[:2]) / cell_m).astype(int) + 1
-    corner = np.minimum(plane_axes(normal)[:, :2] @ low[:2], plane_axes(normal)[:, :2] @ high[:2])
-    everywhere = np.ones(shape, dtype=bool)
-    whole = Plane(normal, 0.0, rms_m=FINE_M, corner=corner, cell_m=cell_m, occupied=everywhere)
+    level = Plane(np.array([0.0, 0.0, 1.0 if up else -1.0]), 0.0, rms_m=FINE_M, cell_m=cell_m)
+    ends = level.to_plane(np.array([low, high]))
+    whole = level.spanning(ends.min(axis=0), ends.max(axis=0) + cell_m)
     surface = plane_mesh(planes)
-    agreement = _swept(whole, levels, surface, photos)
-    peak = _peaks(agreement, AGREES) & ~_known(whole, levels, planes)
+    agreement, known = _swept(whole, levels, surface, photos, planes)
+    peak = _peaks(agreement) & ~known
     found: list[Plane] = []
     min_cells = 15  # of a plane found by the sweep
     while True:
@@ -183,22 +181,26 @@ def level_planes(
         mask |= dilate(mask, 1) & (agreement[band].max(axis=0) > 0.8 * AGREES)
         label, count = ndimage.label(pieces(mask, min_cells))
         for number in range(1, count + 1):  # every connected piece has a height of its own
-            piece = replace(whole, offset=float(levels[k] * normal[2]), occupied=label == number)
-            level = _settled(piece, surface, photos)
-            if level is not None:
-                crossed = (level.seen_through(*lines, 0.05) > 0) & level.occupied
-                if crossed.sum() < 0.2 * level.occupied.sum():
-                    found.append(level)
+            piece = replace(whole, offset=float(levels[k] * whole.normal[2]), occupied=label == number)
+            settled = _settled(piece, surface, photos)
+            if settled is not None:
+                crossed = (settled.seen_through(*lines, 0.05) > 0) & settled.occupied
+                if crossed.sum() < 0.2 * settled.occupied.sum():
+                    found.append(settled)
 
 
-def _swept(whole: Plane, levels: np.ndarray, surface: Mesh | None, photos: GreyPhotos) -> np.ndarray:
-    """Agreement of the photos at every level and cell, shape ``(levels, A, B)``; -1 where nothing is proved.
+def _swept(
+    whole: Plane, levels: np.ndarray, surface: Mesh | None, photos: GreyPhotos, planes: Sequence[Plane]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Agreement of the photos at every level and cell, -1 where nothing is proved, and whether one of ``planes`` is there;
+    shape ``(levels, A, B)`` each.
 
     Photos are chosen once for blocks of 3 x 3 cells and 3 levels.
     """
     middle, group = _blocks(whole, 3)
-    cells = whole.cells()
+    cells, alike = whole.cells(), [plane for plane in planes if plane.normal @ whole.normal > 0.99]
     agreement = np.full((len(levels), len(cells)), -1.0, dtype=np.float32)
+    known = np.zeros(agreement.shape, dtype=bool)
     for k, z in enumerate(levels):
         if k % 3 == 0:
             middle[:, 2] = levels[min(k + 1, len(levels) - 1)]
@@ -207,29 +209,20 @@ def _swept(whole: Plane, levels: np.ndarray, surface: Mesh | None, photos: GreyP
         cells[:, 2] = z
         value, contrast = agreement_of(photos, cells[some], whole.axes, views[some])
         agreement[k, some] = np.where(contrast > CONTRAST, value, -1.0)
-    return agreement.reshape(len(levels), *whole.occupied.shape)
+        for plane in alike:
+            known[k] |= plane.holds(cells, 0.05)
+    shape = len(levels), *whole.occupied.shape
+    return agreement.reshape(shape), known.reshape(shape)
 
 
-def _peaks(agreement: np.ndarray, least: float) -> np.ndarray:
+def _peaks(agreement: np.ndarray) -> np.ndarray:
     """Where a surface shows as a clear peak along the vertical."""
 
     def around(*steps: int) -> np.ndarray:
         footprint = np.isin(np.arange(-4, 5), steps)[:, None, None]
-        return np.asarray(ndimage.maximum_filter(agreement, footprint=footprint, mode="constant", cval=-1.0))
+        return ndimage.maximum_filter(agreement, footprint=footprint, mode="constant", cval=-1.0)
 
-    return (agreement > least) & (agreement >= around(-1, 1)) & (agreement > around(-4, -3, 3, 4) + 0.15)
-
-
-def _known(whole: Plane, levels: np.ndarray, planes: Sequence[Plane]) -> np.ndarray:
-    """Which cells of which levels lie on planes that are known, shape ``(levels, A, B)``."""
-    known = np.zeros((len(levels), *whole.occupied.shape), dtype=bool)
-    cells = whole.cells()
-    for plane in planes:
-        if plane.normal @ whole.normal > 0.99:
-            for k, z in enumerate(levels):
-                cells[:, 2] = z
-                known[k] |= plane.holds(cells, 0.05).reshape(whole.occupied.shape)
-    return known
+    return (agreement > AGREES) & (agreement >= around(-1, 1)) & (agreement > around(-4, -3, 3, 4) + 0.15)
 
 
 def _settled(piece: Plane, surface: Mesh | None, photos: GreyPhotos) -> Plane | None:
@@ -254,9 +247,8 @@ def joined(planes: Sequence[Plane], levels: Sequence[Plane]) -> list[Plane]:
     face down (seen from below, stripes on a wall pass for a soffit)."""
     result = united(planes, levels)
     up_m2, down_m2 = 0.3, 2.0  # least area of a new plane that faces up, or down
-    least = [up_m2 if p.normal[2] > 0 else down_m2 for p in result[len(planes) :]]
-    large = [p for p, area in zip(result[len(planes) :], least, strict=True) if p.area() >= area]
-    return result[: len(planes)] + large
+    new = [p for p in result[len(planes) :] if p.area() >= (up_m2 if p.normal[2] > 0 else down_m2)]
+    return result[: len(planes)] + new
 
 
 def united(planes: Sequence[Plane], others: Sequence[Plane]) -> list[Plane]:
@@ -292,5 +284,4 @@ def _majority(mask: np.ndarray, of_nine: int) -> np.ndarray:
 
 def _closed(mask: np.ndarray) -> np.ndarray:
     """``mask`` with gaps of up to two cells closed."""
-    grown = np.pad(mask, 2)
-    return np.asarray(ndimage.binary_closing(grown, AROUND)[2:-2, 2:-2]) | mask
+    return ndimage.binary_closing(np.pad(mask, 2), AROUND)[2:-2, 2:-2] | mask

@@ -58,13 +58,10 @@ class Targets:
             self.scale = scale
         if view in self.made:
             return self.made[view]
-        camera, mask = self.photos.cameras[view], self.photos.masks[view]
-        small = block_means(np.asarray(self.photos.images[view], dtype=np.float32), scale)
-        height, width, _ = small.shape
-        kept = np.ones((height, width), dtype=np.float32)
-        if mask is not None:
-            kept = (block_means(np.asarray(mask) != 0, scale) == 0).astype(np.float32)
-            small = small * kept[..., None]
+        camera = self.photos.cameras[view]
+        kept = (block_means(self.photos.mask(view), scale) == 0).astype(np.float32)
+        small = block_means(np.asarray(self.photos.images[view], dtype=np.float32), scale) * kept[..., None]
+        height, width = kept.shape
         lens = {name: getattr(camera, name) / scale for name in ("fx", "fy", "cx", "cy")}
         smaller = Camera.pinhole(width, height, world_to_camera=camera.world_to_camera, **lens)
         pixels = self.loss.plane(small, (height, width))
@@ -80,14 +77,9 @@ PRIOR = 1e-3  # weight of a gain of one, in squared display values per pixel
 
 
 class Exposures:
-    """Gains of photos.
+    """Gains of photos, one until they are fitted."""
 
-    Args:
-        fitted: whether gains are fitted; otherwise they stay at one.
-    """
-
-    def __init__(self, count: int, fitted: bool) -> None:
-        self.fitted = fitted
+    def __init__(self, count: int) -> None:
         self.log_gains = np.zeros((count, 3))
 
     def gain(self, view: int) -> wp.vec3:
@@ -111,8 +103,6 @@ class Exposures:
 
     def fit(self, image: wp.array, target: Target, visits: int) -> None:
         """Move a photo's gain towards what its rendered image asks for; ``visits``: how often that was done before."""
-        if not self.fitted:
-            return
         height, width, _ = image.shape
         sums = [wp.empty(height, dtype=wp.vec3, device=image.device) for _ in range(2)]
         knee = 0.03  # of the Huber loss, in display values: what differs more is no matter of exposure

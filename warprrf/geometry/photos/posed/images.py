@@ -30,13 +30,15 @@ class PosedPhotos:
     cameras: Sequence[Camera]
     masks: Sequence[np.ndarray | None] = ()
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "masks", self.masks or [None] * len(self.images))
+    def mask(self, number: int) -> np.ndarray:
+        """Where a photo takes no part, shape ``(H, W)`` bool."""
+        given = self.masks[number] if self.masks else None
+        return np.asarray(np.zeros(self.images[number].shape[:2]) if given is None else given) != 0
 
     def subset(self, chosen: Sequence[int]) -> PosedPhotos:
         """The photos of these numbers."""
-        masks = [self.masks[k] for k in chosen]
-        return PosedPhotos([self.images[k] for k in chosen], [self.cameras[k] for k in chosen], masks)
+        parts = zip(*((self.images[k], self.cameras[k], self.mask(k)) for k in chosen), strict=True)
+        return PosedPhotos(*map(list, parts))
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ def block_means(pixels: np.ndarray, side: int, dtype: DTypeLike | None = None) -
     rows, columns = pixels.shape[0] // side, pixels.shape[1] // side
     whole = pixels[: rows * side, : columns * side]
     blocks = whole.reshape(rows, side, columns, side, *pixels.shape[2:])
-    return np.asarray(blocks.mean(axis=(1, 3), dtype=dtype))
+    return blocks.mean(axis=(1, 3), dtype=dtype)
 
 
 def layout(cameras: Sequence[Camera]) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,19 +11,18 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from warprrf.checks import some_of
 from warprrf.device import require
+from warprrf.files import UNREADABLE
+from warprrf.steps import RECORDS
 
 T = TypeVar("T")
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 MASK_SUFFIX = ".mask.png"
 MIN_PHOTOS = 3
-STEPS_FOLDER = ".steps"  # of a workspace (see warprrf.steps): pictures beside it are its own
 TURNS = {1: 0, 6: 1, 3: 2, 8: 3}
 """Quarter turns clockwise that bring a photo upright, by EXIF's orientation; the other four are mirrored."""
-
-UNREADABLE = (OSError, SyntaxError, ValueError, KeyError, TypeError, struct.error)
-"""What Pillow raises for damaged files and damaged EXIF."""
 
 Photos = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 """A folder of photos, or image files."""
@@ -46,11 +44,11 @@ def find_photos(photos: Photos) -> dict[str, Path]:
         found = (p for p in root.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES and p.is_file())
         every = sorted(p for p in found if not p.name.startswith(".") and not _of_workspace(p, root))
         files = [p for p in every if not p.name.lower().endswith(MASK_SUFFIX)]
-        masked = {mask_name(p) for p in files}
-        stray = [p.relative_to(root).as_posix() for p in every if p not in masked and p not in set(files)]
+        stray = sorted(set(every) - set(files) - {mask_name(p) for p in files})
         if stray:
+            names = some_of([p.relative_to(root).as_posix() for p in stray])
             raise ValueError(
-                f"photos: {len(stray)} masks are of no photo: {some(stray)}; the mask of 0007.jpg is 0007.mask.png"
+                f"photos: {len(stray)} masks are of no photo: {names}; the mask of 0007.jpg is 0007.mask.png"
             )
     else:
         if odd := [p for p in photos if not isinstance(p, str | os.PathLike)]:
@@ -58,7 +56,7 @@ def find_photos(photos: Photos) -> dict[str, Path]:
         files = [Path(p) for p in photos if not str(p).lower().endswith(MASK_SUFFIX)]
         missing = [str(p) for p in files if not p.is_file()]
         if missing:
-            raise ValueError(f"photos: {len(missing)} of {len(files)} files do not exist: {some(missing)}")
+            raise ValueError(f"photos: {len(missing)} of {len(files)} files do not exist: {some_of(missing)}")
         parents = {str(p.resolve().parent) for p in files}
         root = Path(os.path.commonpath(parents)) if parents else Path()
         files = [p.resolve() for p in files]
@@ -74,7 +72,7 @@ def find_photos(photos: Photos) -> dict[str, Path]:
 def _of_workspace(file: Path, root: Path) -> bool:
     """Whether ``file`` lies in a folder of finished steps below ``root``."""
     return any(
-        (folder / STEPS_FOLDER).is_dir()
+        (folder / RECORDS).is_dir()
         for folder in file.parents
         if folder != root and folder.is_relative_to(root)
     )
@@ -107,7 +105,7 @@ def opened(path: str | os.PathLike[str], argument: str = "photos", kind: str = "
     try:
         with image.open(path) as picture:
             yield picture
-    except (*UNREADABLE, image.DecompressionBombError) as error:
+    except (OSError, *UNREADABLE, image.DecompressionBombError) as error:
         raise ValueError(f"{argument}: {path} does not read as {kind}: {error}") from error
 
 
@@ -169,32 +167,25 @@ def check_photos(named: Mapping[str, Path]) -> None:
         if size is not None and size != upright:
             bad.append(f"{name} (its mask is {size[0]} x {size[1]}, expected {upright[0]} x {upright[1]})")
     if bad:
-        raise ValueError(f"photos: {len(bad)} of {len(named)} files do not read as images: {some(bad)}")
+        raise ValueError(f"photos: {len(bad)} of {len(named)} files do not read as images: {some_of(bad)}")
 
 
 def match_names(argument: str, wanted: Iterable[str], names: Sequence[str]) -> list[str]:
     """Full photo names of ``wanted``: each is a name, or a file name that only one of ``names`` has."""
-    by_file: dict[str, list[str]] = {}
-    for name in names:
-        by_file.setdefault(name.rsplit("/", 1)[-1], []).append(name)
-    found: list[str] = []
-    unknown: list[str] = []
-    shared: list[str] = []
-    for key in wanted:
-        key = str(key)
-        if key in names:
-            found.append(key)
-        elif len(by_file.get(Path(key).name, ())) == 1:
-            found.append(by_file[Path(key).name][0])
+    found, unknown, shared = list[str](), list[str](), list[str]()
+    for key in map(str, wanted):
+        hits = [key] if key in names else [n for n in names if n.rpartition("/")[2] == Path(key).name]
+        if len(hits) == 1:
+            found.append(hits[0])
         else:
-            (shared if Path(key).name in by_file else unknown).append(key)
+            (shared if hits else unknown).append(key)
     if unknown:
         raise ValueError(
-            f"{argument}: no such photo: {some(unknown)}; photos are named like {some(list(names), 2)}"
+            f"{argument}: no such photo: {some_of(unknown)}; photos are named like {some_of(list(names), 2)}"
         )
     if shared:
         raise ValueError(
-            f"{argument}: several photos have the file name of {some(shared)}; give the longer name"
+            f"{argument}: several photos have the file name of {some_of(shared)}; give the longer name"
         )
     return found
 
@@ -222,9 +213,3 @@ def spread(items: Iterable[T], most: int) -> list[T]:
     """At most so many of ``items``, evenly spread."""
     every = list(items)
     return [every[k] for k in np.linspace(0, len(every) - 1, min(len(every), most)).round().astype(int)]
-
-
-def some(items: Sequence[str], limit: int = 5) -> str:
-    """The first few of many names, for a message."""
-    more = f" and {len(items) - limit} more" if len(items) > limit else ""
-    return ", ".join(str(i) for i in items[:limit]) + more

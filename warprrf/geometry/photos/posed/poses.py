@@ -10,7 +10,6 @@ COLMAP models are read by :func:`warprrf.geometry.photos.posed.sfm.read_colmap`.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -19,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count, check_number, check_positive, check_type
+from warprrf.checks import check_array, check_count, check_number, check_positive, check_type, some_of, warn
 from warprrf.files import read_json
-from warprrf.geometry.photos.posed.photo_files import MIN_PHOTOS, opened, some
+from warprrf.geometry.photos.posed.photo_files import MIN_PHOTOS, opened
 from warprrf.geometry.photos.posed.undistort import Lens
 from warprrf.tensor_files import named as naming
 
@@ -120,8 +119,9 @@ class KnownPoses:
         return tuple(n for n, p in rest.items() if not p.name.lower().endswith(DEPTH_FILE))
 
 
-def match_photos(cameras: Iterable[str], photos: Iterable[str], *, warn: bool = True) -> dict[str, str]:
-    """Which of ``cameras`` is that of a photo, by photo name in the order of ``photos``; warns of cameras without a photo.
+def match_photos(cameras: Iterable[str], photos: Iterable[str], *, every: bool = True) -> dict[str, str]:
+    """Which of ``cameras`` is that of a photo, by photo name in the order of ``photos``; warns of cameras without a photo if
+    ``every`` one should have one.
 
     A camera's photo has its name, or else alone ends as it does, or alone has its file name, with or without a suffix.
     """
@@ -151,12 +151,11 @@ def match_photos(cameras: Iterable[str], photos: Iterable[str], *, warn: bool = 
     if len(found) < MIN_PHOTOS:
         raise ValueError(
             f"poses: {len(found)} of {len(cameras)} poses have a photo, expected at least {MIN_PHOTOS}; poses are "
-            f"named like {some(cameras, 2)}, photos like {some(photos, 2)}"
+            f"named like {some_of(cameras, 2)}, photos like {some_of(photos, 2)}"
         )
-    if missing and warn:
-        warnings.warn(
-            f"poses: {len(missing)} of {len(cameras)} poses have no photo and are left out: {some(missing)}",
-            stacklevel=3,
+    if missing and every:
+        warn(
+            f"poses: {len(missing)} of {len(cameras)} poses have no photo and are left out: {some_of(missing)}"
         )
     return {photo: found[photo] for photo in photos if photo in found}
 
@@ -183,7 +182,7 @@ def find_depth(folder: Path, photos: Iterable[str]) -> dict[str, Path]:
     if len(found) < MIN_PHOTOS:
         raise ValueError(
             f"depth: {folder} holds depth of {len(found)} photos, expected at least {MIN_PHOTOS}; it has files like "
-            f"{some([p.name for p in files.values()], 2)}, photos are named like {some(list(stems), 2)}"
+            f"{some_of([p.name for p in files.values()], 2)}, photos are named like {some_of(list(stems), 2)}"
         )
     return found
 

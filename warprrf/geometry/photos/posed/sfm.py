@@ -12,17 +12,16 @@ import itertools
 import os
 import shutil
 import sqlite3
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any, cast
 
 import numpy as np
 
+from warprrf.checks import some_of, warn
 from warprrf.device import Progress, require
 from warprrf.files import folder_in_place
 from warprrf.geometry.photos.config import ReconstructionConfig
@@ -35,7 +34,6 @@ from warprrf.geometry.photos.posed.photo_files import (
     mask_beside,
     open_photo,
     photo_facts,
-    some,
 )
 from warprrf.geometry.photos.posed.poses import KnownCamera, KnownPoses
 from warprrf.geometry.photos.posed.sparse import SparseModel, fit_similarity, posed_in_words
@@ -105,70 +103,66 @@ def structure_from_motion(
     config = config or ReconstructionConfig()
     lens, max_features = config.lens, config.max_features
     everything = named = find_photos(photos)
-    colmap = load_colmap()
     known: Any = None
     match, first_lens = True, cast(str | dict[str, Lens], FREE_MODEL if lens == "auto" else lens)
     if poses is not None:
         named = {name: named[name] for name in poses.cameras}
         facts = {name: photo_facts(path) for name, path in named.items()}
         first_lens = {n: c.of_size(n, facts[n].width, facts[n].height) for n, c in poses.cameras.items()}
-        with _quiet(colmap):
-            known = _known_model(colmap, poses, first_lens)
+        with _quiet():
+            known = _known_model(poses, first_lens)
         match = not poses.depth and not known.num_points3D()
 
     folder = Path(workspace).absolute() / "sfm"
     kept = folder / "photos"
     if any(path.resolve().is_relative_to(kept.resolve()) for path in named.values()):
         raise ValueError(f"workspace: {kept} holds the photos and would be overwritten; name another folder")
-    with Steps(folder, progress=progress) as steps, _quiet(colmap):
+    with _quiet() as colmap, Steps(folder, progress=progress) as steps:
         colmap.set_random_seed(seed)
         inputs: list[Any] = []
         if match:
             masks = {name: mask for name, path in named.items() if (mask := mask_beside(path))}
             inputs = [list(named), list(named.values()), masks, max_features, first_lens, colmap.__version__]
-            make = partial(_extract, colmap, folder, named, max_features, first_lens)
-            steps.run("features", make, version=VERSIONS["features"], inputs=inputs, outputs=["features.db"])
-            inputs, make = [steps.key("features"), seed], partial(_match, colmap, folder, list(named), seed)
-            steps.run("matches", make, version=VERSIONS["matches"], inputs=inputs, outputs=["matches.db"])
+            find = partial(_extract, folder, named, max_features, first_lens)
+            steps.run("features", find, version=VERSIONS["features"], inputs=inputs, outputs=["features.db"])
+            inputs, compare = [steps.key("features"), seed], partial(_match, folder, list(named), seed)
+            steps.run("matches", compare, version=VERSIONS["matches"], inputs=inputs, outputs=["matches.db"])
             inputs = [steps.key("matches"), lens, seed]
         if known is None:
-            make = partial(_map, colmap, folder, named, lens, seed)
+            make = partial(_map, folder, named, lens, seed)
         else:
-            make = partial(_keep_known, colmap, folder, named, known, match, seed)
+            make = partial(_keep_known, folder, named, known, match, seed)
             inputs += [list(named.values()), *_content(known)]
         made = steps.run("model", make, version=VERSIONS["model"], inputs=inputs, outputs=["model"])
-        result = _straightened(colmap, steps, named, config.max_pixels)
+        result = _straightened(steps, named, config.max_pixels)
         unposed = [*result.unposed]
         if poses is not None:
             unposed += poses.unposed(everything)
             causes = dict.fromkeys(unposed, "the poses given have none of it")
         else:
-            causes = _causes(colmap, folder / "matches.db", result) if unposed else {}
+            causes = _causes(folder / "matches.db", result) if unposed else {}
         for k, piece in enumerate(made["pieces"][1:], 2):
             text = f"one of {len(piece)} photos in a piece of their own; poses={folder / f'model-{k}'} gives that"
             causes |= dict.fromkeys(piece, text)
         pieces = tuple(map(tuple, made["pieces"]))
         result = replace(result, unposed=tuple(unposed), causes=causes, pieces=pieces)
-        said = posed_in_words(result)
-        if said:
-            warnings.warn(said, stacklevel=3)
-        return replace(result, guessed=(*result.guessed, *filter(None, [said])))
+        if said := posed_in_words(result):
+            warn(said)
+            result = replace(result, guessed=(said,))
+        return result
 
 
-def _straightened(
-    colmap: ModuleType, steps: Steps, named: Mapping[str, Path], max_pixels: int
-) -> SparseModel:
+def _straightened(steps: Steps, named: Mapping[str, Path], max_pixels: int) -> SparseModel:
     """The model in the folder of ``steps``, with undistorted photos beside it."""
-    model, kept = colmap.Reconstruction(str(steps.folder / "model")), steps.folder / "photos"
+    model, kept = load_colmap().Reconstruction(str(steps.folder / "model")), steps.folder / "photos"
     lenses = lenses_of(model)
 
-    def straight(attempt: Attempt) -> dict[str, Any]:
+    def straight(attempt: Attempt) -> None:
         shutil.rmtree(kept, ignore_errors=True)  # of other photos, or with masks that are gone
         for k, name in enumerate(lenses):
             attempt.progress("undistorting", k, len(lenses))
             write_undistorted(named[name], kept / name, lenses[name], max_pixels)
         attempt.progress("undistorting", len(lenses), len(lenses))
-        return {}
 
     outputs = [f"photos/{name}" for name in lenses]
     inputs = [steps.key("model"), max_pixels]
@@ -187,10 +181,9 @@ def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
         ValueError: if the folder holds no readable model, or a camera is not a pinhole.
         ImportError: if pycolmap is not installed.
     """
-    colmap = load_colmap()
     root = Path(folder)
-    with _quiet(colmap):
-        model = _open_model(colmap, root)
+    with _quiet():
+        model = _open_model(root)
         try:
             names = sorted(i.name for i in model.images.values())
             bent = [lens for lens in lenses_of(model).values() if not lens.straight]
@@ -207,7 +200,7 @@ def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
     return found
 
 
-def _open_model(colmap: ModuleType, root: Path) -> Any:
+def _open_model(root: Path) -> Any:
     """A COLMAP model folder, whose files are looked through first."""
     if not is_colmap(root):
         raise ValueError(
@@ -217,7 +210,7 @@ def _open_model(colmap: ModuleType, root: Path) -> Any:
         for name, walk in _RECORDS.items():
             if (root / name).is_file():
                 _check_whole(root / name, walk)
-        return colmap.Reconstruction(str(root))
+        return load_colmap().Reconstruction(str(root))
     except Exception as error:  # pycolmap raises RuntimeError, ValueError or IndexError on a damaged file
         raise ValueError(f"colmap: {root} does not read as a COLMAP model: {error}") from error
 
@@ -256,12 +249,13 @@ def _check_whole(path: Path, walk: Callable[[bytes, int], int]) -> None:
 
 
 @contextmanager
-def _quiet(colmap: ModuleType) -> Iterator[None]:
-    """COLMAP logs to stderr; keep only its fatal messages, and put the level back afterwards."""
+def _quiet() -> Iterator[Any]:
+    """pycolmap, which logs to stderr: its fatal messages alone, and at the level of before afterwards."""
+    colmap = load_colmap()
     before = colmap.logging.minloglevel
     colmap.logging.minloglevel = int(colmap.logging.FATAL)
     try:
-        yield
+        yield colmap
     finally:
         colmap.logging.minloglevel = before
 
@@ -272,37 +266,28 @@ def _root(named: Mapping[str, Path]) -> Path:
     return path.parents[name.count("/")]
 
 
-def _copied(source: Path, target: Path) -> Path:
-    """``target``, a fresh copy of a database."""
-    for suffix in ("-wal", "-shm", "-journal"):
-        Path(f"{target}{suffix}").unlink(missing_ok=True)
-    shutil.copyfile(source, target)
-    return target
+def _fresh(folder: Path) -> Path:
+    """``folder``, empty."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
 
 
-def _settled(working: Path, final: Path) -> dict[str, Any]:
-    """Move a finished database into place, with nothing left in SQLite's write-ahead log; a step's figures: none."""
+def _settled(working: Path, final: Path) -> None:
+    """Move a finished database into place, with nothing left in SQLite's write-ahead log."""
     with closing(sqlite3.connect(working)) as connection:
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         connection.execute("PRAGMA journal_mode=DELETE")
     os.replace(working, final)
-    return {}
 
 
 def _extract(
-    colmap: ModuleType,
-    folder: Path,
-    named: Mapping[str, Path],
-    max_features: int,
-    lens: str | dict[str, Lens],
-    attempt: Attempt,
-) -> dict[str, Any]:
+    folder: Path, named: Mapping[str, Path], max_features: int, lens: str | dict[str, Lens], attempt: Attempt
+) -> None:
     """Features of the photos, into ``features.db``; ``lens``: lenses, or the model of all lenses."""
     check_photos(named)
-    names = list(named)
-    images = _root(named)
-    working = attempt.folder / "features.db"
-    working.unlink(missing_ok=True)
+    colmap, names, images = load_colmap(), list(named), _root(named)
+    working = _fresh(attempt.folder) / "features.db"
     colmap.Database.open(str(working)).close()
     reader = colmap.ImageReaderOptions()
     # Importing first numbers the images by name; extraction alone numbers them as threads finish.
@@ -332,7 +317,7 @@ def _extract(
             device=colmap.Device.cpu,
         )
     attempt.progress("features", len(names), len(names))
-    return _settled(working, folder / "features.db")
+    _settled(working, folder / "features.db")
 
 
 def _write_masks(named: Mapping[str, Path], folder: Path) -> Path:
@@ -349,9 +334,10 @@ def _write_masks(named: Mapping[str, Path], folder: Path) -> Path:
     return folder
 
 
-def _match(colmap: ModuleType, folder: Path, names: list[str], seed: int, attempt: Attempt) -> dict[str, Any]:
+def _match(folder: Path, names: list[str], seed: int, attempt: Attempt) -> None:
     """Verified matches of pairs of photos, into ``matches.db``."""
-    working = _copied(folder / "features.db", attempt.folder / "matches.db")
+    colmap = load_colmap()
+    working = shutil.copyfile(folder / "features.db", _fresh(attempt.folder) / "matches.db")
     listing = attempt.folder / "pairs.txt"
     with colmap.Database.open(str(working)) as database:
         counts = {i.name: database.num_keypoints_for_image(i.image_id) for i in database.read_all_images()}
@@ -359,7 +345,7 @@ def _match(colmap: ModuleType, folder: Path, names: list[str], seed: int, attemp
         if len(names) - len(blank) < MIN_PHOTOS:
             raise ValueError(
                 f"photos: {len(blank)} of {len(names)} photos show fewer than {FEWEST_FEATURES} features (blank, dark or "
-                f"blurred?), too few remain to work with: {some(blank)}"
+                f"blurred?), too few remain to work with: {some_of(blank)}"
             )
         chosen = list(itertools.combinations(names, 2))
         if len(chosen) > MAX_EXHAUSTIVE_PAIRS:
@@ -381,7 +367,7 @@ def _match(colmap: ModuleType, folder: Path, names: list[str], seed: int, attemp
             device=colmap.Device.cpu,
         )
     attempt.progress("matching", len(chosen), len(chosen))
-    return _settled(working, folder / "matches.db")
+    _settled(working, folder / "matches.db")
 
 
 def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[tuple[str, str]]:
@@ -431,19 +417,17 @@ def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[
     return [(names[i], names[j]) for i, j in itertools.combinations(range(len(names)), 2) if keep[i, j]]
 
 
-def _map(
-    colmap: ModuleType, folder: Path, named: Mapping[str, Path], lens: str, seed: int, attempt: Attempt
-) -> dict[str, Any]:
+def _map(folder: Path, named: Mapping[str, Path], lens: str, seed: int, attempt: Attempt) -> dict[str, Any]:
     """Poses and points from the matches, into the folder ``model``: the largest of the models found, with those that
     photos join to it; the others into ``model-2`` and so on. Names of the photos of each, as ``pieces``."""
-    working = _copied(folder / "matches.db", attempt.folder / "matches.db")
-    images, report = _root(named), attempt.progress
+    working = shutil.copyfile(folder / "matches.db", _fresh(attempt.folder) / "matches.db")
+    colmap, images, report = load_colmap(), _root(named), attempt.progress
     options = colmap.IncrementalPipelineOptions()
     options.random_seed = seed
     options.num_threads = 1  # sums in a fixed order: the same poses every time
     options.min_model_size = MIN_PHOTOS
     if lens != "OPENCV_FISHEYE":  # of which no fundamental matrix speaks
-        _calibrate(colmap, working, attempt.folder / "calibrated.db", seed)
+        _calibrate(working, attempt.folder / "calibrated.db", seed)
     best: list[Any] = []
     for limits in ({}, LENIENT):
         for name, limit in limits.items():
@@ -471,14 +455,14 @@ def _map(
         raise ValueError(
             f"photos: too few matches between the {len(named)} photos to pose any "
             f"({(inliers >= options.min_num_matches).sum()} pairs of photos match); expected photos of one textured "
-            f"place that overlap by half or more: {some(list(named))}"
+            f"place that overlap by half or more: {some_of(list(named))}"
         )
     kept: list[Any] = []
     for model in best:
-        if not kept or not _names(model) <= set().union(*map(_names, kept)):
+        if not _names(model) <= set().union(*map(_names, kept)):
             kept.append(model)
     for model in kept[1:]:
-        both = _joined(colmap, kept[0], model, (working, images, options), _fresh(attempt.folder / "joined"))
+        both = _joined(kept[0], model, (working, images, options), _fresh(attempt.folder / "joined"))
         if both is not None:
             kept = [both, *(other for other in kept[1:] if other is not model)]
     pieces: list[list[str]] = []
@@ -492,20 +476,21 @@ def _map(
         with folder_in_place(folder / ("model" if len(pieces) == 1 else f"model-{len(pieces)}")) as whole:
             model.write_binary(str(whole))
             if len(pieces) == 1:
-                choose_lens(colmap, whole, lens).write_binary(str(whole))
+                choose_lens(whole, lens).write_binary(str(whole))
     report("mapping", len(named), len(named))
     return {"pieces": pieces}
 
 
-def _calibrate(colmap: ModuleType, matches: Path, scratch: Path, seed: int) -> None:
+def _calibrate(matches: Path, scratch: Path, seed: int) -> None:
     """Start each lens whose EXIF says nothing from the focal length that most fundamental matrices of its photos agree on.
 
     COLMAP would start from 1.2 times the longer side, where 0.6 to 0.9 are usual of phones and depth cameras. Source: C.
     Sweeney et al., "Optimizing the viewing graph for structure-from-motion", ICCV 2015. The file ``scratch`` is written over:
     COLMAP also sorts out pairs there, which the mapper can use.
     """
+    colmap = load_colmap()
     options = colmap.ViewGraphCalibrationOptions(random_seed=seed, reestimate_relative_pose=False)
-    colmap.calibrate_view_graph(_copied(matches, scratch), options)
+    colmap.calibrate_view_graph(shutil.copyfile(matches, scratch), options)
     with colmap.Database.open(str(scratch)) as found, colmap.Database.open(str(matches)) as database:
         for camera in found.read_all_cameras():
             database.update_camera(camera)
@@ -516,9 +501,7 @@ def _names(model: Any) -> set[str]:
     return {image.name for image in model.images.values() if image.has_pose}
 
 
-def _joined(
-    colmap: ModuleType, model: Any, other: Any, source: tuple[Path, Path, Any], scratch: Path
-) -> Any | None:
+def _joined(model: Any, other: Any, source: tuple[Path, Path, Any], scratch: Path) -> Any | None:
     """``model`` with the photos of ``other`` (which is moved), where they agree on points of a photo that both have; None
     elsewhere.
 
@@ -543,6 +526,7 @@ def _joined(
     # 0.01: median of points that two models share, over their extent, up to which the two are one
     if np.median(error) > 0.01 * np.ptp(theirs, axis=0).max():
         return None
+    colmap = load_colmap()
     other.transform(colmap.Sim3d(scale, colmap.Rotation3d(rotation), shift))
     both = colmap.Reconstruction()
     for part in (model, other):
@@ -561,18 +545,10 @@ def _joined(
     return both
 
 
-def _fresh(folder: Path) -> Path:
-    """``folder``, empty."""
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    return folder
-
-
 def read_known(folder: Path) -> dict[str, KnownCamera]:
     """Lenses and poses of the photos of a COLMAP model, by name."""
-    colmap = load_colmap()
-    with _quiet(colmap), naming(folder, "expected a COLMAP model"):
-        model = _open_model(colmap, folder)
+    with _quiet(), naming(folder, "expected a COLMAP model"):
+        model = _open_model(folder)
         lenses = lenses_of(model)
         poses = {i.name: _pose(i) for i in model.images.values() if i.name in lenses}
     cameras = {}
@@ -582,10 +558,11 @@ def read_known(folder: Path) -> dict[str, KnownCamera]:
     return cameras
 
 
-def _known_model(colmap: ModuleType, poses: KnownPoses, lenses: Mapping[str, Lens]) -> Any:
+def _known_model(poses: KnownPoses, lenses: Mapping[str, Lens]) -> Any:
     """A COLMAP model of known poses, with its points where they come from one that has some."""
+    colmap = load_colmap()
     if poses.model is not None:
-        model = _open_model(colmap, poses.model)
+        model = _open_model(poses.model)
         if model.num_points3D():
             _renamed(model, {name: photo for photo, name in poses.names.items()}, lenses)
             return model
@@ -620,20 +597,15 @@ def _content(model: Any) -> list[Any]:
 
 
 def _keep_known(
-    colmap: ModuleType,
-    folder: Path,
-    photos: Mapping[str, Path],
-    model: Any,
-    match: bool,
-    seed: int,
-    attempt: Attempt,
+    folder: Path, photos: Mapping[str, Path], model: Any, match: bool, seed: int, attempt: Attempt
 ) -> dict[str, Any]:
     """The ``model`` of known poses into the folder ``model``, its points triangulated from the matches where asked."""
     with folder_in_place(folder / "model") as whole:
         if match:
             attempt.progress("triangulating", 0, 1)
+            colmap = load_colmap()
             options = colmap.IncrementalPipelineOptions(random_seed=seed, num_threads=1)
-            working = _copied(folder / "matches.db", attempt.folder / "matches.db")
+            working = shutil.copyfile(folder / "matches.db", _fresh(attempt.folder) / "matches.db")
             root = _root(photos)
             model = colmap.triangulate_points(model, working, root, whole, options=options)
             model.extract_colors_for_all_images(str(root))
@@ -649,8 +621,9 @@ def lenses_of(model: Any) -> dict[str, Lens]:
     return dict(sorted(posed.items()))
 
 
-def _causes(colmap: ModuleType, matches: Path, sparse: SparseModel) -> dict[str, str]:
+def _causes(matches: Path, sparse: SparseModel) -> dict[str, str]:
     """Why photos have no pose, by name."""
+    colmap = load_colmap()
     with colmap.Database.open(str(matches)) as database:
         names = {i.image_id: i.name for i in database.read_all_images()}
         features = {name: database.num_keypoints_for_image(k) for k, name in names.items()}

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from warprrf.checks import check_array, check_positive, check_similarity
-from warprrf.geometry.photos.posed.photo_files import match_names, some
+from warprrf.checks import check_array, check_positive, check_similarity, some_of
+from warprrf.geometry.photos.posed.photo_files import match_names
 from warprrf.geometry.photos.posed.undistort import Lens
 from warprrf.geometry.planes import Plane, PlaneConfig, detect_planes
 from warprrf.geometry.splats.camera import Camera
@@ -117,7 +117,7 @@ def posed_in_words(sparse: SparseModel) -> str:
             f"add photos between {'; between '.join(gaps)}"
         )
     alone = [name for name in sparse.unposed if not any(name in piece for piece in sparse.pieces[1:])]
-    return f"{said}; without a pose: {some(alone)}" if alone else said
+    return f"{said}; without a pose: {some_of(alone)}" if alone else said
 
 
 def align_to_known(sparse: SparseModel, known_positions: Mapping[str, ArrayLike]) -> SparseModel:
@@ -151,7 +151,7 @@ def known_similarity(
         raise ValueError(
             f"known_positions: {len(cameras)} of {len(cameras) + len(unposed)} photos were posed, but only {len(usable)} of "
             "the surveyed ones, expected at least 3; "
-            f"without pose: {some(lost)}"
+            f"without pose: {some_of(lost)}"
         )
     source = np.array([cameras[n].position for n in usable])
     target = np.array([check_array(f"known_positions[{n!r}]", p, (3,)) for n, p in usable.items()])
@@ -187,7 +187,7 @@ def scaled(sparse: SparseModel, scale: Scale) -> SparseModel:
     if isinstance(scale, tuple):
         lost = [name for name in scale[:2] if name not in sparse.cameras]
         if lost:
-            raise ValueError(f"scale: no pose was found for {some(lost)}; name two photos that have one")
+            raise ValueError(f"scale: no pose was found for {some_of(lost)}; name two photos that have one")
         positions = np.array([c.position for c in sparse.cameras.values()])
         gap = float(np.linalg.norm(sparse.cameras[scale[0]].position - sparse.cameras[scale[1]].position))
         if gap <= 1e-3 * float(np.ptp(positions, axis=0).max()):
@@ -245,8 +245,9 @@ def neighbours(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     return index, distance
 
 
-def clean_points(sparse: SparseModel, worst_px: float = np.inf) -> np.ndarray:
-    """Which points to keep, shape ``(P,)`` bool: seen often enough, reprojected well, not far from all others.
+def cleaned(sparse: SparseModel, worst_px: float = np.inf) -> SparseModel:
+    """``sparse`` with the points that are seen often enough, reprojected well and not far from all others; with all where
+    fewer than three are, as of a handful of photos.
 
     A point is an outlier when its mean distance to its neighbours exceeds the average of that figure over all points
     by 2.5 standard deviations (Rusu et al., "Towards 3D point cloud based object maps", 2008).
@@ -258,7 +259,7 @@ def clean_points(sparse: SparseModel, worst_px: float = np.inf) -> np.ndarray:
     if len(chosen) > NEIGHBOURS:
         spacing = neighbours(sparse.points[chosen], NEIGHBOURS)[1].mean(axis=1)
         keep[chosen[spacing > spacing.mean() + deviations * spacing.std()]] = False
-    return keep
+    return sparse if keep.sum() < 3 else sparse.subset(keep)
 
 
 def estimate_normals(points: np.ndarray, viewpoints: np.ndarray, count: int) -> np.ndarray:
@@ -268,7 +269,7 @@ def estimate_normals(points: np.ndarray, viewpoints: np.ndarray, count: int) -> 
     weight = 1 / (1 + (gap / np.maximum(np.median(gap, axis=1, keepdims=True), 1e-9)) ** 2)
     local = points[index] - points[:, None]
     local -= (weight[..., None] * local).sum(axis=1, keepdims=True) / weight.sum(axis=1)[:, None, None]
-    normals: np.ndarray = np.linalg.eigh(np.einsum("nk,nki,nkj->nij", weight, local, local))[1][:, :, 0]
+    normals = np.linalg.eigh(np.einsum("nk,nki,nkj->nij", weight, local, local))[1][:, :, 0]
     away = ((viewpoints - points) * normals).sum(axis=1) < 0
     normals[away] *= -1
     return normals

@@ -15,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 from typing import Annotated, Any
 
 import numpy as np
@@ -82,8 +81,13 @@ def pinhole_of(lens: Lens, world_to_camera: ArrayLike, turns: int, max_pixels: i
     flat = _undistorted(_reduced(lens, max_pixels))
     numbers = {name: getattr(flat, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     camera = Camera.pinhole(**numbers, world_to_camera=world_to_camera)
-    for _ in range(turns % 4):
-        camera = _turned(camera)
+    quarter = np.eye(4)
+    quarter[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
+    for _ in range(turns % 4):  # clockwise
+        camera = Camera.pinhole(
+            camera.height, camera.width, fx=camera.fy, fy=camera.fx, cx=camera.height - camera.cy, cy=camera.cx,
+            world_to_camera=quarter @ camera.world_to_camera,
+        )  # fmt: skip
     return camera
 
 
@@ -99,7 +103,7 @@ def stored_pixels(lens: Lens, slopes: np.ndarray, turns: int) -> np.ndarray:
     if lens.straight:
         return slopes * [lens.fx, lens.fy] + [lens.cx, lens.cy]
     rays = np.column_stack([slopes, np.ones(len(slopes))])
-    return np.asarray(colmap_camera(lens).img_from_cam(rays))
+    return colmap_camera(lens).img_from_cam(rays)
 
 
 def write_undistorted(source: Path, target: Path, lens: Lens, max_pixels: int) -> None:
@@ -113,7 +117,8 @@ def write_undistorted(source: Path, target: Path, lens: Lens, max_pixels: int) -
         shutil.copyfile(source, target)
     else:
         straight = _resampled(open_photo(source, "RGB"), source, lens, small)
-        _save(straight.rotate(-90 * turns, expand=True), target)
+        finest = {"quality": 95, "subsampling": 0} if target.suffix.lower() in (".jpg", ".jpeg") else {}
+        straight.rotate(-90 * turns, expand=True).save(target, **finest)
     if mask is not None:
         image = require("PIL.Image", extra="photos")
         stored = open_photo(mask, "L").rotate(
@@ -121,7 +126,7 @@ def write_undistorted(source: Path, target: Path, lens: Lens, max_pixels: int) -
         )  # a mask is upright, as its photo is seen
         counts = np.asarray(_resampled(stored, mask, lens, small)) > 254
         whole = image.fromarray(np.where(counts, 255, 0).astype(np.uint8))
-        _save(whole.rotate(-90 * turns, expand=True), mask_name(target))
+        whole.rotate(-90 * turns, expand=True).save(mask_name(target))
 
 
 def load_colmap() -> Any:
@@ -129,12 +134,6 @@ def load_colmap() -> Any:
     if find_spec("pycolmap") is not None:
         require("PIL.Image", extra="photos")
     return require("pycolmap", extra="photos")
-
-
-def _save(picture: Any, target: Path) -> None:
-    jpeg = target.suffix.lower() in (".jpg", ".jpeg")
-    jpeg_quality = 95
-    picture.save(target, **({"quality": jpeg_quality, "subsampling": 0} if jpeg else {}))
 
 
 def colmap_camera(lens: Lens, number: int = 1) -> Any:
@@ -185,16 +184,6 @@ def _resampled(picture: Any, path: Path, lens: Lens, small: Lens) -> Any:
     return image.fromarray(flat.to_array().squeeze())
 
 
-def _turned(camera: Camera) -> Camera:
-    """The camera of a photo turned by a quarter clockwise."""
-    turn = np.eye(4)
-    turn[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
-    return Camera.pinhole(
-        camera.height, camera.width, fx=camera.fy, fy=camera.fx, cx=camera.height - camera.cy, cy=camera.cx,
-        world_to_camera=turn @ camera.world_to_camera,
-    )  # fmt: skip
-
-
 def lenses_in_use(lenses: Mapping[str, Lens]) -> dict[Lens, tuple[str, ...]]:
     """Each lens once, with the names of its photos."""
     found: dict[Lens, list[str]] = {}
@@ -208,7 +197,7 @@ CANDIDATES = (("SIMPLE_PINHOLE", False), ("SIMPLE_RADIAL", False), ("RADIAL", Tr
 """Models tried, the simplest first, and whether the principal point is estimated with them."""
 
 
-def choose_lens(colmap: ModuleType, model: Path, lens: str) -> Any:
+def choose_lens(model: Path, lens: str) -> Any:
     """The COLMAP model in the folder ``model``, adjusted with the lens that its photos need.
 
     Args:
@@ -216,11 +205,11 @@ def choose_lens(colmap: ModuleType, model: Path, lens: str) -> Any:
     """
     tried: Sequence[tuple[str, bool]] = CANDIDATES if lens == "auto" else ((lens, False), (lens, True))
     *simpler, richest = tried
-    best = _adjusted(colmap, model, *richest)
+    best = _adjusted(model, *richest)
     worth = 0.01  # of the reprojection error: on photos without distortion the richest model gains 0.0001
     enough = (1 + worth) * best.compute_mean_reprojection_error()
     for kind, principal_point in simpler:
-        found = _adjusted(colmap, model, kind, principal_point)
+        found = _adjusted(model, kind, principal_point)
         if found.compute_mean_reprojection_error() <= enough:
             return found
     return best
@@ -239,8 +228,9 @@ def lens_of(camera: Any) -> Lens:
     return Lens(kind, camera.width, camera.height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], bends)
 
 
-def _adjusted(colmap: ModuleType, model: Path, kind: str, principal_point: bool) -> Any:
+def _adjusted(model: Path, kind: str, principal_point: bool) -> Any:
     """The model after a bundle adjustment with lenses of ``kind``."""
+    colmap = load_colmap()
     found = colmap.Reconstruction(str(model))
     for camera in found.cameras.values():
         lens = lens_of(camera)

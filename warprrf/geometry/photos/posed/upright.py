@@ -17,7 +17,7 @@ from scipy import ndimage
 from warprrf.geometry.mesh_files import UP
 from warprrf.geometry.photos.posed.images import block_means
 from warprrf.geometry.photos.posed.photo_files import spread
-from warprrf.geometry.photos.posed.sparse import SparseModel, clean_points, detect_room_planes
+from warprrf.geometry.photos.posed.sparse import SparseModel, cleaned, detect_room_planes
 from warprrf.geometry.planes import Plane, PlaneConfig
 from warprrf.geometry.splats.camera import Camera
 
@@ -35,7 +35,9 @@ def upright(sparse: SparseModel, photo: Callable[[str], np.ndarray], *, seed: in
     cameras = list(sparse.cameras.values())
     guessed = list(sparse.guessed)
     up, proven = vertical_of_edges(sparse.cameras, photo)
-    points, planes = _planes(sparse, seed)
+    clean = cleaned(sparse)
+    points = clean.points
+    planes = detect_room_planes(clean, PlaneConfig(), seed)[0] if len(points) >= 3 else []
     if not proven:
         level = [p.normal for p in planes if p.normal @ up > np.cos(np.radians(NEAR_DEG))]
         if level:  # the best supported one
@@ -74,7 +76,7 @@ def held_up(cameras: Sequence[Camera]) -> np.ndarray:
 
 def _least(cost: np.ndarray, near: np.ndarray) -> np.ndarray:
     """The unit vector ``x`` of least ``x . cost x``, of symmetric ``cost`` (3, 3), that points the way of ``near``."""
-    found: np.ndarray = np.linalg.eigh(cost)[1][:, 0]
+    found = np.linalg.eigh(cost)[1][:, 0]
     return found if found @ near > 0 else -found
 
 
@@ -129,15 +131,6 @@ def _edge_planes(photo: np.ndarray, camera: Camera) -> np.ndarray:
     return lines / np.linalg.norm(lines, axis=1, keepdims=True) @ camera.rotation
 
 
-def _planes(sparse: SparseModel, seed: int) -> tuple[np.ndarray, list[Plane]]:
-    """Cleaned points and the planes among them."""
-    keep = clean_points(sparse)
-    if keep.sum() < 3:
-        return sparse.points, []
-    sparse = sparse.subset(keep)
-    return sparse.points, detect_room_planes(sparse, PlaneConfig(), seed)[0]
-
-
 def _vertical_of_planes(up: np.ndarray, planes: Iterable[Plane]) -> np.ndarray:
     """``up`` corrected by planes that are nearly level or nearly upright, each by its number of points."""
     normals = np.array([p.normal for p in planes]).reshape(-1, 3)
@@ -172,9 +165,6 @@ def floor_height(
                 levels.append((height, int(near.sum())))
     most = max((count for _, count in levels), default=0)
     floor_share = 0.1  # least points of a floor, over those of the largest level
+    floor = min((height for height, count in levels if count >= floor_share * most), default=None)
     below_share = 0.01  # of all points may lie beneath a floor
-    for height, count in sorted(levels):
-        beneath = (heights < height - 2 * floor_m).mean()
-        if count >= floor_share * most:
-            return height if beneath <= below_share else None
-    return None
+    return None if floor is None or (heights < floor - 2 * floor_m).mean() > below_share else floor

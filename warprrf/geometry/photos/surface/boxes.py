@@ -38,8 +38,18 @@ class Level(NamedTuple):
 
 @dataclass(frozen=True)
 class FaceLevels:
-    """The level that each face lies on: direction 0 to 2 or -1 for none, seen side, height [m]; shapes ``(F,)``."""
+    """Faces of a mesh and the level that each lies on.
 
+    Attributes:
+        middle: along the directions [m], shape ``(F, 3)``.
+        facing: smoothed normals along the directions, shape ``(F, 3)``.
+        area: [m^2], shape ``(F,)``.
+        axis, sign, height: of the level: direction 0 to 2 or -1 for none, seen side, height [m]; shapes ``(F,)``.
+    """
+
+    middle: np.ndarray
+    facing: np.ndarray
+    area: np.ndarray
     axis: np.ndarray
     sign: np.ndarray
     height: np.ndarray
@@ -51,9 +61,9 @@ class FaceLevels:
 
 def known_levels(
     patches: PlanarPatches, planes: Sequence[Plane], axes: np.ndarray
-) -> tuple[list[Level], FaceLevels]:
-    """Levels of the patches that are parallel to the directions, the best supported first, and of the faces on them;
-    then those on which other faces gather.
+) -> tuple[list[Level], FaceLevels, list[tuple[Plane, Level]]]:
+    """Levels of the patches that are parallel to the directions, the best supported first, then those on which other faces
+    gather; the level of each face; and those of ``planes`` that became a level, with it.
 
     Args:
         patches: of the mesh; patch k lies on ``planes[k]`` as far as there are so many.
@@ -77,17 +87,18 @@ def known_levels(
             level = level._replace(plane=sign * np.append(patches.normal[k], patches.offset[k]))
         candidates.append((strength, level, faces))
     chosen: list[Level] = []
-    found = FaceLevels(np.full(count, -1), np.zeros(count, dtype=np.int64), np.zeros(count))
+    known = centres @ axes.T, smoothed_normals(mesh, 3) @ axes.T, mesh.areas
+    found = FaceLevels(*known, np.full(count, -1), np.zeros(count, dtype=np.int64), np.zeros(count))
     for _, level, faces in sorted(candidates, key=lambda c: -c[0]):
         twin = _twin(level, chosen)
         if twin is None:
             chosen.append(level)
         found.set(faces, (twin or level)._replace(sign=level.sign))
-    for level, faces in _gatherings(mesh, found, axes, list(chosen)):
+    for level, faces in _gatherings(found, axes, list(chosen)):
         found.set(faces, level)
         if _twin(level, chosen) is None:
             chosen.append(level)
-    return chosen, found
+    return chosen, found, _proven(planes, axes, chosen, found, centres)
 
 
 def _parallel_to(normal: np.ndarray, axes: np.ndarray) -> tuple[int, int]:
@@ -110,22 +121,21 @@ def _twin(level: Level, others: Sequence[Level]) -> Level | None:
 
 
 def _gatherings(
-    mesh: Mesh, found: FaceLevels, axes: np.ndarray, known: Sequence[Level]
+    faces: FaceLevels, axes: np.ndarray, known: Sequence[Level]
 ) -> Iterator[tuple[Level, np.ndarray]]:
     """Levels on which the faces that no patch took gather, and their faces; known levels take theirs first."""
-    facing = smoothed_normals(mesh, 3) @ axes.T
-    heights = mesh.triangles.mean(axis=1) @ axes.T
     # so much area of left-over faces within so much height makes one more plane
     gather_m2, gather_m = 0.08, 0.03
     for axis in range(3):
         for sign in (1, -1):
-            own = np.flatnonzero((found.axis < 0) & (sign * facing[:, axis] > np.cos(np.radians(25.0))))
+            towards = sign * faces.facing[:, axis] > np.cos(np.radians(25.0))
+            own = np.flatnonzero((faces.axis < 0) & towards)
             for level in [d for d in known if (d.axis, d.sign) == (axis, sign)]:
-                near = np.abs(heights[own, axis] - level.height) < SAME_SIDE_M
+                near = np.abs(faces.middle[own, axis] - level.height) < SAME_SIDE_M
                 yield level, own[near]
                 own = own[~near]
-            own = own[np.argsort(heights[own, axis], kind="stable")]
-            x, area = heights[own, axis], mesh.areas[own]
+            own = own[np.argsort(faces.middle[own, axis], kind="stable")]
+            x, area = faces.middle[own, axis], faces.area[own]
             last = np.searchsorted(x, x + gather_m, side="right")
             while len(own):
                 total = np.concatenate([[0.0], np.cumsum(area)])
@@ -140,42 +150,30 @@ def _gatherings(
                 area = np.where(gap < 2 * SAME_SIDE_M, 0.0, area)
 
 
-def proven_levels(
-    planes: Sequence[Plane], axes: np.ndarray, levels: Sequence[Level]
+def _proven(
+    planes: Sequence[Plane], axes: np.ndarray, levels: Sequence[Level], faces: FaceLevels, centres: np.ndarray
 ) -> list[tuple[Plane, Level]]:
-    """Planes with occupied cells, each with the level that it became."""
+    """Planes with occupied cells, each with the level that it became. The faces near these cells, of middles ``centres`` (F, 3),
+    go to it, whichever plane they were snapped to."""
     result = []
+    # 0.12: a face this close to a part of a plane that photos proved belongs to it
+    least = np.full(len(centres), 0.12)
     for plane in planes:
         axis, sign = _parallel_to(plane.normal, axes)
         if axis < 0 or not plane.occupied.any():
             continue
         height = float(plane.cells().mean(axis=0) @ axes[axis])
         near = [level for level in levels if level[:2] == (axis, sign)]
-        gaps = [abs(level.height - height) for level in near]
-        if gaps and min(gaps) < SAME_SIDE_M:
-            result.append((plane, near[int(np.argmin(gaps))]))
-    return result
-
-
-def claim_proven(
-    mesh: Mesh,
-    found: FaceLevels,
-    axes: np.ndarray,
-    proven: Sequence[tuple[Plane, Level]],
-) -> None:
-    """Faces near occupied cells go to their plane, whichever plane they were snapped to."""
-    facing = smoothed_normals(mesh, 3) @ axes.T
-    centres = mesh.triangles.mean(axis=1)
-    heights = centres @ axes.T
-    # 0.12: a face this close to a part of a plane that the photos proved belongs to it
-    least = np.full(len(centres), 0.12)
-    for plane, level in proven:
-        gap = np.abs(heights[:, level.axis] - level.height)
-        towards = level.sign * facing[:, level.axis] > np.cos(np.radians(35.0))
-        own = np.flatnonzero((gap < least) & towards)
+        level = min(near, key=lambda level: abs(level.height - height), default=None)
+        if level is None or abs(level.height - height) >= SAME_SIDE_M:
+            continue
+        result.append((plane, level))
+        gap = np.abs(faces.middle[:, axis] - level.height)
+        own = np.flatnonzero((gap < least) & (sign * faces.facing[:, axis] > np.cos(np.radians(35.0))))
         own = own[plane.covers(centres[own])]
-        found.set(own, level)
+        faces.set(own, level)
         least[own] = gap[own]
+    return result
 
 
 CELL_M, MARGIN_M = 0.1, 0.3  # largest side of a box, and space kept around the mesh
@@ -322,15 +320,12 @@ def surface_of(grid: Grid, filled: np.ndarray, tolerance_m: float) -> tuple[Plan
     for a in range(3):
         b, c = (a + 1) % 3, (a + 2) % 3
         step = np.diff(filled.astype(np.int8), axis=a)
+        square = np.zeros((4, 3), dtype=int)
+        square[:, [b, c]] = [[0, 0], [1, 0], [1, 1], [0, 1]]
         for sign in (1, -1):
             index = np.argwhere(step == -sign)
             index[:, a] += 1
-            quad = []
-            for along in ((0, 0), (1, 0), (1, 1), (0, 1)):
-                corner = index.copy()
-                corner[:, [b, c]] += along
-                quad.append(np.ravel_multi_index(tuple(corner.T), nodes))
-            corners = np.stack(quad[::sign], axis=1)
+            corners = np.ravel_multi_index(tuple((index[:, None] + square[::sign]).T), nodes).T
             faces += [corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]]
             tags += [np.stack([np.full(len(index), a), index[:, a], np.full(len(index), sign)], axis=1)] * 2
     used, face = np.unique(np.concatenate(faces), return_inverse=True)
@@ -407,7 +402,7 @@ def _lines_of_sight(
     return o, d, ranges
 
 
-def closed_sides(grid: Grid, mesh: Mesh, faces: FaceLevels) -> np.ndarray:
+def closed_sides(grid: Grid, faces: FaceLevels) -> np.ndarray:
     """Whether planes cover the lower and upper end of each direction, seen from within, shape ``(3, 2)`` bool."""
     closed = np.zeros((3, 2), dtype=bool)
     extent = [h[-1] - h[0] for h in grid.heights]
@@ -416,7 +411,7 @@ def closed_sides(grid: Grid, mesh: Mesh, faces: FaceLevels) -> np.ndarray:
         across = extent[(a + 1) % 3] * extent[(a + 2) % 3]
         for k, (end, sign) in enumerate(((grid.heights[a][0], 1), (grid.heights[a][-1], -1))):
             own = (faces.axis == a) & (faces.sign == sign) & (np.abs(faces.height - end) < rim_m)
-            closed[a, k] = mesh.areas[own].sum() > rim_share * across
+            closed[a, k] = faces.area[own].sum() > rim_share * across
     return closed
 
 

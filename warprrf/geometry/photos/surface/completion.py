@@ -23,12 +23,10 @@ from warprrf.geometry.photos.gaussians.cells import BEHIND_M, plane_mesh, with_c
 from warprrf.geometry.photos.posed.photo_files import spread
 from warprrf.geometry.photos.surface.boxes import (
     FaceLevels,
-    claim_proven,
     closed_sides,
     divide,
     known_levels,
     least_surface,
-    proven_levels,
     seen_share,
     surface_of,
     votes,
@@ -63,13 +61,10 @@ def complete(
     axes = directions(patches.normal, patches.area, float(mesh.areas.sum()))
     if axes is None:
         return _without_gaps(patches, cameras), False
-    levels, faces = known_levels(patches, planes, axes)
-    proven = proven_levels(planes, axes, levels)
-    claim_proven(mesh, faces, axes, proven)
-
+    levels, faces, proven = known_levels(patches, planes, axes)
     grid = divide(mesh, axes, levels)
     free, solid = votes(grid, mesh, faces, proven, cameras, depths)
-    filled = least_surface(grid, free, solid, closed_sides(grid, mesh, faces))
+    filled = least_surface(grid, free, solid, closed_sides(grid, faces))
     if filled.all():
         return _without_gaps(patches, cameras), False
     whole, known = surface_of(grid, filled, patches.tolerance_m)
@@ -80,10 +75,7 @@ def complete(
 
 
 def _with_rest(
-    whole: PlanarPatches,
-    known: np.ndarray,
-    patches: PlanarPatches,
-    faces: FaceLevels,
+    whole: PlanarPatches, known: np.ndarray, patches: PlanarPatches, faces: FaceLevels
 ) -> PlanarPatches:
     """The completed surface with round or oblique pieces of the old mesh in place of the steps made for them."""
     new, old = whole.mesh, patches.mesh
@@ -97,15 +89,11 @@ def _with_rest(
     rest &= np.bincount(piece, weights=old.areas * rest)[piece] >= keep_m2
     if not rest.any():
         return whole
-    stays = known.copy()
-    if not known.all():
-        steps = new.triangles[~known].mean(axis=1)
-        stays[~known] = Mesh(old.vertices, old.faces[rest]).distance(steps) > keep_m
-    corners = np.concatenate([new.faces[stays], old.faces[rest] + len(new.vertices)])
-    used, corners = np.unique(corners, return_inverse=True)
+    stays, steps = known.copy(), new.triangles[~known].mean(axis=1)
+    stays[~known] = Mesh(old.vertices, old.faces[rest]).distance(steps) > keep_m
     own = patches.face_patch[rest]
     return PlanarPatches.from_planes(
-        Mesh(np.concatenate([new.vertices, old.vertices])[used], corners.reshape(-1, 3)),
+        joined([(new.vertices, new.faces[stays]), (old.vertices, old.faces[rest])]),
         np.concatenate([whole.face_patch[stays], np.where(own >= 0, own + len(whole), -1)]),
         np.concatenate([whole.normal, patches.normal]),
         np.concatenate([whole.offset, patches.offset]),
@@ -143,11 +131,8 @@ def _gaps(patches: PlanarPatches, k: int, points: np.ndarray) -> Plane:
     plane = Plane(patches.normal[k], float(patches.offset[k]), cell_m=CELL_M)
     uv = plane.to_plane(points)
     gap_m = 2.0  # gaps narrower than this are closed
-    reach = 0.5 * gap_m / CELL_M
-    low = uv.min(axis=0) - 0.5 * gap_m - CELL_M
-    shape = np.ceil((uv.max(axis=0) - low) / CELL_M + reach + 1).astype(int)
-    grid = replace(plane, corner=low, occupied=np.zeros(shape, dtype=bool))
-    own = grid.count(points) > 0
+    grid = plane.spanning(uv.min(axis=0) - 0.5 * gap_m - CELL_M, uv.max(axis=0) + 0.5 * gap_m + CELL_M)
+    own, reach = grid.count(points) > 0, 0.5 * gap_m / CELL_M
     grown = ndimage.distance_transform_edt(~own) <= reach
     closed = (ndimage.distance_transform_edt(grown) > reach) & ~own
     return replace(grid, occupied=closed)

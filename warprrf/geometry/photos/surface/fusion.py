@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 
@@ -26,13 +24,7 @@ from warprrf.geometry.photos.surface.stereo import kept_pixels, mended
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.planes import Plane
 from warprrf.geometry.rays import open3d
-from warprrf.geometry.scans import (
-    MIN_PATCH_M2,
-    SurfaceConfig,
-    largest_first,
-    simplified,
-    snapped,
-)
+from warprrf.geometry.scans import SurfaceConfig, largest_first, simplified, snapped
 from warprrf.geometry.splats.camera import Camera, slopes_of
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.render import render
@@ -59,7 +51,7 @@ def depth_maps(
     *,
     photos: PosedPhotos | None = None,
     planes: Sequence[Plane] = (),
-    config: ReconstructionConfig | None = None,
+    config: ReconstructionConfig,
     progress: Progress | None = None,
     device: DeviceLike = None,
 ) -> list[np.ndarray]:
@@ -69,7 +61,6 @@ def depth_maps(
         photos: what ``cameras`` saw, in the same order; the depth maps are mended by them.
         planes: that Gaussians were kept on: elsewhere only what photos prove is reliable.
     """
-    config = config or ReconstructionConfig()
     report = progress or (lambda stage, done, total: None)
     views, depths = depth_views(cameras, config.surface), []
     alpha = 0.6  # a depth counts where at least so much light is blocked,
@@ -129,7 +120,7 @@ def fuse_maps(
     depths: Sequence[np.ndarray],
     *,
     planes: Sequence[Plane] = (),
-    config: ReconstructionConfig | None = None,
+    config: ReconstructionConfig,
     progress: Progress | None = None,
 ) -> tuple[PlanarPatches, bool]:
     """Mesh of depth maps with its planar patches, the largest first; and whether its holes were closed.
@@ -138,7 +129,6 @@ def fuse_maps(
         depths: ranges [m], 0 where unknown, each of one of ``views``.
         planes: known beforehand; the mesh is snapped to them.
     """
-    config = config or ReconstructionConfig()
     report = progress or (lambda stage, done, total: None)
     report("surface", 0, 4)
     mesh = fuse_depth(depths, views, config=_with_voxels(config.surface, views, depths))
@@ -149,7 +139,7 @@ def fuse_maps(
     if config.completion:
         patches, whole = complete(patches, views, depths, planes=planes)
     report("surface", 3, 4)
-    result = largest_first(simplified(patches), MIN_PATCH_M2)
+    result = largest_first(simplified(patches))
     report("surface", 4, 4)
     return result, whole
 
@@ -165,15 +155,12 @@ def _with_voxels(
     return replace(config, voxel_m=min(config.voxel_m, voxel_pixels * float(np.median(pixel_m))))
 
 
-def fuse_depth(
-    depths: Sequence[np.ndarray], cameras: Sequence[Camera], *, config: SurfaceConfig | None = None
-) -> Mesh:
+def fuse_depth(depths: Sequence[np.ndarray], cameras: Sequence[Camera], *, config: SurfaceConfig) -> Mesh:
     """One mesh from depth maps of pinhole cameras, by a truncated signed distance field.
 
     Args:
         depths: Euclidean range per pixel [m], each ``(height, width)`` of its camera; inf, NaN or 0 where unknown.
     """
-    config = config or SurfaceConfig()
     o3d = open3d()
     core = o3d.core
     grid = o3d.t.geometry.VoxelBlockGrid(
@@ -200,31 +187,27 @@ def fuse_depth(
     raw = grid.extract_triangle_mesh(min_views - 0.5).to_legacy() if filled else None
     if raw is None or len(raw.triangles) == 0:
         raise ValueError("depths: no surface came out; are the maps ranges in metres and the poses right?")
-    return _without_debris(_ordered(o3d, raw), config)
+    return _without_debris(np.asarray(raw.vertices), np.asarray(raw.triangles), config)
 
 
-def _without_debris(raw: Any, config: SurfaceConfig) -> Mesh:
-    raw.merge_close_vertices(1e-4 * config.voxel_m)
-    raw.remove_degenerate_triangles()
-    label, count, _ = raw.cluster_connected_triangles()
-    raw.remove_triangles_by_mask(np.asarray(count)[np.asarray(label)] < config.min_component_faces)
-    raw.remove_unreferenced_vertices()
-    if len(raw.triangles) == 0:
-        raise ValueError(f"min_component_faces: no connected piece has {config.min_component_faces} faces")
-    return Mesh(np.asarray(raw.vertices), np.asarray(raw.triangles))
-
-
-def _ordered(o3d: ModuleType, raw: Any) -> Any:
-    """The mesh with vertices and faces in an order of their own, not in that in which threads found them."""
-    vertices, faces = np.asarray(raw.vertices), np.asarray(raw.triangles)
+def _without_debris(vertices: np.ndarray, faces: np.ndarray, config: SurfaceConfig) -> Mesh:
+    """The mesh without small pieces, in an order of its own, not in that in which threads found vertices and faces."""
     order = np.lexsort(vertices.T[::-1])
     faces = np.argsort(order)[faces]
     turn = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
     faces = np.take_along_axis(faces, turn, axis=1)
-    faces = faces[np.lexsort(faces.T[::-1])]
-    return o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(vertices[order]), o3d.utility.Vector3iVector(faces.astype(np.int32))
-    )
+    faces = faces[np.lexsort(faces.T[::-1])].astype(np.int32)
+    o3d = open3d()
+    vectors = o3d.utility.Vector3dVector(vertices[order]), o3d.utility.Vector3iVector(faces)
+    found = o3d.geometry.TriangleMesh(*vectors)
+    found.merge_close_vertices(1e-4 * config.voxel_m)
+    found.remove_degenerate_triangles()
+    label, count, _ = found.cluster_connected_triangles()
+    found.remove_triangles_by_mask(np.asarray(count)[np.asarray(label)] < config.min_component_faces)
+    found.remove_unreferenced_vertices()
+    if len(found.triangles) == 0:
+        raise ValueError(f"min_component_faces: no connected piece has {config.min_component_faces} faces")
+    return Mesh(np.asarray(found.vertices), np.asarray(found.triangles))
 
 
 def _smooth(z: np.ndarray, tolerance: float) -> np.ndarray:

@@ -89,7 +89,7 @@ def cut_by_colour(colours: np.ndarray) -> np.ndarray:
     edges = [first, second, difference, order[:count]]
     alone = np.ones(number.size, dtype=np.int32), np.zeros(number.size, dtype=np.float32)
     launch(cut, 1, [*edges, COARSENESS / 255, LEAST_PX, parent, *alone], device="cpu")
-    return np.asarray(parent.numpy().reshape(number.shape))
+    return parent.numpy().reshape(number.shape)
 
 
 def _plane(

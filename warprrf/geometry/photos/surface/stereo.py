@@ -81,18 +81,15 @@ def mended(
 
 def ahead(camera: Camera) -> np.ndarray:
     """Depth along the optical axis over range, shape ``(height, width)``."""
-    cosine: np.ndarray = camera.directions() @ camera.rotation[2]
-    return cosine
+    return camera.directions() @ camera.rotation[2]
 
 
 def kept_pixels(photos: PosedPhotos, number: int, camera: Camera) -> np.ndarray:
     """The pixels of a photo that are not masked, at the size of ``camera``, bool."""
-    mask = photos.masks[number]
-    if mask is None:
-        return np.full((camera.height, camera.width), True)
+    mask = photos.mask(number)
     rows, columns = ((np.arange(n) + 0.5) / n for n in (camera.height, camera.width))
     inside = (rows * mask.shape[0]).astype(int), (columns * mask.shape[1]).astype(int)
-    return np.asarray(np.asarray(mask)[np.ix_(*inside)] == 0)
+    return ~mask[np.ix_(*inside)]
 
 
 def _sharpness(pixels: Sequence[np.ndarray]) -> np.ndarray:
@@ -202,7 +199,7 @@ def _votes(
     known = depth > 0
     agreed, crossed = (np.zeros(depth.shape, dtype=np.int64) for _ in range(2))
     cameras, ranges = [other for other, _ in others], [seen.ravel() for _, seen in others]
-    if not known.any() or not cameras:
+    if not cameras:
         return agreed, crossed
     points = camera.position + depth[known][:, None] * camera.directions()[known]
     eyes = np.array([c.position for c in cameras])
