@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from warprrf.rows import distinct_rows, sums_of
+from warprrf.rows import couples, distinct_rows, sums_of
 
 
 @pytest.mark.parametrize(("count", "columns", "values"), [(0, 2, 3), (1, 3, 3), (400, 2, 12), (900, 3, 9)])
@@ -17,6 +17,9 @@ def test_distinct_rows_are_those_of_numpy(count, columns, values):
         known = np.unique(rows, axis=0, return_index=True, return_inverse=True, return_counts=True)[1:]
         for own, other in zip(found, known, strict=True):
             assert np.array_equal(own, other.reshape(-1))
+        first, second = couples(rows)
+        assert np.array_equal(first, np.sort(known[0][known[2] == 2])[np.argsort(np.argsort(first))])
+        assert (first < second).all() and np.array_equal(rows[first], rows[second])
 
 
 def test_sums_are_those_of_each_owner_s_rows():

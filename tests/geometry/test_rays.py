@@ -1,6 +1,7 @@
 """Ray and distance queries, on both back ends, against answers known in closed form; their hard cases."""
 
 import importlib.util
+import os
 import sys
 
 import numpy as np
@@ -192,6 +193,14 @@ def test_auto_takes_embree_for_many_rays_on_a_cpu_where_it_is_installed(monkeypa
     assert choose("auto", cpu, raysearch.EMBREE_RAYS - 1) == "warp"
     monkeypatch.setattr(raysearch, "open3d_installed", lambda: False)
     assert choose("auto", cpu, 10**7) == "warp"
+
+
+@no_embree
+def test_more_threads_than_cores_are_not_asked_of_embree(monkeypatch):
+    """It would say so on standard error."""
+    monkeypatch.setattr(raysearch, "threads", lambda: 999)
+    scene = raysearch.EmbreeScene(np.eye(3), np.array([[0, 1, 2]]), np.array([0]))
+    assert scene._threads_for(np.empty((10_000_000, 0))) == os.cpu_count()
 
 
 def test_the_same_directions_are_cast_from_every_origin(where):

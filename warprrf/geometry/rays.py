@@ -8,6 +8,7 @@ float64 from the plane of that face (:mod:`warprrf.kernels.rays.mesh`), so the t
 from __future__ import annotations
 
 import importlib.util
+import os
 import sys
 from dataclasses import dataclass
 from functools import cache
@@ -311,7 +312,7 @@ class EmbreeScene:
         return met.numpy()
 
     def _threads_for(self, rays: np.ndarray) -> int:
-        return min(threads(), 1 + len(rays) // _RAYS_A_THREAD)
+        return min(threads(), os.cpu_count() or 1, 1 + len(rays) // _RAYS_A_THREAD)
 
 
 def open3d() -> ModuleType:
