@@ -468,6 +468,22 @@ def test_a_set_keeps_its_name_with_other_mirrors_and_edges(scene, data):
         assert field.report["choices"][0]["term"].startswith(name)
 
 
+def test_receivers_held_out_choose_effects_alone(scene, data):
+    """Two of them refuse a residual, or fewer materials, by chance."""
+    wrong = np.random.default_rng(3).uniform(0.1, 10.0, data.path_gain.shape)
+    noisy = replace(
+        data, path_gain=data.path_gain * wrong
+    )  # nothing that is learned of places is true elsewhere
+    field = RadioField.fit(scene, noisy.subset(np.arange(8)), sub_pixels=1, iterations=1)
+    assert field.effects.residual and np.ptp(field.residual) > 0.1
+    others = [
+        choice
+        for choice in field.report["choices"]
+        if choice["term"] not in (*SETS, "no diffraction", "no transmission")
+    ]
+    assert all("materials as" in choice["term"] and choice["kept"] for choice in others)
+
+
 def test_a_quick_fit_tries_nothing_and_is_near(scene, data):
     few, test = data.subset(np.arange(6)), data.subset(np.arange(6, 10))
     quick = RadioField.fit(scene, few, quick=True)
