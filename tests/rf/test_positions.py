@@ -176,6 +176,16 @@ def test_a_room_is_one_whichever_way_each_face_is_wound(seed):
     np.testing.assert_array_equal(is_free(mesh, places), free)
 
 
+def test_beyond_the_walls_is_no_air_though_finer_faces_cover_them():
+    """Two surfaces, one on the other, were walls with air beyond: in the corner of an L a receiver passed."""
+    known = rooms.l_shaped()
+    mesh, beyond = rooms.LAWS["covered by finer faces"](known).mesh, np.array([7.0, 5.5, 1.4])
+    places = np.random.default_rng(1).uniform(*mesh.bounds, (500, 3))
+    np.testing.assert_array_equal(is_free(mesh, places), is_free(known.mesh, places))
+    with pytest.raises(ValueError, match=r"receivers.*expected a place in the air"):
+        check_positions(mesh, known.transmitter, beyond, WAVELENGTH)
+
+
 def test_a_room_is_closed_though_corners_of_its_sides_do_not_meet():
     """Each side is cut into pieces by itself, as exporters and remeshers do; with one side missing it is open."""
     sides = []

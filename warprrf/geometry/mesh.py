@@ -328,6 +328,11 @@ class Mesh:
         count = self.closed_part_of.max() + 1
         return [Mesh(self.vertices, self.faces[self.closed_part_of == k]) for k in range(count)]
 
+    def parts_by_box(self, reach_m: float) -> np.ndarray:
+        """Number of each of :attr:`closed_parts`; copies fill one box, to ``reach_m``, and have one."""
+        boxes = np.array([part.bounds.ravel() for part in self.closed_parts]).reshape(-1, 6)
+        return components(len(boxes), cKDTree(boxes).query_pairs(reach_m, output_type="ndarray"))
+
     @cached_property
     def center(self) -> np.ndarray:
         """Middle of the bounds [m], shape ``(3,)``: the origin of the float32 copy that devices hold."""
@@ -496,7 +501,7 @@ class Mesh:
     def cross_section(self, height: Number) -> np.ndarray:
         """Line segments in which the surface meets the plane z = ``height`` [m]: a floor plan, shape ``(S, 2, 2)`` [m]."""
         a, b = self.triangles, np.roll(self.triangles, -1, axis=1)
-        crosses = (a[:, :, 2] > height) != (b[:, :, 2] > height)  # two edges of a face, or none
+        crosses = (a[:, :, 2] > height) != (b[:, :, 2] > height)
         a, way = a[crosses], (b - a)[crosses]
         share = (height - a[:, 2:]) / way[:, 2:]
         return (a + share * way)[:, :2].reshape(-1, 2, 2)

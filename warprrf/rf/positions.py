@@ -440,8 +440,9 @@ def _rooms(mesh: Mesh) -> list[int]:
 
 
 def _outermost_first(mesh: Mesh) -> list[tuple[int, Mesh]]:
-    """Closed parts with their numbers."""
-    return sorted(enumerate(mesh.closed_parts), key=lambda item: -_box(item[1]))
+    """Closed parts with their numbers, of copies the first."""
+    first = np.unique(mesh.parts_by_box(WALL_CLEARANCE_M), return_index=True)[1]
+    return sorted(((k, mesh.closed_parts[k]) for k in first), key=lambda item: -_box(item[1]))
 
 
 def _box(mesh: Mesh) -> float:

@@ -323,8 +323,7 @@ class RadioField(ABC):
 
         Of ``rf3dgs+`` a diffuse path arrives from its pixel's centre, but its vertex, length and departure are those of the
         centre of the Gaussian that contributes most there (RF-3DGS+'s rule). Wide Gaussians reach over many pixels: arrival and
-        direction to the vertex differ by 1 to 2 degrees in the median with 30,000 Gaussians in a room, and by 10 and more
-        with less than 700; ``interaction_point="peak"`` or
+        direction to the vertex differ by degrees, by 10 and more with few Gaussians; ``interaction_point="peak"`` or
         ``"mesh"`` of :class:`~warprrf.rf.fields.harmonic.fitting.FieldOptions` puts the vertex on the ray.
 
         Args:

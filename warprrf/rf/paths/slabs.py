@@ -11,11 +11,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from warprrf.cache import cached_property
 from warprrf.device import DeviceLike
-from warprrf.geometry.mesh import Mesh, components, headings
+from warprrf.geometry.mesh import Mesh, headings
 from warprrf.rf.em.fresnel import slab_passage, slab_transmission
 from warprrf.rows import Rows
 
@@ -128,11 +127,8 @@ class Walls:
 
     @cached_property
     def _part(self) -> np.ndarray:
-        """Closed part of each face, -1 for none; parts that fill one box are one, as copies that lie micrometres apart."""
-        parts = self.mesh.closed_parts
-        boxes = cKDTree(np.array([p.bounds.ravel() for p in parts]).reshape(-1, 6))
-        label = components(len(parts), boxes.query_pairs(self.clearance_m, output_type="ndarray"))
-        return np.append(label, -1)[self.mesh.closed_part_of]
+        """Closed part of each face, -1 for none; copies that lie micrometres apart are one."""
+        return np.append(self.mesh.parts_by_box(self.clearance_m), -1)[self.mesh.closed_part_of]
 
     def between(self, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, Slabs]:
         """Which of the ways from ``start`` to ``end``, (N, 3) or (3,), arrive, and the slabs that those pass."""

@@ -497,6 +497,25 @@ def test_a_quick_fit_tries_nothing_and_is_near(scene, data):
         RadioField.fit(scene, few, sub_pixels=0)
 
 
+@pytest.mark.parametrize(
+    ("effects", "slabs_count"), [("single", False), (Effects(mirrors=1, scatterings=1), True)]
+)
+def test_of_materials_a_fit_uses_their_names_and_what_makes_slabs_of_them(data, effects, slabs_count):
+    """Permittivity and thickness, and these only for transmission and diffraction."""
+    known = [itu_material("plasterboard"), itu_material("wood", thickness_m=0.02)]
+    others = [replace(m, scattering=0.7, pattern="directive", alpha_r=7, xpd=0.2) for m in known]
+    pane = np.array([[3.4, 0.01, 0.01], [3.4, 3.9, 0.01], [3.4, 3.9, 2.9], [3.4, 0.01, 2.9]])
+    mesh, part = joined(ROOM, (pane, np.array([[0, 1, 2], [0, 2, 3]])))
+    found = [
+        RadioField.fit(Scene(mesh, materials, part), data.subset([0, 5]), quick=True, effects=effects)
+        .spectrum(RECEIVERS[0])
+        .path_gain
+        for materials in (known, others, [replace(m, thickness_m=0.3) for m in known])
+    ]
+    np.testing.assert_array_equal(found[1], found[0])
+    assert np.array_equal(found[2], found[0]) != slabs_count
+
+
 def test_a_fit_goes_on_after_steps_that_were_cut_short(field, monkeypatch):
     """One weight has 9 nepers to go, 1.5 a step, while pixels that nothing explains hide how much each step gains."""
     lit, count = 20, 4020
