@@ -214,7 +214,7 @@ def detect_planes(
         # A wider band goes with it, so that the plane's own fringe is not found again as a second plane.
         near = np.abs(plane.distance(points[free])) < 2.5 * config.distance_m
         free = free[~(near & (normals[free] @ plane.normal > config.cosine))]
-    return _merged(points, weight, found, config)
+    return _without_echoes(points, weight, found, config)
 
 
 def drawn_by_place(points: np.ndarray, weight: np.ndarray, count: int, salt: int) -> np.ndarray:
@@ -268,33 +268,19 @@ def _best_plane(
     return best
 
 
-def _merged(
+def _without_echoes(
     points: np.ndarray, weight: np.ndarray, planes: Sequence[Plane], config: PlaneConfig
 ) -> list[Plane]:
-    """Planes that describe each other's points as well as their own become one; every plane is fitted once more."""
+    """``planes`` without those that are noise of better ones, each fitted once more, the best supported first."""
 
     def support(plane: Plane) -> float:
         return -float(weight[plane.inliers].sum())
 
-    def rms(plane: Plane, other: Plane) -> float:
-        return float(np.sqrt(np.mean(plane.distance(points[other.inliers]) ** 2)))
-
-    kept: list[Plane] = []
-    for plane in sorted(planes, key=support):
-        for k, other in enumerate(kept):
-            alike = other.normal @ plane.normal > np.cos(np.radians(3.0))
-            if (
-                alike
-                and rms(other, plane) < 2 * config.distance_m
-                and rms(plane, other) < 4 * config.distance_m
-            ):
-                kept[k] = replace(other, inliers=np.union1d(other.inliers, plane.inliers))
-                break
-        else:
-            kept.append(plane)
-    kept = [p for k, p in enumerate(kept) if not any(_echo(points, p, strong, config) for strong in kept[:k])]
+    ranked = sorted(planes, key=support)
     refitted: list[Plane] = []
-    for plane in kept:
+    for k, plane in enumerate(ranked):
+        if any(_echo(points, plane, strong) for strong in ranked[:k]):
+            continue
         normal, offset, own = plane.normal, plane.offset, points[plane.inliers]
         for _ in range(3):
             w = weight[plane.inliers] / (1 + ((own @ normal - offset) / (0.5 * config.distance_m)) ** 2)
@@ -306,7 +292,7 @@ def _merged(
     return sorted(refitted, key=support)
 
 
-def _echo(points: np.ndarray, plane: Plane, strong: Plane, config: PlaneConfig) -> bool:
+def _echo(points: np.ndarray, plane: Plane, strong: Plane) -> bool:
     """Whether ``plane`` is only noise of a better supported parallel one: then points of both share the same places.
 
     A poster in front of a wall is no echo: behind it, the wall has no points.

@@ -125,7 +125,7 @@ def visible_from(
     for c, camera in enumerate(cameras):
         inside, _ = camera.in_frame(points, 0.05)
         seen[:, c] = inside & (((camera.position - points) * normal).sum(axis=1) > 0)
-    if surface is not None and seen.any():
+    if surface is not None:
         positions = np.array([camera.position for camera in cameras])
         point, eye = np.nonzero(seen)
         seen[point, eye] = surface.visible(points[point] + clearance_m * normal, positions[eye])

@@ -62,20 +62,21 @@ class GreyPhotos:
         cls, cameras: Sequence[Camera], images: Sequence[np.ndarray], device: DeviceLike = None
     ) -> GreyPhotos:
         """Photos ``(H, W, 3)`` in [0, 1] at the sizes of ``cameras``."""
-        pixels = []
-        for camera, photo in zip(cameras, images, strict=True):
-            grey, size = np.asarray(photo, dtype=np.float32) @ LUMA, (camera.width, camera.height)
-            if grey.shape != size[::-1]:
-                image = require("PIL.Image", extra="photos")
-                grey = np.asarray(image.fromarray(grey).resize(size, image.BOX))
-            pixels.append(grey)
-        flat = np.concatenate([grey.ravel() for grey in pixels])
+        grey = (np.asarray(photo, dtype=np.float32) @ LUMA for photo in images)
+        pixels = [resized(photo, camera) for photo, camera in zip(grey, cameras, strict=True)]
+        flat = np.concatenate([photo.ravel() for photo in pixels])
         return cls(cameras, pixels, layout(cameras), wp.array(flat, dtype=wp.float32, device=resolve(device)))
 
     @property
     def device(self) -> wp.Device:
         """Where they lie."""
         return self.flat.device
+
+
+def resized(pixels: np.ndarray, camera: Camera) -> np.ndarray:
+    """A photo of bytes or single precision, ``(H, W)`` or ``(H, W, 3)``, at the size of ``camera``, averaged over its pixels."""
+    image = require("PIL.Image", extra="photos")
+    return np.asarray(image.fromarray(pixels).resize((camera.width, camera.height), image.BOX))
 
 
 def block_means(pixels: np.ndarray, side: int, dtype: DTypeLike | None = None) -> np.ndarray:

@@ -61,7 +61,7 @@ class KnownCamera:
     size: tuple[int, int]
     lens: tuple[float, ...]
     angle: float
-    world_to_camera: np.ndarray = field(repr=False)
+    world_to_camera: np.ndarray
     depth: DepthFile | None = None
 
     def of_size(self, name: str, width: int, height: int) -> Lens:

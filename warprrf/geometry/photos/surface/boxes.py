@@ -5,7 +5,7 @@ these, and the surface between free and solid ones that costs least.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -197,8 +197,8 @@ class Grid:
 
     axes: np.ndarray
     heights: list[np.ndarray]
-    planes: list[np.ndarray] = field(repr=False)
-    known: list[np.ndarray] = field(repr=False)
+    planes: list[np.ndarray]
+    known: list[np.ndarray]
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -357,7 +357,7 @@ def votes(
     o, d, ranges = _lines_of_sight(cameras, depths)
     hit = mesh.cast(o, d)
     snap_m = 0.12  # a depth agrees with the mesh when both are this close
-    agree = hit.valid & (np.abs(np.where(hit.valid, hit.t, 0.0) - ranges) < snap_m)
+    agree = np.abs(hit.t - ranges) < snap_m
     o, d, ranges, t, face = o[agree], d[agree], ranges[agree], hit.t[agree], hit.face[agree]
     axis, sign, height = faces.axis[face], faces.sign[face], faces.height[face]
     normal = sign[:, None] * grid.axes[axis]
@@ -395,7 +395,7 @@ def _lines_of_sight(
     parts, some = [], (slice(STRIDE // 2, None, STRIDE),) * 2
     for camera, depth in zip(cameras, depths, strict=True):
         ranges = np.asarray(depth, dtype=np.float64)[some].ravel()
-        seen = np.isfinite(ranges) & (ranges > 0)
+        seen = ranges > 0
         towards = camera.directions()[some].reshape(-1, 3)[seen]
         parts.append((np.broadcast_to(camera.position, towards.shape), towards, ranges[seen]))
     o, d, ranges = (np.concatenate(p) for p in zip(*parts, strict=True))

@@ -114,8 +114,8 @@ def _without_gaps(patches: PlanarPatches, cameras: Sequence[Camera]) -> PlanarPa
             looked = np.flatnonzero(camera.in_frame(cells)[0] & (plane.distance(camera.position[None]) > 0))
             ahead = cells[looked] - camera.position
             away = np.linalg.norm(ahead, axis=1)
-            met = mesh.cast(np.broadcast_to(camera.position, ahead.shape), ahead)
-            through[looked] |= met.valid & (np.where(met.valid, met.t, 0.0) > away + BEHIND_M)
+            met = mesh.cast(camera.position, ahead)
+            through[looked] |= met.valid & (met.t > away + BEHIND_M)
         squares = plane_mesh([with_cells(plane, ~through)])
         if squares is not None:
             meshes.append(squares)

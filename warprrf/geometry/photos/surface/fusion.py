@@ -92,7 +92,7 @@ def _sure(
     for plane in planes:
         held |= plane.holds(points, reach_m)
     result = depth.copy()
-    result[rest] = np.where(held, depth[rest], 0.0)
+    result[rest] *= held
     return result
 
 

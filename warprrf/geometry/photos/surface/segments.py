@@ -19,7 +19,8 @@ import numpy as np
 import warp as wp
 from scipy import ndimage
 
-from warprrf.device import launch, require
+from warprrf.device import launch
+from warprrf.geometry.photos.posed.images import resized
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.segments import cut
 
@@ -64,9 +65,7 @@ def with_segments(
 
 def segments_of(photo: np.ndarray, view: Camera) -> np.ndarray:
     """A number for the segment of each pixel of ``view`` in its ``photo``, in [0, 1], shape ``(H, W, 3)``, of any size."""
-    image = require("PIL.Image", extra="photos")
-    bytes_ = np.round(255 * np.asarray(photo)).astype(np.uint8)
-    return cut_by_colour(np.asarray(image.fromarray(bytes_).resize((view.width, view.height), image.BOX)))
+    return cut_by_colour(resized(np.round(255 * np.asarray(photo)).astype(np.uint8), view))
 
 
 def cut_by_colour(colours: np.ndarray) -> np.ndarray:
