@@ -427,6 +427,7 @@ def test_effects_may_change_after_the_fit(field):
     more, less = (one.spectrum(place, uncertainty=True) for one in (all_on, bare))
     assert more.total_path_gain > field.spectrum(place).total_path_gain > less.total_path_gain > 0
     assert np.isfinite(more.std_db).all()
+    assert (all_on.at_frequency(F).spectrum(place, uncertainty=True).std_db == more.std_db).all()
 
 
 def test_one_training_receiver_is_enough_for_a_field(scene, data):

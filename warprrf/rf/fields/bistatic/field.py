@@ -285,8 +285,9 @@ class BistaticField(RadioField):
         ratio = check_frequency(frequency_hz) / self.frequency_hz
         fall = 20.0 * float(np.log10(ratio))
         return replace(
-            self, frequency_hz=float(frequency_hz), parameters=self.parameters.at_ratio(ratio), errors=None,
-            floor=self.floor / ratio**2, range_db=(self.range_db[0] - fall, self.range_db[1] - fall),
+            self, frequency_hz=float(frequency_hz), parameters=self.parameters.at_ratio(ratio),
+            errors=self.errors if ratio == 1.0 else None, floor=self.floor / ratio**2,
+            range_db=(self.range_db[0] - fall, self.range_db[1] - fall),
         )  # fmt: skip
 
     def with_geometry(self, geometry: GeometryLike) -> BistaticField:
