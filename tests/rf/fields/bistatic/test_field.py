@@ -485,6 +485,12 @@ def test_receivers_held_out_choose_effects_alone(scene, data):
     assert all("materials as" in choice["term"] and choice["kept"] for choice in others)
 
 
+@pytest.mark.parametrize("effects", ["auto", "room"])
+def test_few_receivers_join_no_materials(scene, data, effects):
+    field = RadioField.fit(scene, data.subset(np.arange(5)), effects=effects, sub_pixels=1, iterations=1)
+    assert not [choice for choice in field.report["choices"] if "materials as" in choice["term"]]
+
+
 def test_a_quick_fit_tries_nothing_and_is_near(scene, data):
     few, test = data.subset(np.arange(6)), data.subset(np.arange(6, 10))
     quick = RadioField.fit(scene, few, quick=True)

@@ -158,8 +158,7 @@ def choose(t: Training) -> Solution:
     material = t.surface.material
     start = t.start(material)
     trials = [Solution(effects, material, start, np.zeros((0, 0)), []) for effects in t.candidates]
-    least_held = 2 if len(trials) > 1 else 1  # to choose effects by: one alone likes what others do not
-    if len(t.held) < least_held:
+    if len(t.held) < 2:  # one alone likes what others do not
         return _choose_of_few(t, trials)
     best, least = None, np.inf
     for trial in trials:  # each holds the one before it: what is no better with some is not tried with more
