@@ -485,10 +485,13 @@ def test_receivers_held_out_choose_effects_alone(scene, data):
     assert all("materials as" in choice["term"] and choice["kept"] for choice in others)
 
 
-@pytest.mark.parametrize("effects", ["auto", "room"])
-def test_few_receivers_join_no_materials(scene, data, effects):
-    field = RadioField.fit(scene, data.subset(np.arange(5)), effects=effects, sub_pixels=1, iterations=1)
-    assert not [choice for choice in field.report["choices"] if "materials as" in choice["term"]]
+@pytest.mark.parametrize(
+    ("effects", "count", "joined"), [("auto", 5, False), ("room", 5, False), ("room", 8, True)]
+)
+def test_few_receivers_join_no_materials(scene, data, effects, count, joined):
+    few = data.subset(np.arange(count))
+    field = RadioField.fit(scene.mesh, few, effects=effects, sub_pixels=1, iterations=1)
+    assert any("materials as" in choice["term"] for choice in field.report["choices"]) == joined
 
 
 def test_a_quick_fit_tries_nothing_and_is_near(scene, data):
