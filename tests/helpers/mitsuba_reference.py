@@ -85,7 +85,7 @@ def mitsuba_sequences(link: Link, samples: int, scatterings: int, runs: int = 8)
             return both - one
 
         upto = [traced(dark, n) for n in range(1, scatterings + 1)]
-        lit = second(1, integrator="ptracer", light=_toward_mirrors(mi, link))
+        lit = second(8, integrator="ptracer", light=_toward_mirrors(mi, link))
         further = {"S" * n: upto[n - 1] - upto[n - 2] for n in range(2, scatterings + 1)}
         return {"S": upto[0], "SM": second(4), "MS": lit, **further}
 

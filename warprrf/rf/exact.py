@@ -289,9 +289,10 @@ class ExactEngine:
         return _Beams(hits, own, length_m[onward.ray], name + rays.sequence, rays.times)
 
     def _some(self, rays: _Beams, most: int) -> tuple[np.ndarray, int]:
-        """Of the rays those that hit something, at most so many of a pixel: a lattice again. How many each of them stands for."""
+        """Of the rays those that hit something, at most so many of a pixel, and more where it has more than by default: a lattice
+        again. How many each of them stands for."""
         per_pixel = self._tracer.grid.per_pixel
-        count = per_pixel // rays.times
+        count, most = per_pixel // rays.times, most * max(per_pixel // SUB_PIXELS**2, 1)
         every = next(n for n in range(1, count + 1) if count % n == 0 and count // n <= most)
         place = rays.ray % per_pixel // rays.times
         return np.flatnonzero((rays.hits.face >= 0) & (place % every == every // 2)), every
