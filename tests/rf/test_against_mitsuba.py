@@ -126,8 +126,8 @@ def noise_db(found: Estimate) -> float:
 ROOMS = {"floor": (floor_and_mirror, 1), "lobby": (lobby, 3)}  # and scatterings that are compared
 LOOK = "9 rays a pixel where a mirror shows the ceiling beside the transmitter: 0.14 dB where 0.10 are asked"
 FEW = "3 rays a pixel see what mirrors light: 0.36 dB where 0.14 are asked"
-LIT = "mirrors light whole pieces of cells, or none of them: 1.5 dB where 0.44 are asked"
-ELEMENTS = "elements are lit evenly, by 128 rays: 0.6 dB of SS where 0.20 are asked, 1.2 % of SSS where 1, 0.3 dB where 0.22"
+LIT = "mirrors light whole pieces of cells, or none of them: 1.5 dB where 0.18 are asked"
+ELEMENTS = "light is taken to reach elements from everywhere alike: 1.2 % of SS; 128 rays of each: 0.6 dB where 0.20 are asked; SSS 0.3 where 0.22"
 
 
 def cases(**wrong: str) -> list[object]:
