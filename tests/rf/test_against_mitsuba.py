@@ -127,7 +127,10 @@ ROOMS = {"floor": (floor_and_mirror, 1), "lobby": (lobby, 3)}  # and scatterings
 LOOK = "9 rays a pixel where a mirror shows the ceiling beside the transmitter: 0.14 dB where 0.10 are asked"
 FEW = "3 rays a pixel see what mirrors light: 0.36 dB where 0.14 are asked"
 LIT = "mirrors light whole pieces of cells, or none of them: 1.5 dB where 0.18 are asked"
-ELEMENTS = "light is taken to reach elements from everywhere alike: 1.2 % of SS; 128 rays of each: 0.6 dB where 0.20 are asked; SSS 0.3 where 0.22"
+ELEMENTS = (
+    "light is taken to reach elements from everywhere alike: 1.2 % of SS; 128 rays of each: 0.6 dB where 0.20 are asked; "
+    "SSS 0.3 where 0.22"
+)
 
 
 def cases(**wrong: str) -> list[object]:
