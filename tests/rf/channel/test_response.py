@@ -302,6 +302,22 @@ def test_channels_need_a_carrier_delays_and_for_spherical_waves_points():
             replace(p, **changed).cfr([3e11], **asked)
 
 
+@pytest.mark.parametrize("end", ["t", "r"])
+def test_angles_that_are_not_known_count_with_arrays_alone(end):
+    """As of a field that was fitted to spectra without departures."""
+    p = random_paths(5)
+    blind = replace(p, **{f"{angle}_{end}": np.full(5, np.nan) for angle in ("theta", "phi")})
+    np.testing.assert_array_equal(blind.cfr([F, 1.01 * F]), p.cfr([F, 1.01 * F]))
+    np.testing.assert_array_equal(blind.cir()[0], p.cir()[0])
+    for array in (
+        PlanarArray(1, 2),
+        PlanarArray(1, 1, polarisation="V"),
+        PlanarArray(1, 1, pattern="dipole"),
+    ):
+        with pytest.raises(ValueError, match=f"{end}x_array: got one for paths whose angles"):
+            blind.cfr([F], **{f"{end}x_array": array})
+
+
 @pytest.mark.parametrize("wave", ["plane", "spherical"])
 @pytest.mark.parametrize("squint", [False, True])
 @pytest.mark.parametrize("method", ["dense", "grid"])

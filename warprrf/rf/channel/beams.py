@@ -372,7 +372,7 @@ def rays_of_users(sources: Source | Iterable[Source], tx: Codebook) -> list[Rays
 
 def rays_of(source: Source, tx: Codebook) -> Iterator[Rays]:
     """Departure (arrival, if it does not matter), arrival and power of what reaches each receiver of ``source``."""
-    directed = tx.array.elements > 1 or tx.array.element.pattern != "isotropic"
+    directed = tx.array.directed
     if isinstance(source, PathArrays):
         for paths in source.each():
             kept = paths.select(paths.power > 0)

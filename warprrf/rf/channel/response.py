@@ -303,6 +303,12 @@ def _links(
         index = np.flatnonzero(own.valid & ~scattered if diffuse == "power" else own.valid)
         chosen = own.select(index)
         chosen.check_delays()
+        for name, array, toward in (
+            ("tx_array", tx, chosen.departure),
+            ("rx_array", rx, chosen.arrival),
+        ):
+            if array.directed and np.isnan(toward).any():
+                raise ValueError(f"{name}: got one for paths whose angles there are NaN, expected None")
         amplitude = _amplitudes(chosen, tx, rx)
         if diffuse == "random_phase":
             turns = np.zeros(len(own.gain))
