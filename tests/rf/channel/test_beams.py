@@ -149,6 +149,8 @@ def test_what_no_codebook_can_be_made_of_is_named():
     array = wr.PlanarArray(2, 2)
     with pytest.raises(ValueError, match="array: got polarisation 'V'"):
         wr.channel.dft_codebook(wr.PlanarArray(2, 2, polarisation="V"))
+    with pytest.raises(ValueError, match="array: got polarisation 'VH'"):
+        wr.channel.Codebook(wr.PlanarArray(2, 2, polarisation="VH"), (np.eye(4),))
     for factors in ((np.ones((2, 5)),), (np.ones((2, array.cols)),) * 3, ()):
         with pytest.raises(ValueError, match="factors: got"):
             wr.channel.Codebook(array, factors)

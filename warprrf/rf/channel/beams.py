@@ -47,7 +47,8 @@ class Codebook:
     factors: tuple[np.ndarray, ...] = field(repr=False)
 
     def __post_init__(self) -> None:
-        """Check that the weights are of the array's elements; TypeError or ValueError names them."""
+        """Check that the weights are of the array's elements; TypeError or ValueError names them or the array."""
+        check_unpolarised("array", self.array)
         axes = (self.array.cols, self.array.rows) if len(self.factors) == 2 else (self.array.elements,)
         if len(self.factors) != len(axes):
             raise ValueError(f"factors: got {len(self.factors)}, expected weights, or those across and down")
@@ -145,7 +146,6 @@ def dft_codebook(array: PlanarArray, oversampling: Count = 1) -> Codebook:
     Raises:
         ValueError: for a polarised array, or oversampling below 1.
     """
-    check_unpolarised("array", array)
     return Codebook(array, (_dft(array.cols, oversampling), _dft(array.rows, oversampling)))
 
 
@@ -167,7 +167,6 @@ def steering_codebook(
     Raises:
         ValueError: naming the argument; for a polarised array.
     """
-    check_unpolarised("array", array)
     if (directions is None) == (points is None):
         raise ValueError("directions: expected either directions or points, and got both or neither")
     name, given = ("directions", directions) if points is None else ("points", points)
