@@ -214,7 +214,7 @@ def _material(k: int, material: Any, carrier: float) -> dict[str, Any]:
         "conductivity": material.conductivity(carrier),
         "scattering_model": material.pattern if scattering > 0 else "none",
         "scattering_coefficient": scattering,
-        "cross_polarization_coefficient": 0.0,
+        "cross_polarization_coefficient": float(material.xpd),
         "alpha_r": float(material.alpha_r),
         "roughness": float(material.roughness_m),
         "thickness": float(material.thickness_m),
