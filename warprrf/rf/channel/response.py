@@ -342,7 +342,8 @@ def _response(
 ) -> np.ndarray:
     if len(job.tau) == 0:
         return np.zeros((*job.shape, len(f)), dtype=complex)
-    if gridded:
+    # A series of more nepers leaves double precision.
+    if gridded and (loss is None or np.abs(loss).max() * np.ptp(length_m) < 60.0):
         return gridded_sum(job, f) if loss is None else _gridded_with_air(job, f, loss, length_m)
     factor = None if loss is None else np.exp(-loss * length_m[:, None])
     if job.own_delays and job.lengths.separable:
