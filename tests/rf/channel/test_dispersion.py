@@ -88,6 +88,16 @@ def test_all_measures_of_several_receivers():
     assert only.k_factor == np.inf and only.delay_spread_s == 0 and only.coherence_bandwidth_hz == np.inf
 
 
+def test_paths_that_are_marked_invalid_carry_no_power():
+    """As channels leave them out, by hand: valid says what is a path."""
+    paths = random_paths(6)
+    chosen = np.array([True, False, True, True, False, True])
+    marked, taken = replace(paths, valid=chosen), paths.select(chosen)
+    np.testing.assert_array_equal(marked.cfr([3e11]), taken.cfr([3e11]))
+    for name, value in vars(taken.dispersion()).items():
+        assert getattr(marked.dispersion(), name) == pytest.approx(float(value), rel=1e-12), name
+
+
 def test_paths_without_an_angle_say_which():
     paths = random_paths(4)
     with pytest.raises(ValueError, match="paths: phi_t: got NaN"):

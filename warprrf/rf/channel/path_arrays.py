@@ -104,7 +104,7 @@ class PathArrays:
     @property
     def power(self) -> np.ndarray:
         """Path gain |gain|^2 [linear], shape as ``gain``; 0 where padded."""
-        return np.abs(self.gain) ** 2
+        return np.where(self.valid, np.abs(self.gain) ** 2, 0.0)
 
     @property
     def length_m(self) -> np.ndarray:
