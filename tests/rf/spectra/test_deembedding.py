@@ -6,7 +6,13 @@ from path_makers import random_directions
 
 import warprrf as wr
 from warprrf.rf.spectra.deembedding import deembed
-from warprrf.rf.spectra.spectrum import directions_from_angles, pixel_directions, pixel_solid_angles, spread
+from warprrf.rf.spectra.spectrum import (
+    default_floor,
+    directions_from_angles,
+    pixel_directions,
+    pixel_solid_angles,
+    spread,
+)
 
 SHAPE = (90, 180)
 SIGMA = np.radians(2.0)
@@ -189,6 +195,14 @@ def test_a_data_set_keeps_what_was_measured_and_says_what_was_done(tmp_path):
     again = wr.SpectrumDataset.load(tmp_path / "out.nc")
     np.testing.assert_array_equal(again.path_gain, out.path_gain)
     assert again.attributes["deembedded"] == out.attributes["deembedded"]
+
+
+def test_the_floor_is_that_of_what_was_received_though_most_received_nothing():
+    """As of a hall whose receivers are mostly blocked: the antenna's gain of 27 dB goes out of the floor, too."""
+    one = scan(toward((80, 20)), POWERS[:1], shape=(36, 72))
+    alone, among = (dataset(np.stack([one, *[np.zeros((36, 72))] * n])).deembed(horn) for n in (0, 3))
+    assert among.floor == alone.floor == default_floor(alone.path_gain)
+    assert among.range_db == alone.range_db
 
 
 @pytest.mark.parametrize(

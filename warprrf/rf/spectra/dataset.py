@@ -396,8 +396,7 @@ class SpectrumDataset:
         delay = [one.of_strongest(own.ravel()) for one, own in zip(each, self.delay_s, strict=True)]
         aod = [one.of_strongest(own.reshape(-1, 2)) for one, own in zip(each, self.aod, strict=True)]
         gain, count = done.path_gain.astype(np.float32), len(each)
-        received = count > 0 and np.median(gain.max(axis=(1, 2))) > 0
-        floor = default_floor(gain) if received else self.floor
+        floor = default_floor(gain) if gain.any() else self.floor
         return replace(
             self,
             path_gain=gain,
