@@ -164,6 +164,10 @@ def test_powers_and_fields_do_not_mix():
         wr.channel.select_beams(paths, BOTH)
     with pytest.raises(TypeError, match="tx_array"):
         paths.cir(tx_array="dipole")
+    for element in (BOTH, wr.Antenna("dipole", "V")):
+        with pytest.raises(ValueError, match="polarisation: got 'H' for an antenna with its own"):
+            wr.PlanarArray(1, 2, pattern=element, polarisation="H")
+    assert wr.PlanarArray(1, 2, pattern=wr.Antenna("dipole"), polarisation="H").element.polarisation == "H"
 
 
 def test_beams_and_channels_take_the_gain_of_an_antenna():

@@ -278,6 +278,8 @@ def as_antenna(pattern: Pattern, polarisation: str | None = None, name: str = "p
         TypeError, ValueError: naming the argument by ``name``, if it is none; for a polarisation of what has one.
     """
     if isinstance(pattern, Antenna):
+        if polarisation is not None and pattern.polarised:
+            raise ValueError(f"polarisation: got {polarisation!r} for an antenna with its own, expected None")
         return pattern if polarisation is None else replace(pattern, polarisation=polarisation)
     try:
         if isinstance(pattern, str):
