@@ -55,6 +55,8 @@ class Codebook:
         found = [
             check_array("factors", f, (None, n), complex) for f, n in zip(self.factors, axes, strict=True)
         ]
+        if any((np.abs(np.linalg.norm(f, axis=1) - 1.0) > 1e-3).any() for f in found):
+            raise ValueError("factors: got weights of another norm than 1, which would count as gain")
         object.__setattr__(self, "factors", tuple(found))
 
     def __len__(self) -> int:
