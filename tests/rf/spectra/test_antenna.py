@@ -342,6 +342,7 @@ FLAT = np.ones((19, 36))
         ("polarisation.*fields", lambda: Antenna(lopsided, "V")),
         ("pattern.*negative", lambda: Antenna(lambda zenith, azimuth: np.cos(zenith))),
         ("pattern.*shape", lambda: Antenna(lambda zenith, azimuth: np.ones(3))),
+        ("pattern: .*missing 1 required", lambda: wr.PlanarArray(1, 1, pattern=lambda zenith, azimuth: 1.0)),
         ("pattern.*no gain", lambda: Antenna(lambda zenith, azimuth: 0.0)),
         ("pattern: got 3 fields", lambda: Antenna(lambda zenith, azimuth: (1.0, 0.0, 0.0))),
         ("pattern.*NaN or infinite fields", lambda: Antenna(lambda zenith, azimuth: (np.nan, 0.0))),

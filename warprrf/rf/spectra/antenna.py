@@ -294,7 +294,7 @@ def as_antenna(pattern: Pattern, polarisation: str | None = None, name: str = "p
             pattern = partial(_interpolated, samples)
         return Antenna(_OffBoresight(pattern), polarisation)
     except (TypeError, ValueError) as error:
-        raise type(error)(re.sub("^pattern:", f"{name}:", str(error))) from error
+        raise type(error)(re.sub("^pattern: |^(?!polarisation)", f"{name}: ", str(error))) from error
 
 
 def turned_gain(antenna: Antenna, angles: np.ndarray, directions: np.ndarray) -> np.ndarray:
