@@ -25,6 +25,16 @@ def test_two_equal_paths():
     assert coherence_bandwidth(p, t, level=0.9) == pytest.approx(np.arccos(0.9) / np.pi / 4e-9, rel=1e-9)
 
 
+@pytest.mark.parametrize("side", [0.278, 0.28, 0.281, 0.5])
+def test_a_short_dip_of_the_correlation_counts(side):
+    """It falls below one half for a hundredth of the period of the longest delay, between two trials."""
+    p, t = np.array([1.0, side, side]), np.array([0.0, 10.0, 23.7]) * 1e-9
+    shift = np.linspace(0.0, 1e8, 200_001)
+    correlation = np.abs(np.exp(-2j * np.pi * shift[:, None] * t) @ p) / p.sum()
+    first = shift[np.flatnonzero(correlation <= 0.5)[0]]
+    assert coherence_bandwidth(p, t) == pytest.approx(first, abs=1e3)
+
+
 def test_exponential_profile():
     """A dense exponential profile of decay T has delay spread T and |R(f)| = 1 / sqrt(1 + (2 pi f T)^2)."""
     decay = 5e-9
