@@ -149,9 +149,13 @@ def test_what_no_codebook_can_be_made_of_is_named():
     array = wr.PlanarArray(2, 2)
     with pytest.raises(ValueError, match="array: got polarisation 'V'"):
         wr.channel.dft_codebook(wr.PlanarArray(2, 2, polarisation="V"))
+    with pytest.raises(ValueError, match="array: got polarisation 'VH'"):
+        wr.channel.Codebook(wr.PlanarArray(2, 2, polarisation="VH"), (np.eye(4),))
     for factors in ((np.ones((2, 5)),), (np.ones((2, array.cols)),) * 3, ()):
         with pytest.raises(ValueError, match="factors: got"):
             wr.channel.Codebook(array, factors)
+    with pytest.raises(ValueError, match="factors: got weights of another norm than 1"):
+        wr.channel.Codebook(array, (np.exp(1j * np.arange(8.0).reshape(2, 4)),))
     with pytest.raises(ValueError, match="either directions or points"):
         wr.channel.steering_codebook(array)
     with pytest.raises(ValueError, match="wavelength_m: got None"):

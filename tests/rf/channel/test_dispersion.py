@@ -25,6 +25,16 @@ def test_two_equal_paths():
     assert coherence_bandwidth(p, t, level=0.9) == pytest.approx(np.arccos(0.9) / np.pi / 4e-9, rel=1e-9)
 
 
+@pytest.mark.parametrize("side", [0.278, 0.28, 0.281, 0.5])
+def test_a_short_dip_of_the_correlation_counts(side):
+    """It falls below one half for a hundredth of the period of the longest delay, between two trials."""
+    p, t = np.array([1.0, side, side]), np.array([0.0, 10.0, 23.7]) * 1e-9
+    shift = np.linspace(0.0, 1e8, 200_001)
+    correlation = np.abs(np.exp(-2j * np.pi * shift[:, None] * t) @ p) / p.sum()
+    first = shift[np.flatnonzero(correlation <= 0.5)[0]]
+    assert coherence_bandwidth(p, t) == pytest.approx(first, abs=1e3)
+
+
 def test_exponential_profile():
     """A dense exponential profile of decay T has delay spread T and |R(f)| = 1 / sqrt(1 + (2 pi f T)^2)."""
     decay = 5e-9
@@ -86,6 +96,16 @@ def test_all_measures_of_several_receivers():
         assert value == 0 if name == "path_gain" else np.isnan(value), name
     only = los.select([0]).dispersion()
     assert only.k_factor == np.inf and only.delay_spread_s == 0 and only.coherence_bandwidth_hz == np.inf
+
+
+def test_paths_that_are_marked_invalid_carry_no_power():
+    """As channels leave them out, by hand: valid says what is a path."""
+    paths = random_paths(6)
+    chosen = np.array([True, False, True, True, False, True])
+    marked, taken = replace(paths, valid=chosen), paths.select(chosen)
+    np.testing.assert_array_equal(marked.cfr([3e11]), taken.cfr([3e11]))
+    for name, value in vars(taken.dispersion()).items():
+        assert getattr(marked.dispersion(), name) == pytest.approx(float(value), rel=1e-12), name
 
 
 def test_paths_without_an_angle_say_which():

@@ -70,6 +70,16 @@ def test_slnr_is_the_generalised_eigenvector_and_for_channels_the_mmse_precoder(
     np.testing.assert_allclose(alike(w, mmse.T / np.linalg.norm(mmse.T, axis=1)[:, None]), 1.0, rtol=1e-12)
 
 
+def test_slnr_of_hardly_any_noise_is_the_limit_that_it_tends_to():
+    """With more users than elements no zero forcing is: the least leakage of SciPy's eigenvectors; alike users get one beam."""
+    h = rayleigh(6, 4)
+    limit = wr.channel.precoders(rank_one(h), "slnr", noise=1e-20)
+    for noise in (1e-20, 1e-28, 1e-40):
+        np.testing.assert_allclose(alike(wr.channel.precoders(h, "slnr", noise=noise), limit), 1.0, rtol=1e-6)
+    twins = wr.channel.precoders(h[[0, 0]], "slnr", noise=1e-40)
+    np.testing.assert_allclose(alike(twins, wr.channel.precoders(h[[0, 0]], "mr", noise=1.0)), 1.0, rtol=1e-9)
+
+
 def test_slnr_goes_from_zero_forcing_to_maximum_ratio_with_the_noise():
     h = rayleigh()
     for channels in (h, rank_one(h)):

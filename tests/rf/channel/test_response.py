@@ -277,6 +277,14 @@ def test_absorption_follows_frequency(method, squint):
         assert np.abs(h[..., k] - expected).max() < 1e-6 * np.abs(h).max()
 
 
+def test_absorption_of_many_nepers_is_that_of_every_path():
+    """Half a kilometre at water vapour's line of 557 GHz, where a series in the lengths would overflow."""
+    p = replace(random_paths(5), tau=np.linspace(1e-9, 2e-6, 5)).with_gas()
+    f = np.linspace(550e9, 560e9, 32)
+    dense = p.cfr(f, method="dense")
+    np.testing.assert_allclose(p.cfr(f, method="grid"), dense, atol=1e-6 * np.abs(dense).max())
+
+
 def test_gas_is_put_in_and_taken_out():
     p = random_paths(5)
     wet = p.with_gas(Air(water_vapour_g_m3=20))
@@ -300,6 +308,22 @@ def test_channels_need_a_carrier_delays_and_for_spherical_waves_points():
     ):
         with pytest.raises(ValueError, match=name):
             replace(p, **changed).cfr([3e11], **asked)
+
+
+@pytest.mark.parametrize("end", ["t", "r"])
+def test_angles_that_are_not_known_count_with_arrays_alone(end):
+    """As of a field that was fitted to spectra without departures."""
+    p = random_paths(5)
+    blind = replace(p, **{f"{angle}_{end}": np.full(5, np.nan) for angle in ("theta", "phi")})
+    np.testing.assert_array_equal(blind.cfr([F, 1.01 * F]), p.cfr([F, 1.01 * F]))
+    np.testing.assert_array_equal(blind.cir()[0], p.cir()[0])
+    for array in (
+        PlanarArray(1, 2),
+        PlanarArray(1, 1, polarisation="V"),
+        PlanarArray(1, 1, pattern="dipole"),
+    ):
+        with pytest.raises(ValueError, match=f"{end}x_array: got one for paths whose angles"):
+            blind.cfr([F], **{f"{end}x_array": array})
 
 
 @pytest.mark.parametrize("wave", ["plane", "spherical"])

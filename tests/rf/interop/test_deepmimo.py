@@ -83,6 +83,22 @@ def test_paths_of_several_transmitters_are_refused(tmp_path):
     assert not (tmp_path / "a").exists()
 
 
+def test_paths_of_unknown_departure_are_refused(tmp_path):
+    """As of a field that was fitted to spectra without departures: DeepMIMO drops paths without an angle."""
+    paths = traced()
+    blind = replace(paths, theta_t=np.where(paths.kind == "los", paths.theta_t, np.nan))
+    with pytest.raises(ValueError, match="paths: got some without an angle"):
+        write_deepmimo(blind, tmp_path / "a")
+
+
+def test_a_materials_cross_polarisation_is_written(tmp_path):
+    mesh, rough = room().mesh, replace(WALLS, scattering=0.5, xpd=0.2)
+    scene = Scene(mesh, [rough], np.zeros(len(mesh.faces), np.int32), object_names=("room",))
+    folder = write_deepmimo(random_paths(1), tmp_path / "a", scene=scene)
+    (said,) = json.loads((folder / "params.json").read_text())["materials"].values()
+    assert said["cross_polarization_coefficient"] == 0.2 and said["scattering_coefficient"] == 0.5
+
+
 def test_folder_without_the_package(tmp_path):
     """What DeepMIMO relies on: names of files, NaN where there is no path, codes of interactions."""
     parts = [

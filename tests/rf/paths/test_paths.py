@@ -9,6 +9,7 @@ from radio_scenes import METAL, RadioScene, SlabMaterial, box_mesh, joined, squa
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.trace import trace_paths
 
 F = 300e9
@@ -69,6 +70,18 @@ def test_angles_and_vertices_describe_the_same_polyline():
             for a, b in itertools.pairwise(steps / lengths[:, None]):
                 # An axis-aligned mirror only flips a sign.
                 assert (np.abs(np.abs(a) - np.abs(b)) < 1e-9).all()
+
+
+def test_paths_of_several_receivers_do_not_become_those_of_one():
+    paths = trace_paths(room(), transmitter=TX, receivers=receivers(2), frequency_hz=F)
+    for join, parts, said in (
+        (Paths.concatenate, [paths[0], paths[1]], "of several receivers, expected those of one"),
+        (Paths.concatenate, [paths, paths], "lists of several receivers"),
+        (Paths.stack, [paths, paths], "lists of several receivers"),
+    ):
+        with pytest.raises(ValueError, match=f"parts: got (paths )?{said}"):
+            join(parts)
+    np.testing.assert_array_equal(Paths.concatenate([paths[0], paths[0]]).receiver, paths[0].receiver)
 
 
 def test_swapping_the_ends_keeps_gain_and_delay():

@@ -99,6 +99,11 @@ def test_paths_through_walls_and_round_edges_are_taken_too(rt):
         Paths.from_sionna(rt.PathSolver()(room, max_depth=1), frequency_hz=3.5e9)
 
 
+def test_a_transmitter_that_there_is_not_is_named(solved):
+    with pytest.raises(ValueError, match="transmitter: got 1, expected a whole number of 0 to 0"):
+        Paths.from_sionna(solved, frequency_hz=CARRIER, transmitter=1)
+
+
 def test_round_trip_changes_nothing(solved):
     both = PlanarArray(1, 1, polarisation="VH")
     back = Paths.from_sionna(solved, frequency_hz=CARRIER)

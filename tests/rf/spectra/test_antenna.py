@@ -164,6 +164,10 @@ def test_powers_and_fields_do_not_mix():
         wr.channel.select_beams(paths, BOTH)
     with pytest.raises(TypeError, match="tx_array"):
         paths.cir(tx_array="dipole")
+    for element in (BOTH, wr.Antenna("dipole", "V")):
+        with pytest.raises(ValueError, match="polarisation: got 'H' for an antenna with its own"):
+            wr.PlanarArray(1, 2, pattern=element, polarisation="H")
+    assert wr.PlanarArray(1, 2, pattern=wr.Antenna("dipole"), polarisation="H").element.polarisation == "H"
 
 
 def test_beams_and_channels_take_the_gain_of_an_antenna():
@@ -338,6 +342,7 @@ FLAT = np.ones((19, 36))
         ("polarisation.*fields", lambda: Antenna(lopsided, "V")),
         ("pattern.*negative", lambda: Antenna(lambda zenith, azimuth: np.cos(zenith))),
         ("pattern.*shape", lambda: Antenna(lambda zenith, azimuth: np.ones(3))),
+        ("pattern: .*missing 1 required", lambda: wr.PlanarArray(1, 1, pattern=lambda zenith, azimuth: 1.0)),
         ("pattern.*no gain", lambda: Antenna(lambda zenith, azimuth: 0.0)),
         ("pattern: got 3 fields", lambda: Antenna(lambda zenith, azimuth: (1.0, 0.0, 0.0))),
         ("pattern.*NaN or infinite fields", lambda: Antenna(lambda zenith, azimuth: (np.nan, 0.0))),

@@ -1,12 +1,21 @@
 """Antenna de-embedding against measurements simulated path by path, without the grid's own convolution."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from path_makers import random_directions
 
 import warprrf as wr
 from warprrf.rf.spectra.deembedding import deembed
-from warprrf.rf.spectra.spectrum import directions_from_angles, pixel_directions, pixel_solid_angles, spread
+from warprrf.rf.spectra.levels import free_space_gain
+from warprrf.rf.spectra.spectrum import (
+    default_floor,
+    directions_from_angles,
+    pixel_directions,
+    pixel_solid_angles,
+    spread,
+)
 
 SHAPE = (90, 180)
 SIGMA = np.radians(2.0)
@@ -189,6 +198,31 @@ def test_a_data_set_keeps_what_was_measured_and_says_what_was_done(tmp_path):
     again = wr.SpectrumDataset.load(tmp_path / "out.nc")
     np.testing.assert_array_equal(again.path_gain, out.path_gain)
     assert again.attributes["deembedded"] == out.attributes["deembedded"]
+
+
+def test_who_sees_the_transmitter_is_judged_without_the_antennas_gain():
+    """A blocked receiver whose strongest path comes 12 dB below free space from beside the transmitter."""
+    ends = {
+        "receivers": np.array([[4.0, 0, 0], [0, 4.0, 0]]),
+        "transmitter": np.zeros(3),
+        "frequency_hz": 300e9,
+    }
+    friis = free_space_gain(np.zeros(3), ends["receivers"], 300e9)
+    directions = -ends["receivers"] / 4.0
+    power = [friis[0] * scan(directions[:1], [1.0]), friis[1] / 16 * scan(directions[1:], [1.0])]
+    raw = wr.SpectrumDataset.from_spectra(path_gain=np.stack(power), beam_sigma_rad=SIGMA, **ends)
+    assert raw.line_of_sight.all()  # 27 dB of horn
+    assert raw.deembed(horn).line_of_sight.tolist() == [True, False]
+    known = replace(raw, line_of_sight=[False, True]).deembed(horn)
+    assert known.line_of_sight.tolist() == [False, True]
+
+
+def test_the_floor_is_that_of_what_was_received_though_most_received_nothing():
+    """As of a hall whose receivers are mostly blocked: the antenna's gain of 27 dB goes out of the floor, too."""
+    one = scan(toward((80, 20)), POWERS[:1], shape=(36, 72))
+    alone, among = (dataset(np.stack([one, *[np.zeros((36, 72))] * n])).deembed(horn) for n in (0, 3))
+    assert among.floor == alone.floor == default_floor(alone.path_gain)
+    assert among.range_db == alone.range_db
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,13 @@ def test_idw_is_the_weighted_mean_of_its_domain_and_a_training_spectrum_at_its_o
     assert found([3.0, 0.0, 0.0]).path_gain[0, 0] == pytest.approx(1e-10, rel=1e-3)
 
 
+def test_idw_of_a_steep_power_is_the_nearest_receivers_spectrum():
+    """The inverse powers themselves leave double precision."""
+    ds = training_set([[0, 0, 0], [3, 0, 0]], [1e-8, 1e-10])
+    for at in ([1.0, 20.0, 0.0], [0.01, 0.0, 0.0]):
+        assert lookups.idw(ds, power=1e4)(at).path_gain[3, 3] == pytest.approx(1e-8, rel=1e-5)
+
+
 @pytest.mark.parametrize(
     ("gains", "better"),
     [([1e-8, 1e-9, 1e-10], "db"), ([1.0e-8, 5.05e-9, 1.0e-10], "linear")],

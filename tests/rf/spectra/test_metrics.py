@@ -102,6 +102,9 @@ def test_steering_half_a_beamwidth_off_a_lone_path_loses_three_decibels():
     assert metrics.beam_gain_loss_db(image, off, np.radians(10.0)) == pytest.approx(
         10 * np.log10(2), abs=1e-9
     )
+    assert metrics.beam_gain_loss_db(image, 3.0 * off, np.radians(10.0)) == pytest.approx(10 * np.log10(2))
+    with pytest.raises(ValueError, match="direction: got a vector of length zero"):
+        metrics.beam_gain_loss_db(image, 0.0 * off, np.radians(10.0))
     assert metrics.beam_gain_loss_db(image, path, np.radians(10.0)) == pytest.approx(0.0, abs=1e-9)
 
 

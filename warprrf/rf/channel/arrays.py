@@ -67,6 +67,11 @@ class PlanarArray:
         """Number of ports: elements times theirs."""
         return self.elements * self.element.ports
 
+    @property
+    def directed(self) -> bool:
+        """Whether directions of paths count: all but one isotropic element without polarisation."""
+        return self.ports > 1 or self.element.polarised or self.element.pattern != "isotropic"
+
     @cached_property
     def element(self) -> Antenna:
         """An element, turned as it stands in the world."""

@@ -47,13 +47,16 @@ class Codebook:
     factors: tuple[np.ndarray, ...] = field(repr=False)
 
     def __post_init__(self) -> None:
-        """Check that the weights are of the array's elements; TypeError or ValueError names them."""
+        """Check that the weights are of the array's elements; TypeError or ValueError names them or the array."""
+        check_unpolarised("array", self.array)
         axes = (self.array.cols, self.array.rows) if len(self.factors) == 2 else (self.array.elements,)
         if len(self.factors) != len(axes):
             raise ValueError(f"factors: got {len(self.factors)}, expected weights, or those across and down")
         found = [
             check_array("factors", f, (None, n), complex) for f, n in zip(self.factors, axes, strict=True)
         ]
+        if any((np.abs(np.linalg.norm(f, axis=1) - 1.0) > 1e-3).any() for f in found):
+            raise ValueError("factors: got weights of another norm than 1, which would count as gain")
         object.__setattr__(self, "factors", tuple(found))
 
     def __len__(self) -> int:
@@ -145,7 +148,6 @@ def dft_codebook(array: PlanarArray, oversampling: Count = 1) -> Codebook:
     Raises:
         ValueError: for a polarised array, or oversampling below 1.
     """
-    check_unpolarised("array", array)
     return Codebook(array, (_dft(array.cols, oversampling), _dft(array.rows, oversampling)))
 
 
@@ -167,7 +169,6 @@ def steering_codebook(
     Raises:
         ValueError: naming the argument; for a polarised array.
     """
-    check_unpolarised("array", array)
     if (directions is None) == (points is None):
         raise ValueError("directions: expected either directions or points, and got both or neither")
     name, given = ("directions", directions) if points is None else ("points", points)
@@ -372,7 +373,7 @@ def rays_of_users(sources: Source | Iterable[Source], tx: Codebook) -> list[Rays
 
 def rays_of(source: Source, tx: Codebook) -> Iterator[Rays]:
     """Departure (arrival, if it does not matter), arrival and power of what reaches each receiver of ``source``."""
-    directed = tx.array.elements > 1 or tx.array.element.pattern != "isotropic"
+    directed = tx.array.directed
     if isinstance(source, PathArrays):
         for paths in source.each():
             kept = paths.select(paths.power > 0)

@@ -131,12 +131,16 @@ def _first_fall(weight: np.ndarray, tau: np.ndarray, level: float) -> float:
 
     steps = 16  # trials of the correlation over the shortest period that it can have
     step = 1.0 / (longest * steps)
+    # By no more it falls between trials, by its second derivative, and by its first.
+    dip = min(0.005 * (1.0 + 1.0 / level), 0.1)
     most_periods = 4096  # searched for the first crossing
     for begin in range(0, most_periods * steps, 256):
         shifts = step * np.arange(begin, begin + 257)
-        below = np.flatnonzero(over(shifts) <= 0)
-        if len(below):
-            return float(brentq(over, shifts[below[0] - 1], shifts[below[0]], xtol=1e-9))
+        for k in np.flatnonzero(over(shifts) <= dip):
+            fine = np.linspace(shifts[max(k - 1, 0)], shifts[min(k + 1, 256)], 33)
+            below = np.flatnonzero(over(fine) <= 0)
+            if len(below):
+                return float(brentq(over, fine[below[0] - 1], fine[below[0]], xtol=1e-9))
     return float("inf")
 
 

@@ -104,7 +104,7 @@ class PathArrays:
     @property
     def power(self) -> np.ndarray:
         """Path gain |gain|^2 [linear], shape as ``gain``; 0 where padded."""
-        return np.abs(self.gain) ** 2
+        return np.where(self.valid, np.abs(self.gain) ** 2, 0.0)
 
     @property
     def length_m(self) -> np.ndarray:
@@ -277,8 +277,14 @@ class PathArrays:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
-        """All paths of one receiver."""
+        """All paths of one receiver.
+
+        Raises:
+            ValueError, TypeError: for no paths, or those of several receivers.
+        """
         check_items("parts", parts, PathArrays, 1)
+        if not all(np.array_equal(p.receiver, parts[0].receiver) for p in parts):  # type: ignore[arg-type]
+            raise ValueError("parts: got paths of several receivers, expected those of one (Paths.stack)")
         joined: dict[str, Any] = {name: np.concatenate(arrays) for name, arrays in _columns(parts).items()}
         return cls(**joined, **_common(parts), receiver=parts[0].receiver)
 
@@ -329,6 +335,8 @@ def length_along(points: np.ndarray) -> np.ndarray:
 
 def _columns(parts: Sequence[PathArrays]) -> dict[str, list[np.ndarray]]:
     """The arrays of all parts by name, equally deep; without ``jones`` if no part has it, NaN for those that lack it."""
+    if any(p.batched for p in parts):
+        raise ValueError("parts: got lists of several receivers, expected one of each (Paths.each)")
     columns = {name: [getattr(p, name) for p in parts] for name in PADDING}
     depth = max((v.shape[1] for v in columns["vertices"]), default=1)
     for name in ("vertices", "interactions"):

@@ -87,8 +87,9 @@ def precoders(
     h = _checked(channels)
     if h.ndim == 2:
         if method == "slnr":
-            gram = h @ h.conj().T
-            return _unit(np.linalg.solve(gram.T + len(h) * noise * np.eye(len(h)), h.conj()))
+            left, size, right = np.linalg.svd(h.conj(), full_matrices=False)
+            size = np.where(size > 1e-14 * size[0], size, 0.0)  # what is smaller is rounding
+            return _unit(left * (size / (size**2 + len(h) * noise)) @ right)
         best = _unit(h.conj())
     elif method == "slnr":
         return _leakage(h, len(h) * noise)

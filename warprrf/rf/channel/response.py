@@ -303,6 +303,12 @@ def _links(
         index = np.flatnonzero(own.valid & ~scattered if diffuse == "power" else own.valid)
         chosen = own.select(index)
         chosen.check_delays()
+        for name, array, toward in (
+            ("tx_array", tx, chosen.departure),
+            ("rx_array", rx, chosen.arrival),
+        ):
+            if array.directed and np.isnan(toward).any():
+                raise ValueError(f"{name}: got one for paths whose angles there are NaN, expected None")
         amplitude = _amplitudes(chosen, tx, rx)
         if diffuse == "random_phase":
             turns = np.zeros(len(own.gain))
@@ -336,7 +342,8 @@ def _response(
 ) -> np.ndarray:
     if len(job.tau) == 0:
         return np.zeros((*job.shape, len(f)), dtype=complex)
-    if gridded:
+    # A series of more nepers leaves double precision.
+    if gridded and (loss is None or np.abs(loss).max() * np.ptp(length_m) < 60.0):
         return gridded_sum(job, f) if loss is None else _gridded_with_air(job, f, loss, length_m)
     factor = None if loss is None else np.exp(-loss * length_m[:, None])
     if job.own_delays and job.lengths.separable:

@@ -258,8 +258,8 @@ def plane_lengths(paths: PathArrays, sending: np.ndarray, receiving: np.ndarray)
     """
     return PairLengths(
         place=receiving,
-        target=np.ascontiguousarray(paths.arrival)[None],
-        extra=-(sending @ paths.departure.T),
+        target=np.nan_to_num(paths.arrival)[None],  # where not known, there is one element at the centre
+        extra=-(sending @ np.nan_to_num(paths.departure).T),
         scale=np.ones((len(sending), 1)),
         spherical=False,
     )

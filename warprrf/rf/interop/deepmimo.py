@@ -54,7 +54,7 @@ def write_deepmimo(
 
     Raises:
         ValueError: for a name that DeepMIMO cannot load, unknown positions or carrier, several transmitters, paths without
-            delay, ``diffuse`` not stated.
+            delay or angle, ``diffuse`` not stated.
     """
     folder = Path(folder)
     name = folder.name
@@ -69,6 +69,8 @@ def write_deepmimo(
         raise ValueError(
             f"diffuse: got {diffuse!r} with diffuse paths, expected 'random_phase' or 'given': a path here has a phase"
         )
+    if not np.isfinite((paths.arrival + paths.departure)[paths.valid]).all():
+        raise ValueError("paths: got some without an angle, which DeepMIMO would leave out in silence")
     carrier = paths.carrier_hz
     coefficient, _ = paths.cir(diffuse=diffuse if scattered else None, seed=seed)
     several = paths.as_several()
@@ -214,7 +216,7 @@ def _material(k: int, material: Any, carrier: float) -> dict[str, Any]:
         "conductivity": material.conductivity(carrier),
         "scattering_model": material.pattern if scattering > 0 else "none",
         "scattering_coefficient": scattering,
-        "cross_polarization_coefficient": 0.0,
+        "cross_polarization_coefficient": float(material.xpd),
         "alpha_r": float(material.alpha_r),
         "roughness": float(material.roughness_m),
         "thickness": float(material.thickness_m),

@@ -82,7 +82,7 @@ class Paths(PathArrays):
                 triangles several times.
 
         Raises:
-            ValueError: for other arrays.
+            ValueError: for other arrays, or a transmitter that there is not.
         """
         several = sionna.by_delay(paths, frequency_hz, transmitter, drop_repeated)
         found = [p.select(np.argsort(-np.abs(p.gain), kind="stable")) for p in several]

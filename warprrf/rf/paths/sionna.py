@@ -197,6 +197,7 @@ def by_delay(paths: Any, carrier: float, transmitter: int, drop_repeated: bool) 
             'at either end: set scene.tx_array and scene.rx_array to PlanarArray(num_rows=1, num_cols=1, pattern="iso", '
             'polarization="VH") and solve with synthetic_array=True'
         )
+    check_count("transmitter", transmitter, 0, real.shape[2] - 1)
     a = (real + 1j * imag)[:, :, transmitter]  # (R, 2, 2, L)
 
     def field(values: Any) -> np.ndarray:

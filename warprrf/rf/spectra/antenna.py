@@ -278,6 +278,8 @@ def as_antenna(pattern: Pattern, polarisation: str | None = None, name: str = "p
         TypeError, ValueError: naming the argument by ``name``, if it is none; for a polarisation of what has one.
     """
     if isinstance(pattern, Antenna):
+        if polarisation is not None and pattern.polarised:
+            raise ValueError(f"polarisation: got {polarisation!r} for an antenna with its own, expected None")
         return pattern if polarisation is None else replace(pattern, polarisation=polarisation)
     try:
         if isinstance(pattern, str):
@@ -292,7 +294,7 @@ def as_antenna(pattern: Pattern, polarisation: str | None = None, name: str = "p
             pattern = partial(_interpolated, samples)
         return Antenna(_OffBoresight(pattern), polarisation)
     except (TypeError, ValueError) as error:
-        raise type(error)(re.sub("^pattern:", f"{name}:", str(error))) from error
+        raise type(error)(re.sub("^pattern: |^(?!polarisation)", f"{name}: ", str(error))) from error
 
 
 def turned_gain(antenna: Antenna, angles: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -373,8 +373,9 @@ class SpectrumDataset:
         pixel's direction, ``(H, W)`` (:meth:`Antenna.gain`): pixels are divided by it. Where it lies more than
         ``limit_db`` below its peak nothing is known: those pixels become empty, and the sum is that of the others.
 
-        Delay and angle of departure are those measured in the direction that gives a pixel most of its power. The
-        floor and range are chosen anew; attributes ``deembedded...`` say what was done.
+        Delay and angle of departure are those measured in the direction that gives a pixel most of its power. Floor
+        and range are chosen anew, and where the spectra had said who sees the transmitter, they say it anew;
+        attributes ``deembedded...`` say what was done.
 
         Args:
             pattern: Linear power gain over isotropic; see above.
@@ -396,11 +397,13 @@ class SpectrumDataset:
         delay = [one.of_strongest(own.ravel()) for one, own in zip(each, self.delay_s, strict=True)]
         aod = [one.of_strongest(own.reshape(-1, 2)) for one, own in zip(each, self.aod, strict=True)]
         gain, count = done.path_gain.astype(np.float32), len(each)
-        received = count > 0 and np.median(gain.max(axis=(1, 2))) > 0
-        floor = default_floor(gain) if received else self.floor
+        floor = default_floor(gain) if gain.any() else self.floor
+        ends, beam = (self.receivers, self.transmitter), (self.frequency_hz, self.beam_sigma_rad)
+        guessed = np.array_equal(self.line_of_sight, _sees(*ends, self.path_gain, *beam))
         return replace(
             self,
             path_gain=gain,
+            line_of_sight=_sees(*ends, gain, *beam) if guessed else self.line_of_sight,
             delay_s=np.reshape(delay, self.delay_s.shape),
             aod=np.reshape(aod, self.aod.shape),
             floor=floor,

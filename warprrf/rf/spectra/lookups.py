@@ -131,7 +131,7 @@ def _average(
     distance = np.linalg.norm(receivers - at, axis=-1)
     same_place_m = 1e-9  # a receiver nearer than this to a training one is that one
     same = distance < same_place_m
-    weight = same.astype(np.float64) if same.any() else distance**-power
+    weight = same.astype(np.float64) if same.any() else (distance / distance.min()) ** -power
     average = np.tensordot(weight / weight.sum(), table, axes=1)
     return np.maximum(10 ** (average / 10) - floor, 0.0) if domain == "db" else average
 

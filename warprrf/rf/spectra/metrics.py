@@ -32,6 +32,7 @@ from warprrf.rf.spectra.spectrum import (
     pixel_directions,
     pixel_solid_angles,
     to_db,
+    unit_vectors,
 )
 
 SSIM_WINDOW = 7  # pixels; scikit-image's default, so that figures compare with other work
@@ -140,17 +141,15 @@ def _beam_kernel(shape: tuple[int, int], kappa: float) -> np.ndarray:
 
 
 @checked
-def beam_gain_loss_db(
-    path_gain: Image, direction: Annotated[np.ndarray, Shaped("3")], width_rad: BeamWidth
-) -> float:
-    """Loss [dB] of a beam steered to ``direction`` (3,) on the spectrum ``path_gain`` against its best steering.
+def beam_gain_loss_db(path_gain: Image, direction: np.ndarray, width_rad: BeamWidth) -> float:
+    """Loss [dB] of a beam steered to ``direction`` (3,), of any length, on the spectrum ``path_gain`` against its best steering.
 
     The best is sought over pixel centres, so steering between them can score slightly below zero.
     """
     best = float(np.max(beam_response(path_gain, width_rad)))
     if best <= 0:
         return 0.0
-    cosine = pixel_directions(path_gain.shape) @ direction
+    cosine = pixel_directions(path_gain.shape) @ unit_vectors("direction", direction, (3,))
     got = float(np.sum(path_gain * np.exp(beam_kappa(width_rad) * (cosine - 1.0))))
     return float(10.0 * np.log10(best / max(got, best * 1e-30)))
 

@@ -236,10 +236,11 @@ class Readings(PowerTable):
         """
         names = list(map(str, table))
         _check_columns(names)
+        count = np.size(table["power_db"])
 
         def column(name: str) -> np.ndarray:
             return check_array(
-                f"table[{name!r}]", np.asarray(table[name]), (None,), finite=name != "power_db"
+                f"table[{name!r}]", np.asarray(table[name]), (count,), finite=name != "power_db"
             )
 
         found: dict[str, Any] = {
@@ -258,7 +259,7 @@ class Readings(PowerTable):
             found["std_db"] = column("std_db")
         if "chain" in names:
             cells = np.ravel(np.asarray(table["chain"], dtype=object))
-            none = [c is None or (isinstance(c, float) and np.isnan(c)) for c in cells]  # as pandas has it
+            none = [str(c) in ("None", "nan", "<NA>") for c in cells]  # as pandas has it
             found["chain"] = np.where(none, "", cells.astype(str))
         readings = cls(**found, **settings)
         question_readings(readings)

@@ -1,5 +1,6 @@
 """Tables of received power: what a reading is, and fits to horns, powers and delays whose chain's gain is not known."""
 
+import re
 import warnings
 from dataclasses import replace
 
@@ -17,7 +18,7 @@ from warprrf.rf.positions import is_free
 from warprrf.rf.spectra.antenna import horn
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import evaluate
-from warprrf.rf.spectra.readings import COLUMNS, Readings, path_weights
+from warprrf.rf.spectra.readings import COLUMNS, NEEDED, Readings, path_weights
 from warprrf.rf.spectra.spectrum import directions_from_angles
 from warprrf.rf.tracing.model import SETS
 
@@ -391,9 +392,15 @@ def test_a_carrier_in_gigahertz_is_questioned():
 def test_a_cell_without_a_chain_is_a_calibrated_reading():
     table = pd.DataFrame({name: [1.0, 2.0] for end in ("transmitter", "receiver") for name in COLUMNS[end]})
     table["power_db"] = -80.0
-    for missing in (None, np.nan):
-        read = Readings.from_table(table.assign(chain=["horn", missing]), frequency_hz=F, floor=1e-12)
+    for cells in (["horn", None], ["horn", np.nan], pd.array(["horn", None], dtype="string")):
+        read = Readings.from_table(table.assign(chain=cells), frequency_hz=F, floor=1e-12)
         assert read.chain.tolist() == ["horn", ""]
+
+
+def test_a_column_of_another_length_is_named():
+    table = dict.fromkeys(NEEDED, [1.0, 2.0]) | {"power_db": [-80.0, -80.0]}
+    with pytest.raises(ValueError, match=re.escape("table['rx_y']: got shape (3,), expected (2)")):
+        Readings.from_table(table | {"rx_y": [1.0, 2.0, 3.0]}, frequency_hz=F, floor=1e-12)
 
 
 def test_the_only_place_of_a_chain_is_not_held_out(scene, turned, monkeypatch):

@@ -192,6 +192,20 @@ def test_rf3dgs_learns_delay_and_departure_of_its_training_spectra(room, spectra
     assert np.median(np.abs(zenith - spectra.aod[blocked][..., 0])) < np.radians(3)
 
 
+def test_rf3dgs_learns_delays_where_departures_were_not_measured_and_the_other_way_round(room, spectra):
+    apart = {"delay_s": spectra.delay_s.copy(), "aod": spectra.aod.copy()}
+    apart["aod"][0, 3, 4] = apart["delay_s"][1, 5, 6] = np.nan  # one pixel
+    both = HarmonicField.fit(room, SimpleNamespace(**(vars(spectra) | apart)), "rf3dgs", iterations=2)
+    whole = HarmonicField.fit(room, spectra, "rf3dgs", iterations=2)
+    assert list(both.layers) == list(whole.layers) == ["gain", "delay", "aod_x", "aod_y", "aod_z"]
+    for lacking, other in (("aod", "delay_s"), ("delay_s", "aod")):
+        none = {lacking: np.full_like(getattr(spectra, lacking), np.nan)}
+        found = HarmonicField.fit(room, SimpleNamespace(**(vars(spectra) | none)), "rf3dgs", iterations=2)
+        blocked = found.spectrum(BLOCKED)
+        assert np.isnan(getattr(blocked, lacking)).all()
+        np.testing.assert_array_equal(getattr(blocked, other), getattr(whole.spectrum(BLOCKED), other))
+
+
 def test_gaussians_that_nobody_saw_keep_the_median_gain(room, spectra):
     g = room.gaussians
     parts = (g.means, g.quaternions, g.scales, g.opacities, g.sh)

@@ -100,9 +100,9 @@ class HarmonicField(RadioField):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        given, known = ", ".join(self.layers), LAYERS[self.model]
-        if set(self.layers) not in (set(), {"gain"}, set(known)):
-            raise ValueError(f"layers: got {given}, expected the gain alone or {', '.join(known)}")
+        known, aod = set(LAYERS[self.model]), {"aod_x", "aod_y", "aod_z"}
+        if not set(self.layers) <= known or aod & set(self.layers) not in (set(), aod):
+            raise ValueError(f"layers: got {', '.join(self.layers)}, expected {', '.join(sorted(known))}")
         most_coefficient = 1e9
         table = Expected(f"N {_kernels.COEFFICIENTS}", -most_coefficient, most_coefficient)
         check_arrays(self.layers, dict.fromkeys(self.layers, table), N=len(self.gaussians))
@@ -344,12 +344,13 @@ class HarmonicField(RadioField):
 
     def _channels(self, seen: Transport) -> tuple[np.ndarray, np.ndarray]:
         """Learned delay [s] and vector of departure; NaN where a ray meets nothing or nothing was learned."""
-        if "delay" not in self.layers:
-            return np.full(self.shape, np.nan), np.full((*self.shape, 3), np.nan)
-        empty = seen.dominant[0] < 0
-        delay = np.maximum(self._blend("delay", seen), 0.0) * self.delay_unit
-        departure = np.stack([self._blend(f"aod_{axis}", seen) for axis in "xyz"], axis=-1)
-        return np.where(empty, np.nan, delay), np.where(empty[..., None], np.nan, departure)
+        met = seen.dominant[0] >= 0
+
+        def learned(name: str) -> np.ndarray:
+            return np.where(met, self._blend(name, seen) if name in self.layers else np.nan, np.nan)
+
+        departure = np.stack([learned(f"aod_{axis}") for axis in "xyz"], axis=-1)
+        return np.maximum(learned("delay"), 0.0) * self.delay_unit, departure
 
 
 def _geometry(geometry: GeometryLike | Gaussians) -> tuple[Gaussians, Mesh | None]:

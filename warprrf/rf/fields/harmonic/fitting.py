@@ -420,21 +420,24 @@ def targets(
     }
     delay_unit = 1.0
     if options.model == "rf3dgs" and ds.delay_s is not None:
-        delays = np.asarray(ds.delay_s, np.float64)
-        mask = (images > floor) & np.isfinite(delays) & (problem.transport.dominant >= 0)
-        if mask.any():
-            delay_unit = float(delays[mask].max())
-            departure = directions_from_angles(*np.moveaxis(np.asarray(ds.aod, np.float64), -1, 0))
-            channels = {"delay": delays / delay_unit}
-            channels.update({f"aod_{axis}": departure[..., k] for k, axis in enumerate("xyz")})
-            for name, image in channels.items():
-                middle = float(np.median(image[mask]))
-                mean = problem.weighted_means(np.where(mask, image, np.nan))
-                layers[name] = Target(
-                    kind="signed",
-                    image=np.where(mask, image, 0.0),
-                    initial=np.where(np.isnan(mean), middle, mean) / Y00,
-                    unseen=middle / Y00,
-                    mask=mask,
-                )
+        seen = (images > floor) & (problem.transport.dominant >= 0)
+        departure = directions_from_angles(*np.moveaxis(np.asarray(ds.aod, np.float64), -1, 0))
+        channels = {"delay": np.asarray(ds.delay_s, np.float64)}
+        channels |= {f"aod_{axis}": departure[..., k] for k, axis in enumerate("xyz")}
+        for name, image in channels.items():
+            mask = seen & np.isfinite(image)
+            if not mask.any():  # not measured
+                continue
+            if name == "delay":
+                delay_unit = float(image[mask].max())
+                image = image / delay_unit
+            middle = float(np.median(image[mask]))
+            mean = problem.weighted_means(np.where(mask, image, np.nan))
+            layers[name] = Target(
+                kind="signed",
+                image=np.where(mask, image, 0.0),
+                initial=np.where(np.isnan(mean), middle, mean) / Y00,
+                unseen=middle / Y00,
+                mask=mask,
+            )
     return layers, gain_unit, delay_unit
