@@ -130,6 +130,7 @@ BAD = {
     "option of no model": (f"{FIT} {{spectra}} --option colour=red", "colour"),
     "effects by a wrong name": (f'{FIT} {{spectra}} --effects {{{{"mirror":2}}}}', "got mirror, expected among line_of_sight"),
     "effects of Sionna": (f"{SIMULATE} 7,4,1.5 --engine sionna --effects room", "--effects: got 'room'"),
+    "walls of Sionna": (f"{SIMULATE} 7,4,1.5 --refraction", "--refraction: got True, but engine exact has --effects"),
     "pointings without a direction": (f"{SUGGEST} --frequency 3e11 --receive-pattern 10", "azimuth"),
     "camera looks straight up": (f"{RENDER} {{tmp}}/one.ply --position 0 0 1 --look-at 0 0 2", "--look-at"),
     "field without receiver": (f"{RENDER} {{tmp}}/bad.safetensors", "--receiver"),
