@@ -550,6 +550,8 @@ def _relevance(args: argparse.Namespace, out: Output) -> None:
       warprrf fit room spectra.nc -o field.safetensors --relevance relevance.json
     """
     source = existing(args.source)
+    if args.out and Path(args.out).suffix == ".md":
+        raise ValueError(f"--out: got {args.out!r}, expected JSON's name: the table goes beside it as .md")
     given = {"transmitter": args.transmitter, "frequency_hz": args.frequency}
     receivers = None if args.receivers is None else read_receivers(args.receivers)
     if args.spectra is not None:
