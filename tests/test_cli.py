@@ -181,6 +181,12 @@ def test_receivers_from_file_and_words_agree(tmp_path):
         assert read_receivers([str(tmp_path / "r.csv")]).shape == (0, 3)
 
 
+def test_a_photo_has_one_known_position(tmp_path):
+    (tmp_path / "a.csv").write_text("file,x,y,z\na.jpg,1,2.5,3\na.jpg,4,5,6\n")
+    with pytest.raises(ValueError, match="a file stands in it twice"):
+        read_positions(tmp_path / "a.csv")
+
+
 @pytest.mark.parametrize("names", ["x,z,y", "y,x,z", "x,y,z,elevation,azimuth"])
 def test_columns_in_another_order_are_refused(names, tmp_path):
     file, row = tmp_path / "r.csv", ",".join("123450"[: names.count(",") + 1])

@@ -61,7 +61,10 @@ def read_positions(path: str | os.PathLike[str]) -> dict[str, tuple[float, float
                 rows = [tuple(row) for row in csv.reader(lines) if row and not row[0].startswith("#")]
             if rows and [cell.strip() for cell in rows[0]] == ["file", "x", "y", "z"]:
                 rows = rows[1:]
-        return {str(name): (float(x), float(y), float(z)) for name, x, y, z in rows}
+        found = {str(name): (float(x), float(y), float(z)) for name, x, y, z in rows}
+        if len(found) < len(rows):
+            raise ValueError("a file stands in it twice")
+        return found
     except (ValueError, TypeError) as error:
         raise ValueError(
             f'{path}: expected camera positions in metres, JSON {{"file.jpg": [x, y, z]}} or CSV file,x,y,z ({error})'
