@@ -237,3 +237,10 @@ def test_a_wall_drawn_as_one_polygon_keeps_its_doorway(first, tmp_path):
         assert mesh.areas[:6].sum() == pytest.approx(5 * 3 - 1 * 2)
         np.testing.assert_allclose(mesh.face_normals[:6], np.tile([0.0, -1.0, 0.0], (6, 1)), atol=1e-12)
     assert wr.Mesh.load(tmp_path / "wall.obj", unit="m").face_label.tolist() == [0] * 6 + [1]
+
+
+def test_a_polygon_that_crosses_itself_is_cut_as_far_as_it_goes():
+    points = np.column_stack([np.random.default_rng(0).random((300, 2)), np.zeros(300)])
+    index, polygon = mesh_content.triangulated(np.array([300, 3]), np.r_[:300, :3], points)
+    assert index.shape == (299, 3) and polygon.tolist() == [0] * 298 + [1]
+    assert index[:298].min() == 0 and index[:298].max() == 299 and index[298].tolist() == [300, 301, 302]

@@ -9,6 +9,7 @@ import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -159,11 +160,12 @@ def _ears(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
         inside = (
             leftward(a, b, left) & leftward(b, c, left) & leftward(c, a, left) for a, b, c in corner[convex]
         )
-        # none of what crosses itself, or has no area
-        k = next((k for k, met in zip(convex, inside, strict=True) if not met.any()), 0)
+        k = next((k for k, met in zip(convex, inside, strict=True) if not met.any()), None)
+        if k is None:  # what is left crosses itself, or has no area
+            break
         found.append(corner[k])
         left = np.delete(left, k)
-    return np.array([*found, left])
+    return np.array([*found, *([left[0], b, c] for b, c in pairwise(left[1:]))])
 
 
 def material_name(name: str | None, textured: bool) -> str | None:
