@@ -14,7 +14,7 @@ from small_room import small_room
 
 import warprrf as wr
 from warprrf import cli
-from warprrf.cli.inputs import load_geometry, read_positions, read_receivers
+from warprrf.cli.inputs import load_geometry, read_pointings, read_positions, read_receivers
 from warprrf.cli.views import _look_at
 from warprrf.rf.fields.bistatic.options import FitOptions
 from warprrf.rf.fields.harmonic.fitting import FieldOptions
@@ -130,6 +130,10 @@ BAD = {
     "option of no model": (f"{FIT} {{spectra}} --option colour=red", "colour"),
     "effects by a wrong name": (f'{FIT} {{spectra}} --effects {{{{"mirror":2}}}}', "got mirror, expected among line_of_sight"),
     "effects of Sionna": (f"{SIMULATE} 7,4,1.5 --engine sionna --effects room", "--effects: got 'room'"),
+    "walls of Sionna": (f"{SIMULATE} 7,4,1.5 --refraction", "--refraction: got True, but engine exact has --effects"),
+    "table in the place of JSON": ("relevance {scene} --spectra {spectra} -o {tmp}/r.md", "--out: got"),
+    "result in the place of a mesh": ("sample {tmp}/one.ply -o {tmp}/../{tmp.name}/one.ply", "which the command reads"),
+    "result in the place of readings": (HORN.replace("f.safetensors", "horn.csv"), "which the command reads"),
     "pointings without a direction": (f"{SUGGEST} --frequency 3e11 --receive-pattern 10", "azimuth"),
     "camera looks straight up": (f"{RENDER} {{tmp}}/one.ply --position 0 0 1 --look-at 0 0 2", "--look-at"),
     "field without receiver": (f"{RENDER} {{tmp}}/bad.safetensors", "--receiver"),
@@ -175,6 +179,23 @@ def test_receivers_from_file_and_words_agree(tmp_path):
     for none in ("", "x,y,z\n", "# none\n\n"):
         (tmp_path / "r.csv").write_text(none)
         assert read_receivers([str(tmp_path / "r.csv")]).shape == (0, 3)
+
+
+def test_a_photo_has_one_known_position(tmp_path):
+    (tmp_path / "a.csv").write_text("file,x,y,z\na.jpg,1,2.5,3\na.jpg,4,5,6\n")
+    with pytest.raises(ValueError, match="a file stands in it twice"):
+        read_positions(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize("names", ["x,z,y", "y,x,z", "x,y,z,elevation,azimuth"])
+def test_columns_in_another_order_are_refused(names, tmp_path):
+    file, row = tmp_path / "r.csv", ",".join("123450"[: names.count(",") + 1])
+    file.write_text(f"{names}\n{row}\n")
+    with pytest.raises(ValueError, match="expected rows x,y,z"):
+        (read_receivers if names.count(",") == 2 else read_pointings)([str(file)], "candidates")
+    file.write_text(f"file,{names}\na.jpg,{row}\n")
+    with pytest.raises(ValueError, match="CSV file,x,y,z"):
+        read_positions(file)
 
 
 def test_look_at_puts_the_target_in_the_middle_with_z_up():

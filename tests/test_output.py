@@ -62,6 +62,14 @@ def test_a_log_gets_a_line_every_half_minute_and_a_terminal_one_line_that_moves(
     assert moving.count("\n") == 3 and moving.count("\r") == 4 and bar[1] in moving  # 901 is drawn there too
 
 
+def test_an_error_goes_to_standard_error_when_nobody_reads_standard_output(monkeypatch, capsys):
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert cli.main(["sample", "none.xml", "-o", "r.csv", "--json"]) == 2
+        full.buffer.raw.close()
+    assert "none.xml: no such file" in capsys.readouterr().err
+
+
 def events(text):
     """Standard output of a command with --json: strict JSON, an object a line, and nothing else."""
 

@@ -218,3 +218,29 @@ def test_texture_coordinates_that_are_nan_are_left_out(tmp_path):
     found = read_mesh(tmp_path / "nan.ply")
     assert found.uv is None
     np.testing.assert_array_equal(found.vertices, corners)
+
+
+@pytest.mark.parametrize("first", range(8))
+def test_a_wall_drawn_as_one_polygon_keeps_its_doorway(first, tmp_path):
+    outline = np.array([[0, 0], [1, 0], [1, 2], [2, 2], [2, 0], [5, 0], [5, 3], [0, 3]])
+    rows = [f"{x} 7 {z}" for x, z in np.roll(outline, first, axis=0)]
+    vertices, corners = "\n".join(f"v {row}" for row in rows), " ".join(map(str, range(1, 9)))
+    (tmp_path / "wall.obj").write_text(f"{vertices}\nusemtl wood\nf {corners}\nusemtl glass\nf 1 2 3\n")
+    header = (
+        "ply\nformat ascii 1.0\nelement vertex 8\nproperty double x\nproperty double y\nproperty double z\n"
+    )
+    header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "wall.ply").write_text(header + "\n".join(rows) + "\n8 0 1 2 3 4 5 6 7\n")
+    for name in ("wall.obj", "wall.ply"):
+        mesh = wr.Mesh.load(tmp_path / name, unit="m")
+        # 5 m by 3 m without a door of 1 m by 2 m, wound in one way
+        assert mesh.areas[:6].sum() == pytest.approx(5 * 3 - 1 * 2)
+        np.testing.assert_allclose(mesh.face_normals[:6], np.tile([0.0, -1.0, 0.0], (6, 1)), atol=1e-12)
+    assert wr.Mesh.load(tmp_path / "wall.obj", unit="m").face_label.tolist() == [0] * 6 + [1]
+
+
+def test_a_polygon_that_crosses_itself_is_cut_as_far_as_it_goes():
+    points = np.column_stack([np.random.default_rng(0).random((300, 2)), np.zeros(300)])
+    index, polygon = mesh_content.triangulated(np.array([300, 3]), np.r_[:300, :3], points)
+    assert index.shape == (299, 3) and polygon.tolist() == [0] * 298 + [1]
+    assert index[:298].min() == 0 and index[:298].max() == 299 and index[298].tolist() == [300, 301, 302]

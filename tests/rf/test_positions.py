@@ -335,6 +335,15 @@ def test_sizes_that_are_no_metres_are_questioned(scale, unit):
     assert len(told) == (unit is not None)
 
 
+def test_places_in_millimetres_beside_a_room_in_metres_are_questioned():
+    with pytest.warns(UserWarning, match="transmitter: all places are .* in metres"):
+        check_positions(room(), 1e3 * TX, 1e3 * AIR, WAVELENGTH)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_positions(room(), TX, AIR, WAVELENGTH)
+        check_positions(room(), TX + 100.0, AIR + 100.0, WAVELENGTH)
+
+
 def test_a_room_in_millimetres_is_refused_before_it_is_cut_to_elements():
     s = scene()
     ds = wr.simulate(s, transmitter=TX, receivers=[AIR], frequency_hz=F, shape=(16, 32))

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import os
 import re
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import warprrf as wr
 from warprrf.cli import steps, views
@@ -59,6 +61,7 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> i
         # A space before a number that is negative keeps argparse from taking it for an option; whoever reads it drops it.
         args = parser.parse_args([f" {word}" if _NEGATIVE.fullmatch(word) else word for word in words])
         out, debug = Output(parser.prog, args.json, args.quiet), args.debug
+        _spare_inputs(args)
         with out.speaking():
             args.command(args, out)
             out.close()
@@ -73,6 +76,15 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> i
             raise
         return 2
     return 0
+
+
+def _spare_inputs(args: argparse.Namespace) -> None:
+    """Refuse a result in the place of a file that the command reads: it cannot be made again."""
+    given = {name: value for name, value in vars(args).items() if name != "out"}
+    words = [w for value in given.values() for w in (value if isinstance(value, list) else [value])]
+    out = Path(getattr(args, "out", None) or "")
+    if out.is_file() and any(isinstance(w, str) and os.path.exists(w) and out.samefile(w) for w in words):
+        raise ValueError(f"--out: got {args.out!r}, which the command reads; expected another name")
 
 
 def _one_line(error: Exception) -> str:

@@ -6,7 +6,6 @@ import argparse
 import csv
 import json
 import os
-import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
@@ -60,9 +59,12 @@ def read_positions(path: str | os.PathLike[str]) -> dict[str, tuple[float, float
         else:
             with path.open(newline="", encoding="utf-8-sig") as lines:
                 rows = [tuple(row) for row in csv.reader(lines) if row and not row[0].startswith("#")]
-            if rows and rows[0][0] == "file":
+            if rows and [cell.strip() for cell in rows[0]] == ["file", "x", "y", "z"]:
                 rows = rows[1:]
-        return {str(name): (float(x), float(y), float(z)) for name, x, y, z in rows}
+        found = {str(name): (float(x), float(y), float(z)) for name, x, y, z in rows}
+        if len(found) < len(rows):
+            raise ValueError("a file stands in it twice")
+        return found
     except (ValueError, TypeError) as error:
         raise ValueError(
             f'{path}: expected camera positions in metres, JSON {{"file.jpg": [x, y, z]}} or CSV file,x,y,z ({error})'
@@ -293,14 +295,14 @@ def refuse(args: argparse.Namespace, flags: Sequence[str], reason: str) -> None:
             raise ValueError(f"--{flag.replace('_', '-')}: got {getattr(args, flag)!r}, but {reason}")
 
 
-def read_rows(path: Path, what: str, columns: int) -> np.ndarray:
-    """Rows of ``columns`` numbers of a CSV or NPY file; a line of names and comments are left out."""
+def read_rows(path: Path, what: str, columns: int, names: str = "") -> np.ndarray:
+    """Rows of ``columns`` numbers of a CSV or NPY file; a line of their ``names`` and comments are left out."""
     with named(path, f"expected {what}"):
         if path.suffix.lower() == ".npy":
             found = np.load(path, mmap_mode="r", allow_pickle=False)
         else:
-            lines = [re.split("[#x]", line)[0] for line in path.read_text("utf-8-sig").splitlines()]
-            lines = [line for line in lines if line.strip()]
+            lines = [line.split("#")[0].strip() for line in path.read_text("utf-8-sig").splitlines()]
+            lines = [line for line in lines if line and line.replace(" ", "") != names]
             found = np.loadtxt(lines, delimiter=",", ndmin=2) if lines else np.zeros((0, columns))
         return check_array(what, found, (None, columns))
 
@@ -317,7 +319,7 @@ def read_pointings(values: Sequence[str], name: str) -> np.ndarray:
 
 def _read_places(values: Sequence[str], name: str, what: str, count: int) -> np.ndarray:
     if len(values) == 1 and "," not in values[0]:
-        return read_rows(existing(values[0]), f"rows {what}", count)
+        return read_rows(existing(values[0]), f"rows {what}", count, what.split()[0])
     rows = []
     for word in values:
         try:

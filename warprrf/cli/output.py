@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stdout, suppress
 from pathlib import Path
 from typing import Any
 
@@ -96,11 +96,11 @@ class Output:
 
     def error(self, message: str, status: int) -> None:
         """Say why the command ends with ``status``."""
-        self.close()
-        if self.lines:
-            self._line("error", message=message, status=status)
-        else:
-            print(f"{self._name}: {message}", file=sys.stderr, flush=True)
+        with suppress(OSError):  # nobody reads standard output any more
+            self.close()
+            if self.lines:
+                return self._line("error", message=message, status=status)
+        print(f"{self._name}: {message}", file=sys.stderr, flush=True)
 
     def resumes(self, kept: str | os.PathLike[str]) -> None:
         """From now on finished work lies in ``kept``, a file or a folder with :class:`~warprrf.steps.Steps`."""

@@ -181,12 +181,12 @@ def add_simulate(add: Add) -> None:
     )
     sim.add_argument("--engine", choices=("exact", "sionna"), default="exact", help="default exact")
     add_effects(sim, "what exact models, by default single bounces, without noise")
-    sim.add_argument("--depth", type=int, default=3, help="most interactions (sionna; default 3)")
-    sim.add_argument(
-        "--samples", type=int, default=1_000_000, help="rays per transmitter (sionna; default 1e6)"
-    )
+    sim.add_argument("--depth", type=int, help="most interactions (sionna; default 3)")
+    sim.add_argument("--samples", type=int, help="rays per transmitter (sionna; default 1e6)")
     sim.add_argument("--beam-sigma-deg", type=float, default=2.0, help="receiver beam (default 2 degrees)")
-    sim.add_argument("--refraction", action="store_true", help="transmission through walls (sionna)")
+    sim.add_argument(
+        "--refraction", action="store_const", const=True, help="transmission through walls (sionna)"
+    )
     sim.add_argument("--gas", action="store_true", help="absorption by standard air (ITU-R P.676)")
 
 
@@ -205,7 +205,10 @@ def _simulate(args: argparse.Namespace, out: Output) -> None:
       warprrf simulate data/lobby/scene.xml -o many.nc --transmitter 2 3 3.2 --receivers receivers.csv --engine sionna
       warprrf simulate data/lobby/scene.xml -o all.nc --transmitter 2 3 3.2 --receivers 7,4,1.5 --effects everything
     """
-    how: dict[str, Any] = {}
+    solver = ("depth", "samples", "refraction")
+    how = {name: getattr(args, name) for name in solver if getattr(args, name) is not None}
+    if args.engine == "exact":
+        refuse(args, solver, "engine exact has --effects instead")
     if args.effects is not None:
         if args.engine != "exact":
             refuse(args, ["effects"], f"engine {args.engine} has its own: --depth, --refraction")
@@ -220,10 +223,7 @@ def _simulate(args: argparse.Namespace, out: Output) -> None:
         frequency_hz=args.frequency,
         shape=tuple(args.shape),
         engine=args.engine,
-        depth=args.depth,
-        samples=args.samples,
         beam_sigma_rad=np.deg2rad(args.beam_sigma_deg),
-        refraction=args.refraction,
         gas=args.gas,
         seed=args.seed,
         workspace=unfinished,
@@ -550,6 +550,8 @@ def _relevance(args: argparse.Namespace, out: Output) -> None:
       warprrf fit room spectra.nc -o field.safetensors --relevance relevance.json
     """
     source = existing(args.source)
+    if args.out and Path(args.out).suffix == ".md":
+        raise ValueError(f"--out: got {args.out!r}, expected JSON's name: the table goes beside it as .md")
     given = {"transmitter": args.transmitter, "frequency_hz": args.frequency}
     receivers = None if args.receivers is None else read_receivers(args.receivers)
     if args.spectra is not None:

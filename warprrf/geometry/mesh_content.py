@@ -9,6 +9,7 @@ import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +117,55 @@ def numbered(names: Sequence[str | None], counts: Sequence[int]) -> tuple[np.nda
     index: dict[str, int] = {}
     own = [-1 if name is None else index.setdefault(name, len(index)) for name in names]
     return (np.repeat(np.array(own, dtype=np.int32), counts) if index else None), tuple(index)
+
+
+def triangulated(
+    lengths: np.ndarray, corners: np.ndarray, vertices: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles ``(F, 3)`` of polygons as indices into all their ``corners``, and the polygon of each, ``(F,)``.
+
+    A polygon becomes a fan around its first corner, or, where that would cover what lies outside, as a doorway in its wall,
+    ears are cut off it one by one (Meisters, "Polygons have ears", 1975).
+    """
+    n = np.asarray(lengths, np.int64)
+    first, start, polygon = np.cumsum(n) - n, np.cumsum(n - 2) - (n - 2), np.repeat(np.arange(len(n)), n - 2)
+    place = np.arange(len(polygon)) - start[polygon]
+    index = first[polygon, None] + np.stack([0 * place, place + 1, place + 2], axis=1)
+    if corners.min(initial=0) < 0 or corners.max(initial=0) >= len(vertices):
+        return index, polygon  # refused by whoever reads them
+    some, normal = np.flatnonzero(n[polygon] > 3), np.zeros((len(n), 3))
+    own = polygon[some]
+    with np.errstate(invalid="ignore", over="ignore"):  # so are vertices that are not finite
+        a, b, c = np.moveaxis(vertices[corners[index[some]]], 1, 0)
+        cross = np.cross(b - a, c - a)
+        np.add.at(normal, own, cross)
+        outside = (cross * normal[own]).sum(axis=1) < -1e-6 * (normal[own] ** 2).sum(axis=1)
+    for k in np.unique(own[outside]):
+        points = vertices[corners[first[k] : first[k] + n[k]]]
+        index[start[k] : start[k] + n[k] - 2] = first[k] + _ears(points - points[0], normal[k])
+    return index, polygon
+
+
+def _ears(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Triangles ``(N - 2, 3)`` of a polygon (N, 3) that may be concave."""
+    left, found = np.arange(len(points)), []
+
+    def leftward(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+        turn: np.ndarray = np.cross(points[b] - points[a], points[c] - points[a]) @ normal
+        return turn > 0
+
+    while len(left) > 3:
+        corner = np.stack([np.roll(left, 1), left, np.roll(left, -1)], axis=1)
+        convex = np.flatnonzero(leftward(*corner.T))
+        inside = (
+            leftward(a, b, left) & leftward(b, c, left) & leftward(c, a, left) for a, b, c in corner[convex]
+        )
+        k = next((k for k, met in zip(convex, inside, strict=True) if not met.any()), None)
+        if k is None:  # what is left crosses itself, or has no area
+            break
+        found.append(corner[k])
+        left = np.delete(left, k)
+    return np.array([*found, *([left[0], b, c] for b, c in pairwise(left[1:]))])
 
 
 def material_name(name: str | None, textured: bool) -> str | None:

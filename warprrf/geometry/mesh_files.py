@@ -16,7 +16,14 @@ from numpy.typing import ArrayLike
 
 from warprrf.checks import LARGEST_M, check_array, check_choice, check_count, warn
 from warprrf.geometry.gltf_files import read_gltf
-from warprrf.geometry.mesh_content import LARGEST_BYTES, Folder, MeshContent, to_linear, to_srgb
+from warprrf.geometry.mesh_content import (
+    LARGEST_BYTES,
+    Folder,
+    MeshContent,
+    to_linear,
+    to_srgb,
+    triangulated,
+)
 from warprrf.geometry.obj_files import read_obj
 from warprrf.geometry.ply_files import Element, Lists, read_ply, write_ply
 from warprrf.geometry.rays import open3d
@@ -76,7 +83,7 @@ def load_mesh(
 def read_mesh(
     path: str | os.PathLike[str], *, allow_outside: bool = False, colours: bool = True
 ) -> MeshContent:
-    """Read a mesh file as it stands, in its own unit and axes; polygons become fans of triangles.
+    """Read a mesh file as it stands, in its own unit and axes; polygons become triangles.
 
     Args:
         path: PLY, OBJ, STL, glTF or GLB, by the suffix.
@@ -159,7 +166,8 @@ def _from_ply(folder: Folder) -> MeshContent:
         raise ValueError(
             f"path: {path} holds one of the texture coordinates {' and '.join(uv)}, expected both"
         )
-    vertices, (faces, polygon) = _columns(vertex, "xyz"), _fans(corners, path)
+    vertices = _columns(vertex, "xyz")
+    faces, polygon = _triangles(corners, vertices, path)
     own, seen = _ply_colours(face, path), _ply_colours(vertex, path)
     colours = None
     if own is not None:
@@ -186,18 +194,16 @@ def _columns(element: Element, names: Sequence[str]) -> np.ndarray:
         return np.column_stack([np.asarray(element[name], dtype=np.float64) for name in names])
 
 
-def _fans(polygons: Lists, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles ``(F, 3)`` around the first corner of each polygon, and the polygon of each, ``(F,)``."""
-    n = polygons.lengths
+def _triangles(polygons: Lists, vertices: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles ``(F, 3)`` of polygons, and the polygon of each, ``(F,)``."""
+    n, corners = polygons.lengths, np.asarray(polygons.values)
     if (n < 3).any():
         raise ValueError(f"path: {path} holds {int((n < 3).sum())} faces of fewer than three corners")
-    first = np.repeat(np.cumsum(n) - n, n - 2)
-    place = np.arange(len(first)) - np.repeat(np.cumsum(n - 2) - (n - 2), n - 2)
-    index = np.stack([first, first + place + 1, first + place + 2], axis=1)
-    corners = np.asarray(polygons.values)[index]
     if not (np.abs(corners) < 2**31).all():
         raise ValueError(f"path: {path} names vertices beyond {2**31}")
-    return corners.astype(np.int32), np.repeat(np.arange(len(n)), n - 2)
+    corners = corners.astype(np.int32)
+    index, polygon = triangulated(n, corners, vertices)
+    return corners[index], polygon
 
 
 def _from_stl(folder: Folder) -> MeshContent:

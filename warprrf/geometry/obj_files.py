@@ -23,6 +23,7 @@ from warprrf.geometry.mesh_content import (
     sampled,
     to_linear,
     to_srgb,
+    triangulated,
 )
 
 _STATEMENTS = {
@@ -39,6 +40,7 @@ class _Lines:
     positions: array[float] = field(default_factory=lambda: array("d"))
     colours: array[float] = field(default_factory=lambda: array("d"))
     textures: array[float] = field(default_factory=lambda: array("d"))
+    sizes: array[int] = field(default_factory=lambda: array("q"))
     corners: array[int] = field(default_factory=lambda: array("q"))
     corner_textures: array[int] = field(default_factory=lambda: array("q"))
     names: dict[str, str] = field(default_factory=dict)
@@ -58,19 +60,16 @@ class _Lines:
             case ["vt", *numbers]:
                 self.textures.extend(map(float, (numbers + ["0"])[:2]))
             case ["f", *corners]:
-                vertex, texture = [], []
+                self.sizes.append(len(corners))
                 for corner in corners:
                     parts = corner.split("/")
-                    vertex.append(_index(parts[0], len(self.positions) // 3))
+                    self.corners.append(_index(parts[0], len(self.positions) // 3))
                     mapped = len(parts) > 1 and parts[1] != ""
-                    texture.append(_index(parts[1], len(self.textures) // 2) if mapped else -1)
-                for k in range(1, len(corners) - 1):  # a fan around the first corner
-                    self.corners.extend((vertex[0], vertex[k], vertex[k + 1]))
-                    self.corner_textures.extend((texture[0], texture[k], texture[k + 1]))
+                    self.corner_textures.append(_index(parts[1], len(self.textures) // 2) if mapped else -1)
             case ["usemtl" | "o" | "g" as kind, *name]:
                 self.names[kind] = " ".join(name)
                 thing = self.names.get("o") or self.names.get("g")
-                self.runs.append((len(self.corners) // 3, self.names.get("usemtl"), thing or None))
+                self.runs.append((len(self.sizes), self.names.get("usemtl"), thing or None))
             case ["mtllib", *name]:
                 self.libraries.append(" ".join(name))
 
@@ -80,7 +79,7 @@ _Material = tuple[np.ndarray, np.ndarray | None]
 
 
 def read_obj(folder: Folder) -> MeshContent:
-    """Read the OBJ file of ``folder``; polygons become fans of triangles.
+    """Read the OBJ file of ``folder``; polygons become triangles.
 
     Raises:
         ValueError: naming the file and the line, if it is damaged or names files outside its folder.
@@ -91,8 +90,12 @@ def read_obj(folder: Folder) -> MeshContent:
     lines = _lines(folder)
     if not np.isfinite(lines.textures).all() or not np.isfinite(lines.colours).all():
         raise ValueError(f"path: {folder.path} holds texture coordinates or colours that are not finite")
-    faces = np.array(lines.corners, dtype=np.int64).reshape(-1, 3)
-    starts, material, thing = zip(*lines.runs, strict=True)
+    corners, sizes = np.array(lines.corners, np.int64), np.array(lines.sizes, np.int64)
+    positions = np.array(lines.positions, dtype=np.float64).reshape(-1, 3)
+    index, _ = triangulated(sizes, corners, positions)
+    faces, textures = corners[index], np.array(lines.corner_textures, np.int64)[index]
+    polygons, material, thing = zip(*lines.runs, strict=True)
+    starts = np.append(0, np.cumsum(sizes - 2))[list(polygons)].tolist()
     ends = [*starts[1:], len(faces)]
     known: dict[str, _Material] = {}
     for library in lines.libraries if folder.colours else ():
@@ -106,8 +109,7 @@ def read_obj(folder: Folder) -> MeshContent:
     objects = numbered(thing, counts)
     runs = [(known[m], k, n) for m, k, n in zip(material, starts, ends, strict=True) if m in known and k < n]
     return MeshContent(
-        np.array(lines.positions, dtype=np.float64).reshape(-1, 3), faces.astype(np.int32),
-        face_colours=_colours(lines, faces, runs),
+        positions, faces.astype(np.int32), face_colours=_colours(lines, faces, textures, runs),
         face_material=names[0], material_names=names[1], face_object=objects[0], object_names=objects[1],
     )  # fmt: skip
 
@@ -174,10 +176,13 @@ def _read_materials(folder: Folder, library: str) -> dict[str, _Material]:
     return known
 
 
-def _colours(lines: _Lines, faces: np.ndarray, runs: list[tuple[_Material, int, int]]) -> np.ndarray | None:
+def _colours(
+    lines: _Lines, faces: np.ndarray, corner: np.ndarray, runs: list[tuple[_Material, int, int]]
+) -> np.ndarray | None:
     """sRGB of faces: of the texture, else of the vertices, else of the material; None without any.
 
     Args:
+        corner: texture coordinates of corners, shape ``(F, 3)``, -1 for none.
         runs: faces that have a material, from a first one to behind a last one.
     """
     colour = np.full((len(faces), 3), np.nan)
@@ -186,7 +191,6 @@ def _colours(lines: _Lines, faces: np.ndarray, runs: list[tuple[_Material, int, 
         own = (faces < len(vertex)).all(axis=1)  # the others are refused by whoever reads them
         colour[own] = vertex[faces[own]].mean(axis=1)
     uv = np.array(lines.textures, dtype=np.float64).reshape(-1, 2)
-    corner = np.array(lines.corner_textures, dtype=np.int64).reshape(-1, 3)
     for (plain, picture), low, high in runs:
         part, at = colour[low:high], corner[low:high]
         part[np.isnan(part[:, 0])] = plain

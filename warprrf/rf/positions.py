@@ -200,6 +200,14 @@ def _check_in_air(
     ):
         apart = np.arange(len(points)) == 0
     outside = ((points < mesh.bounds[0]) | (points > mesh.bounds[1])).any(axis=1)
+    if outside.all():
+        away = np.linalg.norm(points - points.clip(*mesh.bounds), axis=1).min()
+        size = float(np.linalg.norm(np.ptp(mesh.bounds, axis=0)))
+        if away > 30.0 * size:
+            warn(
+                f"{labels[0]}: all places are {away:.3g} m or more from the scene, which is {size:.3g} m large: are they "
+                "in metres, and counted from its origin?"
+            )
     if outside.any():
         air = points[~outside & ~apart]
         sealed = _is_sealed(mesh, air[0], device) if len(air) else apart[0]

@@ -348,6 +348,8 @@ FLAT = np.ones((19, 36))
         ("pattern.*NaN or infinite fields", lambda: Antenna(lambda zenith, azimuth: (np.nan, 0.0))),
         ("one of several ports", lambda: Antenna((lambda z, a: np.ones(z.shape), lopsided))),
         ("orientation.*-1", lambda: Antenna("dipole", orientation=np.diag([1.0, 1.0, -1.0]))),
+        ("orientation.*radians", lambda: Antenna("dipole").turned((90, 0, 0))),
+        ("orientation.*radians", lambda: wr.PlanarArray(2, 2, orientation=(0, -90, 0))),
         ("polarisation: got None", lambda: Antenna("dipole").field([1.0, 0, 0])),
         ("two angles", lambda: Antenna("dipole").gain_off_boresight([0.1])),
         ("zenith: got 0 to 1.5", lambda: Antenna.from_grid(ZENITH[:10], AZIMUTH, FLAT[:10])),

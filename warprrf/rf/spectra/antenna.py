@@ -326,6 +326,10 @@ def check_rotation(orientation: ArrayLike) -> np.ndarray:
     """The rotation (3, 3) of three angles or a matrix; ValueError or TypeError names ``orientation``."""
     value = check_array("orientation", orientation)
     if value.shape == (3,):
+        if np.abs(value).max() > 2.0 * np.pi:
+            raise ValueError(
+                f"orientation: got {value.tolist()}, expected yaw, pitch and roll in radians, at most 2 pi"
+            )
         return rotation_matrix(value)
     if value.shape != (3, 3) or not np.allclose(value @ value.T, np.eye(3), atol=1e-9):
         raise ValueError(

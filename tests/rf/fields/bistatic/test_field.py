@@ -58,6 +58,29 @@ def test_spectra_that_would_not_fit_into_memory_are_refused(scene, data, monkeyp
     RadioField.fit(scene, data.subset(np.arange(9)), sub_pixels=2, effects="single", iterations=1)
 
 
+@pytest.mark.parametrize("turned", [None, "azimuths from 0", "transposed", "in another order"])
+def test_spectra_whose_pixels_are_counted_in_another_way_are_questioned(scene, data, turned):
+    gain = {
+        None: data.path_gain,
+        "azimuths from 0": np.roll(data.path_gain, 24, axis=2),
+        "transposed": data.path_gain.swapaxes(1, 2),
+        "in another order": np.roll(data.path_gain, 1, axis=0),
+    }[turned]
+    told = {
+        name: getattr(data, name) for name in ("receivers", "transmitter", "frequency_hz", "beam_sigma_rad")
+    }
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        RadioField.fit(
+            scene,
+            SpectrumDataset.from_spectra(path_gain=gain, **told),
+            effects="single",
+            quick=True,
+            iterations=1,
+        )
+    assert any("rows by zenith from 0" in str(w.message) for w in said) == (turned is not None)
+
+
 def test_what_was_learned_under_another_transmitter_than_its_own_a_field_does_not_use(scene, data):
     """A first data set without receivers says where the field's own stands; all that was read is of another."""
     own = np.array([4.2, 3.4, 2.3])

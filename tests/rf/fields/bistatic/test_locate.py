@@ -193,7 +193,8 @@ def test_a_map_s_departures_are_those_of_paths_that_met_one_surface(field):
 def test_what_cannot_be_located_is_refused(scene, field, horn):
     ds = furnished.spectra(scene, UNSEEN)
     for what, text in (
-        (ds, "spectra of 2 receivers"), (replace(ds.subset([0]), frequency_hz=140e9), "at_frequency"),
+        (ds, "of 2 receivers"), (replace(horn, receivers=horn.receivers + np.arange(len(horn))[:, None]), "Readings of"),
+        (replace(ds.subset([0]), frequency_hz=140e9), "at_frequency"),
         (replace(horn, departure=horn.arrival, transmit_pattern=horn.receive_pattern), "beside departures"), (3, "int"),
     ):  # fmt: skip
         with pytest.raises((TypeError, ValueError), match=text):

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from warprrf.checks import warn
 from warprrf.device import DeviceLike, Progress
-from warprrf.geometry.mesh import GeometryLike, as_mesh
+from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import Data, Measured
 from warprrf.rf.fields.bistatic.gauss_newton import Solution, gauss_newton
@@ -40,6 +41,7 @@ from warprrf.rf.fields.bistatic.training import (
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
 from warprrf.rf.positions import warn_of_unmodelled
 from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.metrics import angle_deg, strongest_direction
 from warprrf.rf.tracing.model import SETS, Effects, Model
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rows import distinct_rows
@@ -65,6 +67,9 @@ def fit(
         if isinstance(one, SpectrumDataset) and len(one) and not (one.path_gain > one.floor).any():
             raise ValueError("ds: got no pixel above the floor, expected spectra with power to fit to")
     places = places_of(data, mesh, device)
+    for one in data:
+        if isinstance(one, SpectrumDataset):
+            _question_directions(one, mesh, device)
     ends = np.array([np.concatenate([place.transmitter, place.receiver]) for place in places])
     ends = ends[np.sort(distinct_rows(ends)[0])]
     check_rays(places, options.rays_a_side)
@@ -99,6 +104,24 @@ def fit(
         "parameters": parameters, "report": report | zeros | {"position_offset_m": places_moved},
         "fitted_on": ends[:, 3:], "fitted_under": ends[:, :3],
     }  # fmt: skip
+
+
+def _question_directions(ds: SpectrumDataset, mesh: Mesh, device: DeviceLike) -> None:
+    """Warn if most receivers in line of sight get most power from elsewhere: their pixels are counted in another way, or
+    they stood elsewhere."""
+    whole = ~np.isnan(ds.path_gain).any(axis=(1, 2))
+    seen = np.flatnonzero(whole & mesh.visible(ds.receivers, ds.transmitter, device=device))
+    if len(seen) < 4:
+        return
+    toward = ds.transmitter - ds.receivers[seen]
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    off = angle_deg(np.array([strongest_direction(ds.path_gain[k]) for k in seen]), toward) > 20.0
+    if off.mean() > 0.5:
+        warn(
+            f"ds: at {off.sum()} of {len(seen)} receivers in line of sight the strongest direction is not that of the "
+            "transmitter; expected rows by zenith from 0, columns by azimuth from -pi (x at 0, y at pi / 2), and receivers "
+            "in the order of their spectra"
+        )
 
 
 def _learned(

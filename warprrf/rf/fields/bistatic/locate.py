@@ -64,9 +64,10 @@ def as_data(field: Any, measured: Any) -> list[Measured]:
                 raise ValueError(
                     "measured: got azimuths of an unknown zero beside departures or delays, expected one without the other"
                 )
-        elif len(one) != 1:
+        count = len(np.unique(one.receivers, axis=0)) if isinstance(one, Readings) else len(one)
+        if count != 1:
             raise ValueError(
-                f"measured: got spectra of {len(one)} receivers, expected that of one: ds.subset([k])"
+                f"measured: got {type(one).__name__} of {count} receivers, expected that of one: .subset([k])"
             )
         if isinstance(one, SpectrumDataset) and np.isnan(one.path_gain).all():
             raise ValueError("measured: got a spectrum of NaN alone, expected pixels that were measured")
