@@ -86,7 +86,7 @@ def frequency_response(
 
     Args:
         amplitude: "carrier", or "friis" for the factor carrier / f.
-        method: "dense", exact to rounding; "grid" for equally spaced frequencies, errs by about 1e-7 of the root of the
+        method: "dense", exact to rounding; "grid" for equally spaced frequencies, errs by less than 1e-6 of the root of the
             paths' power; "auto" takes the grid where the dense sum has more than a million terms (pairs x paths x frequencies).
         **link: See :class:`LinkOptions`.
 

@@ -10,7 +10,7 @@ Dense sums cost pairs x paths x frequencies. The gridded one, for equally spaced
 grid log grid): each path is spread to 8 cells of a twice oversampled grid of delays by a smooth window, a fast Fourier
 transform follows, and the window's transform is divided out (Dutt and Rokhlin, SIAM J. Sci. Comput. 14, 1993; the
 window exp(beta sqrt(1 - z^2)) is that of Barnett, Magland and af Klinteberg, SIAM J. Sci. Comput. 41, 2019). It treats
-arrays exactly, whatever their shape, and errs by about 1e-7 of the root of the paths' total power.
+arrays exactly, whatever their shape, and errs by less than 1e-6 of the root of the paths' total power.
 
 Lengths are those of plane waves, or of spherical waves about exact points. For line of sight, mirrors, slabs and edges a
 spherical wave comes from the transmitting element's image: the transmitter's lies one path length away along the arrival, and

@@ -386,7 +386,7 @@ def fading_db(samples: int | None, steady: ArrayLike = 0.0) -> tuple[np.ndarray,
 
     Power is taken for gamma distributed with the shape m that has its variance (Nakagami 1960): that of waves of
     independent phases is 1 - sum s_i^2 of its mean's square, s_i the share of each. One wave of K-factor K over many weak
-    ones has m = (K + 1)^2 / (2 K + 1), and a mean that is at most 0.25 dB off that of a Rician power; Rayleigh fading is m = 1.
+    ones has m = (K + 1)^2 / (2 K + 1), and a mean that is at most 0.26 dB off that of a Rician power; Rayleigh fading is m = 1.
 
     Args:
         samples: independent ones that a reading is the mean of; None where fading is averaged out.
