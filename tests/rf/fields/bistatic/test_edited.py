@@ -207,6 +207,11 @@ def test_wrong_names_are_refused(objects, materials, message):
         field.with_objects(objects, materials=materials)
 
 
+def test_what_is_no_mesh_is_refused_by_name(field):
+    with pytest.raises(TypeError, match=r"objects\['person'\]: got str, expected a Mesh"):
+        field.with_objects({"person": "person.ply"}, materials={"person": "skin"})
+
+
 def test_an_edited_field_is_saved_and_loaded(field, tmp_path):
     there = field.with_objects(
         {"person": box([1.2, 3.0, 0.01], [1.7, 3.3, 1.8])}, materials={"person": "skin"}
