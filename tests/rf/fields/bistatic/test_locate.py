@@ -64,6 +64,24 @@ def test_what_is_said_of_the_place_does_not_count(scene, field):
     np.testing.assert_array_equal(field.locate(one).position, field.locate(elsewhere).position)
 
 
+def test_where_nothing_arrives_no_place_is_known(field):
+    """In the shadow of a field of line of sight alone."""
+    sight = wr.Effects(mirrors=0, scatterings=0, transmissions=0, diffractions=0)
+    direct, dark = replace(field, effects=sight), RECEIVERS[~field.mesh.visible(RECEIVERS, field.transmitter)]
+    read = direct.spectrum(dark[0])
+    assert read.path_gain.max() == 0
+    found = direct.locate(read)
+    assert not found.known and found.std_m == np.inf
+
+
+def test_one_power_leaves_ways_open(field):
+    """Along which nothing says how far: that is no error of none."""
+    total = field.spectrum(UNSEEN[0]).path_gain.sum()
+    read = wr.Readings(field.transmitter, UNSEEN[0], [total], field.frequency_hz, 1e-3 * total)
+    found = field.locate(read)
+    assert not found.known and found.std_m == np.inf
+
+
 def test_a_transmitter_may_stand_at_a_place_of_the_map(field):
     places = next(iter(maps_of(field, [field.transmitter]).values())).places
     other = places[np.linalg.norm(places - [1.2, 3.2, 1.2], axis=1).argmin()]
