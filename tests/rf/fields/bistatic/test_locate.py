@@ -6,6 +6,7 @@ import furnished
 import numpy as np
 import pytest
 from furnished import RECEIVERS
+from radio_scenes import box_mesh
 
 import warprrf as wr
 from warprrf.rf.fields.bistatic.field_map import coarse, maps_of
@@ -62,6 +63,18 @@ def test_what_is_said_of_the_place_does_not_count(scene, field):
     one = furnished.spectra(scene, UNSEEN[:1])
     elsewhere = replace(one, receivers=RECEIVERS[:1])
     np.testing.assert_array_equal(field.locate(one).position, field.locate(elsewhere).position)
+
+
+@pytest.mark.parametrize(
+    ("size", "told"), [([0.3, 0.3, 0.3], "none of the places"), ([900.0, 900.0, 30.0], "1.9e\\+08 places")]
+)
+def test_scenes_too_large_or_too_small_to_search_are_refused(size, told):
+    room = wr.Mesh(*box_mesh([0, 0, 0], size, inward=True))
+    ends = {"transmitter": 0.3 * np.array(size), "frequency_hz": 300e9}
+    field = wr.RadioField.fit(room, wr.SpectrumDataset.empty(**ends), effects="single")
+    read = wr.Readings(ends["transmitter"], 0.6 * np.array(size), [1e-8], 300e9, 1e-12)
+    with pytest.raises(ValueError, match=f"field: {told}"):
+        field.locate(read)
 
 
 def test_where_nothing_arrives_no_place_is_known(field):
