@@ -173,7 +173,8 @@ def test_paths_carry_the_spectrum_and_line_of_sight_is_exact(field):
 def test_a_view_is_of_the_field_that_it_is_given_to(field):
     view, place = field.view(RECEIVERS[3]), RECEIVERS[3]
     assert np.array_equal(
-        field.spectrum(place, view=view).path_gain, field.spectrum(place, shape=field.shape, view=view).path_gain
+        field.spectrum(place, view=view).path_gain,
+        field.spectrum(place, shape=field.shape, view=view).path_gain,
     )
     box = Mesh(*box_mesh([1.0, 3.0, 0.5], [1.5, 3.5, 1.0]))
     others = [

@@ -472,7 +472,9 @@ class BistaticField(RadioField):
         loss = 0.0 if self.air is None else self.air.loss_per_m(self.frequency_hz)
         t, own = view.tracer, (self.surface, self.frequency_hz, loss, tuple(self.shape))
         if (t.surface, t.frequency_hz, t.grid.loss_per_m, tuple(t.grid.shape)) != own:
-            raise ValueError("view: got one of another geometry, carrier, air or grid, expected this field's own")
+            raise ValueError(
+                "view: got one of another geometry, carrier, air or grid, expected this field's own"
+            )
         return path_gains(view, self.state)
 
     def tracer(self, transmitter: ArrayLike | None = None) -> Tracer:

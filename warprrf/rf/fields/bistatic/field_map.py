@@ -130,7 +130,9 @@ def lattice(mesh: Mesh, known: np.ndarray, transmitters: np.ndarray, device: Any
     far = (np.linalg.norm(every[:, None] - transmitters, axis=2) > clearance_m).all(axis=1)
     found = every[far][is_free(mesh, every[far], known, clearance_m=clearance_m, device=device)]
     if len(found) == 0:
-        raise ValueError(f"field: none of the places {SPACING_M:g} m apart that would be searched is in the air")
+        raise ValueError(
+            f"field: none of the places {SPACING_M:g} m apart that would be searched is in the air"
+        )
     return found
 
 
