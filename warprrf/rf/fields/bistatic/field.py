@@ -366,7 +366,7 @@ class BistaticField(RadioField):
     def _seen(self, view: View, uncertainty: bool) -> Spectrum:
         gains = self.path_gains(view)
         image = spectra_of(gains, self._beam)[0]
-        known = {"transmitter": view.tracer.transmitter, "frequency_hz": self.frequency_hz}
+        known = {"transmitter": view.tracer.transmitter.copy(), "frequency_hz": self.frequency_hz}
         known |= {"beam_sigma_rad": self.beam_sigma_rad} | ({} if self.air is None else self.air.attributes)
         arrays = image.astype(np.float32), *strongest(gains, image, self.beam_sigma_rad)
         spectrum = Spectrum(*arrays, self.floor, self.range_db, attributes=known)
