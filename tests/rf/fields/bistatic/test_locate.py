@@ -225,7 +225,8 @@ def test_what_cannot_be_located_is_refused(scene, field, horn):
     ds = furnished.spectra(scene, UNSEEN)
     for what, text in (
         (ds, "spectra of 2 receivers"), (replace(ds.subset([0]), frequency_hz=140e9), "at_frequency"),
-        (replace(horn, departure=horn.arrival, transmit_pattern=horn.receive_pattern), "beside departures"), (3, "int"),
+        (replace(horn, departure=horn.arrival, transmit_pattern=horn.receive_pattern), "beside departures"),
+        (3, "measured: got int"), ([], "measured: got an empty list"), ([field.spectrum(UNSEEN[0])], "measured: got Spectrum"),
     ):  # fmt: skip
         with pytest.raises((TypeError, ValueError), match=text):
             as_data(field, what)

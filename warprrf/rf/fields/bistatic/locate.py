@@ -53,7 +53,7 @@ def as_data(field: Any, measured: Any) -> list[Measured]:
             floor=measured.floor or field.floor, attributes=None if air is None else air.attributes, **own,
         )  # fmt: skip
     found = []
-    for one in as_list(measured):
+    for one in as_list(measured, "measured"):
         of, told = one.frequency_hz / 1e9, field.frequency_hz / 1e9
         if abs(of / told - 1.0) > 1e-3:
             raise ValueError(
