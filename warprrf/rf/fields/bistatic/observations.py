@@ -122,7 +122,9 @@ def as_list(data: Data, name: str = "ds") -> list[Measured]:
             )
         several.append(one)
     if not several:
-        raise ValueError(f"{name}: got an empty list, expected a SpectrumDataset, Readings, or several of them")
+        raise ValueError(
+            f"{name}: got an empty list, expected a SpectrumDataset, Readings, or several of them"
+        )
     names = [None if isinstance(one, SpectrumDataset) else one.name for one in several]
     for k, one in enumerate(several):
         if not isinstance(one, SpectrumDataset) and names.count(one.name) > 1:
