@@ -300,3 +300,13 @@ def test_the_cross_section_of_a_box_is_its_outline():
     lines = mesh.cross_section(1.2)
     assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum() == pytest.approx(2 * (4 + 3))
     assert mesh.cross_section(2.5).shape == (0, 2, 2)
+
+
+@pytest.mark.parametrize(
+    "name", ["vertices", "faces", "triangles", "areas", "face_normals", "bounds", "center"]
+)
+def test_what_a_mesh_keeps_cannot_be_written_into(name):
+    """``low, high = scene.bounds; low += 0.5`` would move the room's walls for all that asks later."""
+    kept = getattr(Mesh(*box_mesh([0, 0, 0], [5, 4, 3])), name)
+    with pytest.raises(ValueError, match="read-only"):
+        kept += kept

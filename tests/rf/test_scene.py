@@ -106,3 +106,21 @@ def test_a_scene_whose_folder_is_a_link_is_read(copy, tmp_path_factory):
     link = tmp_path_factory.mktemp("links") / "room"
     link.symlink_to(copy)
     assert "desk" in Scene.load(link / "scene.xml").object_names
+
+
+def test_a_scene_keeps_what_it_was_made_of(lobby):
+    """Scenes of a series are often made of one array that is changed in between."""
+    material, thing = np.zeros((2, len(lobby.mesh.faces)), np.int32)
+    at = np.ones(3)
+    scene = Scene(
+        lobby.mesh,
+        lobby.materials,
+        material,
+        face_object=thing,
+        object_names=("a", "b"),
+        transmitters={"t": at},
+    )
+    for own in (material, thing, at):
+        own += 1
+    assert not scene.face_material.any() and not scene.face_object.any()
+    assert (scene.transmitters["t"] == 1).all()

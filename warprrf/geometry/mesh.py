@@ -104,8 +104,8 @@ class Mesh:
             )
         if not np.cross(*np.diff(self.vertices[self.faces], axis=1).swapaxes(0, 1)).any():
             raise ValueError("faces: got none that has an area, expected at least one")
-        self.vertices.setflags(write=False)
-        self.faces.setflags(write=False)
+        for array in (self.vertices, self.faces):
+            _fixed(array)
         self.face_colours = self._checked_colours(face_colours)
         self.face_label, self.labels = self._checked_labels(face_label, labels)
 
@@ -117,8 +117,7 @@ class Mesh:
         ).copy()
         if not ((found >= 0) & (found <= 1) | np.isnan(found)).all():
             raise ValueError("face_colours: got values outside 0 to 1, expected sRGB, NaN where unknown")
-        found.setflags(write=False)
-        return found
+        return _fixed(found)
 
     def _checked_labels(
         self, material: ArrayLike | None, names: Sequence[str]
@@ -134,8 +133,7 @@ class Mesh:
             raise ValueError(
                 f"face_label: got indices from {found.min()} to {found.max()}, expected -1 (none) to {len(names) - 1}"
             )
-        found.setflags(write=False)
-        return found, tuple(names)
+        return _fixed(found), tuple(names)
 
     @classmethod
     def load(
@@ -188,7 +186,7 @@ class Mesh:
     @cached_property
     def triangles(self) -> np.ndarray:
         """Corner positions [m], shape ``(F, 3, 3)``."""
-        return self.vertices[self.faces]
+        return _fixed(self.vertices[self.faces])
 
     @cached_property
     def _crosses(self) -> np.ndarray:
@@ -198,19 +196,19 @@ class Mesh:
     @cached_property
     def areas(self) -> np.ndarray:
         """Face areas [m^2], shape ``(F,)``."""
-        return 0.5 * np.linalg.norm(self._crosses, axis=1)
+        return _fixed(0.5 * np.linalg.norm(self._crosses, axis=1))
 
     @cached_property
     def face_normals(self) -> np.ndarray:
         """Unit normals by winding, shape ``(F, 3)``; zero for a face without area."""
         length = np.linalg.norm(self._crosses, axis=1, keepdims=True)
-        return np.divide(self._crosses, length, out=np.zeros_like(self._crosses), where=length > 0)
+        return _fixed(np.divide(self._crosses, length, out=np.zeros_like(self._crosses), where=length > 0))
 
     @cached_property
     def bounds(self) -> np.ndarray:
         """Lowest and highest corner of the box around the faces [m], shape ``(2, 3)``."""
         corners = self.vertices[np.unique(self.faces)]
-        return np.stack([corners.min(axis=0), corners.max(axis=0)])
+        return _fixed(np.stack([corners.min(axis=0), corners.max(axis=0)]))
 
     @cached_property
     def rounding_m(self) -> float:
@@ -336,7 +334,7 @@ class Mesh:
     @cached_property
     def center(self) -> np.ndarray:
         """Middle of the bounds [m], shape ``(3,)``: the origin of the float32 copy that devices hold."""
-        return self.bounds.mean(axis=0)
+        return _fixed(self.bounds.mean(axis=0))
 
     @cached_property
     def _rays(self) -> RaySearch:
@@ -505,6 +503,12 @@ class Mesh:
         a, way = a[crosses], (b - a)[crosses]
         share = (height - a[:, 2:]) / way[:, 2:]
         return (a + share * way)[:, :2].reshape(-1, 2, 2)
+
+
+def _fixed(array: np.ndarray) -> np.ndarray:
+    """``array``, which is kept and handed out: nobody may write into it."""
+    array.setflags(write=False)
+    return array
 
 
 def vectors_across(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

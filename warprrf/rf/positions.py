@@ -44,12 +44,12 @@ _AT_ONCE = 20_000  # places whose rays are cast in one launch
 
 
 def check_receivers(name: str, value: ArrayLike) -> np.ndarray:
-    """``value`` as positions (3,) or (R, 3) [m], R at least 1.
+    """A copy of ``value``, positions (3,) or (R, 3) [m], R at least 1: callers may move theirs on in place.
 
     Raises:
         ValueError: on another shape or numbers that are not finite.
     """
-    array = check_array(name, value)
+    array = check_array(name, value).copy()
     if array.ndim not in (1, 2) or array.shape[-1] != 3 or array.size == 0:
         raise ValueError(f"{name}: got shape {array.shape}, expected (3,) or (R, 3) with R at least 1")
     return array

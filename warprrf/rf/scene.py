@@ -61,8 +61,8 @@ class Scene:
             face_object = np.zeros(faces, dtype=np.int32)
         self.mesh = mesh
         self.materials = check_items("materials", materials, Material)
-        self.face_material = check_array("face_material", face_material, (faces,), dtype=np.int32)
-        self.face_object = check_array("face_object", face_object, (faces,), dtype=np.int32)
+        self.face_material = check_array("face_material", face_material, (faces,), dtype=np.int32).copy()
+        self.face_object = check_array("face_object", face_object, (faces,), dtype=np.int32).copy()
         self.object_names = check_items("object_names", object_names, str)
         self.xml_path = None if xml_path is None else Path(xml_path)
         self.transmitters = _positions("transmitters", transmitters)
@@ -258,5 +258,5 @@ def _positions(name: str, values: Mapping[str, ArrayLike] | None) -> dict[str, n
     found = {}
     for key, position in (values or {}).items():
         check_type(f"{name}: the name {key!r}", key, str)
-        found[key] = check_array(f"{name}[{key!r}]", position, (3,))
+        found[key] = check_array(f"{name}[{key!r}]", position, (3,)).copy()
     return found

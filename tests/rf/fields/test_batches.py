@@ -105,6 +105,25 @@ def test_a_row_is_what_its_link_gets_alone_without_a_receiver_axis(model, tmp_pa
         field.spectra([PLACES[0], PLACES[0] + 50.0])
 
 
+def test_answers_keep_their_places_when_the_caller_moves_on():
+    """A cart's position is often one array that is added to."""
+    field, at, source = fitted("bistatic"), PLACES[1].copy(), TX.copy()
+    one = {"transmitter": source, "frequency_hz": field.frequency_hz, "shape": (6, 12)}
+    many, view, found = field.spectra(at, source), field.view(at, source), field.radio_map(1.5, 1.0, source)
+    before = field.spectrum(at, source, view=view).delay_s
+    concrete = wr.Scene(field.mesh, [wr.em.itu_material("concrete")], np.zeros(len(field.mesh.faces)))
+    ds, empty = wr.simulate(concrete, receivers=at, **one), wr.SpectrumDataset.empty(**one)
+    for moved in (at, source):
+        moved += 0.1
+    for own in (many.receivers, view.receivers[0], ds.receivers[0]):
+        np.testing.assert_array_equal(own, PLACES[1])
+    for own in (many.transmitters, found.transmitter, ds.transmitter, empty.transmitter):
+        np.testing.assert_array_equal(own, TX)
+    np.testing.assert_array_equal(field.spectrum(at, source, view=view).delay_s, before)
+    field.spectrum(PLACES[1]).attributes["transmitter"] += 1.0  # what the next answer is reckoned from stays
+    np.testing.assert_array_equal(field.spectrum(PLACES[1], TX, view=field.view(PLACES[1])).delay_s, before)
+
+
 def test_every_model_takes_what_the_base_says():
     """Names, order, kinds and defaults of parameters, which more may follow by name; places have one name each."""
     for kind in wr.RadioField.models.values():

@@ -134,6 +134,12 @@ def test_gas_matters_over_a_kilometre_and_not_over_ten_metres():
     assert long["gas"].total_db == pytest.approx(1000 * gas_attenuation_db_per_m(F), rel=1e-3)
 
 
+@pytest.mark.parametrize("gas_db_per_m", [-1.0, np.nan])
+def test_air_that_is_no_absorber_is_refused(slabs, gas_db_per_m):
+    with pytest.raises(ValueError, match="gas_db_per_m: got"):
+        relevance(slabs, receivers=RECEIVERS, gas_db_per_m=gas_db_per_m, **OPTIONS)
+
+
 def test_a_larger_tolerance_never_keeps_more(several):
     for tight, loose in zip(several[:-1], several[1:], strict=True):
         assert set(loose.kept) <= set(tight.kept)

@@ -64,7 +64,8 @@ class Location:
 
     Attributes:
         position: the likeliest place [m], shape ``(3,)``.
-        covariance: of its error, by how readings change there and how well the field explains them [m^2], shape ``(3, 3)``.
+        covariance: of its error, by how readings change there and how well the field explains them [m^2], shape ``(3, 3)``;
+            infinite where they leave a way open, as one reading does.
         candidates: places where readings are explained better than round about, the likeliest first [m], shape ``(K, 3)``.
         likelihoods: of each, among them, shape ``(K,)``; their sum is 1.
         known: whether readings and field tell the place: it is likelier than all other candidates together by far, its error

@@ -256,7 +256,10 @@ def radio_map(
     if not isinstance(mesh, Mesh):
         raise ValueError("field: got one without a mesh, expected one that knows walls from air")
     source = field.transmitter if transmitter is None else transmitter
-    source, wavelength_m = check_array("transmitter", source, (3,)), SPEED_OF_LIGHT / field.frequency_hz
+    source, wavelength_m = (
+        check_array("transmitter", source, (3,)).copy(),
+        SPEED_OF_LIGHT / field.frequency_hz,
+    )
     check_positions(
         mesh, source, np.zeros((0, 3)), wavelength_m, known=field.transmitter, device=field.device
     )

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from warprrf.checks import checked, one_line, positive
+from warprrf.checks import NotNegative, checked, one_line, positive
 from warprrf.device import Progress
 from warprrf.files import read_json, write_json
 from warprrf.geometry.mesh import as_mesh
@@ -225,7 +225,7 @@ class Setting:
     floor: Annotated[float, positive("path gain")] | None = None
     shape: tuple[int, int] = (60, 120)
     beam_sigma_rad: float = BEAM_SIGMA_RAD
-    gas_db_per_m: float | None = None
+    gas_db_per_m: NotNegative | None = None
 
     def of(self, geometry: Any) -> Setting:
         """The same with what a fitted field knows itself.

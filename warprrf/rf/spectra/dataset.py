@@ -132,6 +132,8 @@ class SpectrumDataset:
         """Check shapes and values; ValueError or TypeError names the field."""
         check_shape(self.shape)
         check_departures(self.aod)
+        for name in ("receivers", "transmitter"):  # callers may move theirs on in place
+            object.__setattr__(self, name, getattr(self, name).copy())
         object.__setattr__(self, "role", _check_roles(self.role, len(self)))
         object.__setattr__(self, "attributes", _check_attributes(self.attributes))
 

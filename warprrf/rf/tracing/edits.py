@@ -67,7 +67,8 @@ class Room:
         parent, groups = once[parent], list(surface.group_names)
         label = np.full(len(parent), len(names)) if material is None else material[parent]
         for k, name in enumerate((*names, "new")):
-            own = (label == k) & ((group < 0) | (name in surface.group_names))
+            named = k < len(names) and name in surface.group_names
+            own = (label == k) & ((group < 0) | named)
             if own.any():
                 groups += [name] * (name not in groups)
                 group[own] = groups.index(name)

@@ -164,7 +164,13 @@ def test_something_new_that_nobody_knows_warns(field):
         np.concatenate([scene.mesh.faces, faces + len(scene.mesh.vertices)]),
     )
     with pytest.warns(UserWarning, match=r"1.5 m\^2 are new, of 'new', a material that nobody knows"):
-        assert field.with_geometry(mesh).surface.group_names[-1] == "new"
+        there = field.with_geometry(mesh)
+    assert there.surface.group_names[-1] == "new"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again = there.with_geometry(mesh)
+    assert np.array_equal(again.surface.group, there.surface.group)
+    assert np.array_equal(gains(again), gains(there))
 
 
 @pytest.mark.parametrize(
@@ -199,6 +205,11 @@ def test_wrong_names_are_refused(objects, materials, message):
         materials = {"person": itu_material("vinyl_tile")}
     with pytest.raises(ValueError, match=message):
         field.with_objects(objects, materials=materials)
+
+
+def test_what_is_no_mesh_is_refused_by_name(field):
+    with pytest.raises(TypeError, match=r"objects\['person'\]: got str, expected a Mesh"):
+        field.with_objects({"person": "person.ply"}, materials={"person": "skin"})
 
 
 def test_an_edited_field_is_saved_and_loaded(field, tmp_path):

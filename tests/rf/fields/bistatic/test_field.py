@@ -8,6 +8,7 @@ import pytest
 from furnished import MATERIALS, RECEIVERS, ROOM, SHAPE, SIGMA, TX, F, spectra
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths, observation
 
+from warprrf.geometry.mesh import Mesh
 from warprrf.rf.channel.array_spectra import UP, hemisphere
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.fresnel import fresnel_curves, slab_transmission
@@ -190,6 +191,25 @@ def test_paths_carry_the_spectrum_and_line_of_sight_is_exact(field):
     assert set(paths.kind) == {"los", "mirror", "diffuse"}
     several = field.paths(RECEIVERS[:2], max_paths=5)
     assert several.gain.shape == (2, 5)
+
+
+def test_a_view_is_of_the_field_that_it_is_given_to(field):
+    view, place = field.view(RECEIVERS[3]), RECEIVERS[3]
+    assert np.array_equal(
+        field.spectrum(place, view=view).path_gain,
+        field.spectrum(place, shape=field.shape, view=view).path_gain,
+    )
+    box = Mesh(*box_mesh([1.0, 3.0, 0.5], [1.5, 3.5, 1.0]))
+    others = [
+        field.at_frequency(140e9), field.with_gas(), field.on_grid((12, 24)),
+        field.with_objects({"box": box}, materials={"box": field.surface.group_names[0]}),
+    ]  # fmt: skip
+    for other in others:
+        for ask in (other.spectrum, other.paths):
+            with pytest.raises(ValueError, match="view: got one of another geometry, carrier, air or grid"):
+                ask(place, view=view)
+    with pytest.raises(ValueError, match="max_paths: got -1"):
+        field.paths(place, max_paths=-1, view=view)
 
 
 def test_before_any_spectrum_the_field_is_that_of_the_prior(scene, data):

@@ -6,6 +6,7 @@ import furnished
 import numpy as np
 import pytest
 from furnished import RECEIVERS
+from radio_scenes import box_mesh
 
 import warprrf as wr
 from warprrf.rf.fields.bistatic.field_map import coarse, maps_of
@@ -62,6 +63,36 @@ def test_what_is_said_of_the_place_does_not_count(scene, field):
     one = furnished.spectra(scene, UNSEEN[:1])
     elsewhere = replace(one, receivers=RECEIVERS[:1])
     np.testing.assert_array_equal(field.locate(one).position, field.locate(elsewhere).position)
+
+
+@pytest.mark.parametrize(
+    ("size", "told"), [([0.3, 0.3, 0.3], "none of the places"), ([900.0, 900.0, 30.0], "1.9e\\+08 places")]
+)
+def test_scenes_too_large_or_too_small_to_search_are_refused(size, told):
+    room = wr.Mesh(*box_mesh([0, 0, 0], size, inward=True))
+    ends = {"transmitter": 0.3 * np.array(size), "frequency_hz": 300e9}
+    field = wr.RadioField.fit(room, wr.SpectrumDataset.empty(**ends), effects="single")
+    read = wr.Readings(ends["transmitter"], 0.6 * np.array(size), [1e-8], 300e9, 1e-12)
+    with pytest.raises(ValueError, match=f"field: {told}"):
+        field.locate(read)
+
+
+def test_where_nothing_arrives_no_place_is_known(field):
+    """In the shadow of a field of line of sight alone."""
+    sight = wr.Effects(mirrors=0, scatterings=0, transmissions=0, diffractions=0)
+    direct, dark = replace(field, effects=sight), RECEIVERS[~field.mesh.visible(RECEIVERS, field.transmitter)]
+    read = direct.spectrum(dark[0])
+    assert read.path_gain.max() == 0
+    found = direct.locate(read)
+    assert not found.known and found.std_m == np.inf
+
+
+def test_one_power_leaves_ways_open(field):
+    """Along which nothing says how far: that is no error of none."""
+    total = field.spectrum(UNSEEN[0]).path_gain.sum()
+    read = wr.Readings(field.transmitter, UNSEEN[0], [total], field.frequency_hz, 1e-3 * total)
+    found = field.locate(read)
+    assert not found.known and found.std_m == np.inf
 
 
 def test_a_transmitter_may_stand_at_a_place_of_the_map(field):
@@ -193,9 +224,10 @@ def test_a_map_s_departures_are_those_of_paths_that_met_one_surface(field):
 def test_what_cannot_be_located_is_refused(scene, field, horn):
     ds = furnished.spectra(scene, UNSEEN)
     for what, text in (
-        (ds, "of 2 receivers"), (replace(horn, receivers=horn.receivers + np.arange(len(horn))[:, None]), "Readings of"),
-        (replace(ds.subset([0]), frequency_hz=140e9), "at_frequency"),
-        (replace(horn, departure=horn.arrival, transmit_pattern=horn.receive_pattern), "beside departures"), (3, "int"),
+        (ds, "spectra of 2 receivers"), (replace(ds.subset([0]), frequency_hz=140e9), "at_frequency"),
+        (replace(horn, receivers=horn.receivers + np.arange(len(horn))[:, None]), "Readings of"),
+        (replace(horn, departure=horn.arrival, transmit_pattern=horn.receive_pattern), "beside departures"),
+        (3, "measured: got int"), ([], "measured: got an empty list"), ([field.spectrum(UNSEEN[0])], "measured: got Spectrum"),
     ):  # fmt: skip
         with pytest.raises((TypeError, ValueError), match=text):
             as_data(field, what)

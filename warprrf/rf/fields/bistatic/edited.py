@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from warprrf.checks import check_type, warn
-from warprrf.geometry.mesh import GeometryLike, Mesh
+from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.rf.em.materials import ITU_BANDS, Material, is_name_alone, library_material
 from warprrf.rf.fields.bistatic.options import assumed
 from warprrf.rf.tracing.edits import Called, Room, edited
@@ -51,7 +51,7 @@ def with_objects(
 ) -> dict[str, Any]:
     """The parts of a bistatic ``field`` that are others with ``objects``, by name."""
     s, new, kept = field.surface, dict[str, Material](), np.ones(len(field.mesh.faces), bool)
-    there = {name: mesh for name, mesh in objects.items() if mesh is not None}
+    there = {name: as_mesh(one, f"objects[{name!r}]") for name, one in objects.items() if one is not None}
     if unknown := sorted(set(materials) - set(there)):
         raise ValueError(f"materials: got {unknown[0]!r}, expected among the objects {_some(list(there))}")
     for name in objects:

@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike
 
 from warprrf.cache import Cache
 from warprrf.checks import (
+    Count,
     Expected,
     NotNegative,
     check_array,
@@ -365,7 +366,7 @@ class BistaticField(RadioField):
     def _seen(self, view: View, uncertainty: bool) -> Spectrum:
         gains = self.path_gains(view)
         image = spectra_of(gains, self._beam)[0]
-        known = {"transmitter": view.tracer.transmitter, "frequency_hz": self.frequency_hz}
+        known = {"transmitter": view.tracer.transmitter.copy(), "frequency_hz": self.frequency_hz}
         known |= {"beam_sigma_rad": self.beam_sigma_rad} | ({} if self.air is None else self.air.attributes)
         arrays = image.astype(np.float32), *strongest(gains, image, self.beam_sigma_rad)
         spectrum = Spectrum(*arrays, self.floor, self.range_db, attributes=known)
@@ -375,7 +376,7 @@ class BistaticField(RadioField):
         self,
         receivers: ArrayLike,
         transmitter: ArrayLike | None = None,
-        max_paths: int | None = None,
+        max_paths: Count | None = None,
         *,
         store: str | os.PathLike[str] | None = None,
         client: Any = None,
@@ -462,8 +463,18 @@ class BistaticField(RadioField):
         return self.tracer(transmitter).view(receiver, self.effects)
 
     def path_gains(self, view: View) -> PathGains:
-        """Path gain of all that is seen, by sequence of interactions."""
+        """Path gain of all that is seen, by sequence of interactions.
+
+        Raises:
+            ValueError: for a view of another geometry, carrier, air or grid.
+        """
         check_type("view", view, View)
+        loss = 0.0 if self.air is None else self.air.loss_per_m(self.frequency_hz)
+        t, own = view.tracer, (self.surface, self.frequency_hz, loss, tuple(self.shape))
+        if (t.surface, t.frequency_hz, t.grid.loss_per_m, tuple(t.grid.shape)) != own:
+            raise ValueError(
+                "view: got one of another geometry, carrier, air or grid, expected this field's own"
+            )
         return path_gains(view, self.state)
 
     def tracer(self, transmitter: ArrayLike | None = None) -> Tracer:

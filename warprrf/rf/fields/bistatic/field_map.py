@@ -116,13 +116,24 @@ def maps_of(
 
 
 def lattice(mesh: Mesh, known: np.ndarray, transmitters: np.ndarray, device: Any) -> np.ndarray:
-    """Places in the air of ``known`` (3,), off surfaces and ``transmitters`` (T, 3), shape ``(P, 3)`` [m]."""
-    clearance_m = 0.1
+    """Places in the air of ``known`` (3,), off surfaces and ``transmitters`` (T, 3), shape ``(P, 3)`` [m].
+
+    Raises:
+        ValueError: for a scene of more places than fit into memory, 14 kB each, or of none.
+    """
+    clearance_m, most = 0.1, 300_000
     low, high = mesh.bounds
+    if (count := np.prod((high - low) / SPACING_M)) > most:
+        raise ValueError(f"field: {count:.2g} places of its scene would be searched, expected at most {most}")
     axes = [np.arange(a + 0.5 * SPACING_M, b, SPACING_M) for a, b in zip(low, high, strict=True)]
     every = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     far = (np.linalg.norm(every[:, None] - transmitters, axis=2) > clearance_m).all(axis=1)
-    return every[far][is_free(mesh, every[far], known, clearance_m=clearance_m, device=device)]
+    found = every[far][is_free(mesh, every[far], known, clearance_m=clearance_m, device=device)]
+    if len(found) == 0:
+        raise ValueError(
+            f"field: none of the places {SPACING_M:g} m apart that would be searched is in the air"
+        )
+    return found
 
 
 def _mapped(bistatic: Any, part: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:

@@ -53,7 +53,7 @@ def as_data(field: Any, measured: Any) -> list[Measured]:
             floor=measured.floor or field.floor, attributes=None if air is None else air.attributes, **own,
         )  # fmt: skip
     found = []
-    for one in as_list(measured):
+    for one in as_list(measured, "measured"):
         of, told = one.frequency_hz / 1e9, field.frequency_hz / 1e9
         if abs(of / told - 1.0) > 1e-3:
             raise ValueError(
@@ -252,7 +252,7 @@ class Question:
         for _ in range(steps):
             threshold = now.threshold
             curvature, gradient = now.normal(threshold)
-            diagonal = np.diag(curvature) + 1e-9 * np.trace(curvature)
+            diagonal = np.diag(curvature) + max(1e-9 * np.trace(curvature), 1e-100)  # in the dark all are 0
             step = -longer * np.linalg.solve(curvature + damping * np.diag(diagonal), gradient)
             step *= min(1.0, longest_m / max(float(np.linalg.norm(step[:3])), 1e-12))
             while not self.field.mesh.visible(now.unknown[None, :3], (now.unknown + 1.1 * step)[None, :3])[0]:
@@ -268,8 +268,11 @@ class Question:
         return now
 
     def covariance(self, best: Found, threshold: float) -> np.ndarray:
-        """Of the position's error [m^2], shape ``(3, 3)``, by what errors turn out to be."""
+        """Of the position's error [m^2], shape ``(3, 3)``, by what errors turn out to be; infinite where they leave a way open."""
         curvature = best.normal(threshold)[0]
+        told, along = np.linalg.eigh(curvature)
+        if np.abs(along[:3, told <= 1e-12 * told.max()]).max(initial=0.0) > 1e-6:
+            return np.diag(np.full(3, np.inf))
         inverse, count = np.linalg.pinv(curvature), len(best.error)
         if not self.spectra:
             return np.asarray(inverse * max(1.0, best.loss(threshold) / max(count - len(curvature), 1)))[
@@ -315,7 +318,7 @@ def search(question: Question, maps: dict[bytes, FieldMap]) -> Location:
     first.sort(key=lambda one: one.loss(threshold))
     least, found, rest = first[0].loss(threshold), list[Found](), list[Found]()
     for one in first:
-        if one.loss(threshold) >= followed * least:
+        if one.loss(threshold) > followed * least:
             rest.append(one)
         elif not one.near(first[: first.index(one)]):
             found.append(question.descend(one.unknown, quick=False, near=one if question.alike else None))

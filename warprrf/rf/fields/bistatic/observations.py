@@ -107,8 +107,8 @@ Seen = tuple[Place, View]
 """A place, and what is seen there."""
 
 
-def as_list(data: Data) -> list[Measured]:
-    """Data sets as a list; of several that have one name each gets a number after it.
+def as_list(data: Data, name: str = "ds") -> list[Measured]:
+    """Data sets as a list, errors call it ``name``; of several that have one name each gets a number after it.
 
     Raises:
         TypeError: for anything else.
@@ -118,11 +118,13 @@ def as_list(data: Data) -> list[Measured]:
     for one in data if isinstance(data, list | tuple) else [data]:
         if not isinstance(one, Measured):
             raise TypeError(
-                f"ds: got {type(one).__name__}, expected a SpectrumDataset, Readings, ArraySpectra, or a list of them"
+                f"{name}: got {type(one).__name__}, expected a SpectrumDataset, Readings, ArraySpectra, or a list of them"
             )
         several.append(one)
     if not several:
-        raise ValueError("ds: got an empty list, expected a SpectrumDataset, Readings, or several of them")
+        raise ValueError(
+            f"{name}: got an empty list, expected a SpectrumDataset, Readings, or several of them"
+        )
     names = [None if isinstance(one, SpectrumDataset) else one.name for one in several]
     for k, one in enumerate(several):
         if not isinstance(one, SpectrumDataset) and names.count(one.name) > 1:
