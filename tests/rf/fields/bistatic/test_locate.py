@@ -77,7 +77,7 @@ def test_scenes_too_large_or_too_small_to_search_are_refused(size, told):
         field.locate(read)
 
 
-def test_where_nothing_arrives_no_place_is_known(field):
+def test_where_nothing_arrives_no_place_is_known(scene, field):
     """In the shadow of a field of line of sight alone."""
     sight = wr.Effects(mirrors=0, scatterings=0, transmissions=0, diffractions=0)
     direct, dark = replace(field, effects=sight), RECEIVERS[~field.mesh.visible(RECEIVERS, field.transmitter)]
@@ -85,6 +85,10 @@ def test_where_nothing_arrives_no_place_is_known(field):
     assert read.path_gain.max() == 0
     found = direct.locate(read)
     assert not found.known and found.std_m == np.inf
+    one = furnished.spectra(scene, UNSEEN).subset([0])
+    assert not field.locate(
+        replace(one, path_gain=0.0 * one.path_gain)
+    ).known  # but a place on the floor is likeliest
 
 
 def test_one_power_leaves_ways_open(field):
@@ -224,7 +228,7 @@ def test_a_map_s_departures_are_those_of_paths_that_met_one_surface(field):
 def test_what_cannot_be_located_is_refused(scene, field, horn):
     ds = furnished.spectra(scene, UNSEEN)
     for what, text in (
-        (ds, "spectra of 2 receivers"), (replace(ds.subset([0]), frequency_hz=140e9), "at_frequency"),
+        (ds, "of 2 receivers"), (replace(ds.subset([0]), frequency_hz=140e9), "at_frequency"),
         (replace(horn, receivers=horn.receivers + np.arange(len(horn))[:, None]), "Readings of"),
         (replace(horn, departure=horn.arrival, transmit_pattern=horn.receive_pattern), "beside departures"),
         (3, "measured: got int"), ([], "measured: got an empty list"), ([field.spectrum(UNSEEN[0])], "measured: got Spectrum"),

@@ -346,13 +346,14 @@ def search(question: Question, maps: dict[bytes, FieldMap]) -> Location:
     covariance, misfit = question.covariance(best, threshold), float(np.sqrt(spread))
     sure, explained = bool(likelihood[0] > 0.95), misfit < 4.0
     close = float(np.sqrt(np.trace(covariance))) < SPACING_M
+    heard = any(not isinstance(d, SpectrumDataset) or (d.path_gain > d.floor).any() for d in question.data)
     after: list[Any] = [question.data[k] for k in question.turned]
     zeros = list(zip(after, best.unknown[3:].tolist(), strict=False))
     gains = (NEPER * best.unknown[3 + len(question.turned) :]).tolist()
     return Location(
         position=best.unknown[:3], covariance=covariance, candidates=np.stack([one.unknown[:3] for one in order]),
         likelihoods=likelihood, misfit=misfit,
-        known=sure and close and explained and not question.narrow,
+        known=sure and close and explained and heard and not question.narrow,
         gains_db=dict(zip(question.chains, gains, strict=True)),
         azimuth_zeros={one.name: by for one, by in zeros if not one.azimuth_known},
         clock_offsets_s={one.name: by / SPEED_OF_LIGHT for one, by in zeros if one.azimuth_known},
