@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from copy import copy
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from types import ModuleType
 from typing import Any, TypeAlias
@@ -276,11 +276,7 @@ def require(module: str, extra: str) -> ModuleType:
         raise ImportError(f'{module} is not installed: pip install "warprrf[{extra}]"') from error
 
 
-def _uploaded(values: Any, dtype: Any, device: str) -> wp.array:
-    return wp.array(values, dtype=dtype, device=device)
-
-
-copyreg.pickle(wp.array, lambda a: (_uploaded, (a.numpy(), a.dtype, str(a.device))))
+copyreg.pickle(wp.array, lambda a: (partial(wp.array, dtype=a.dtype, device=str(a.device)), (a.numpy(),)))
 # Warp's arrays have no pickles of their own, which workers of a cluster need.
 
 _NO_CUDA = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
