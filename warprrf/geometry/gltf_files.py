@@ -291,8 +291,8 @@ def _joined(file: _File) -> MeshContent:
         for material, positions, corners, colour in parts:
             total = _counted(total, corners, positions)
             moved = positions @ place[:3, :3].T + place[:3, 3]
-            faces = (corners[:, ::-1] if np.linalg.det(place[:3, :3]) < 0 else corners) + start
-            found.append((moved, faces, colour, material, name, len(corners)))
+            turned = (corners[:, ::-1] if np.linalg.det(place[:3, :3]) < 0 else corners) + start
+            found.append((moved, turned, colour, material, name, len(corners)))
             start += len(positions)
     if not found:
         raise ValueError("its default scene holds no triangles")
