@@ -285,18 +285,20 @@ def _transform(node: Mapping[str, Any]) -> np.ndarray:
 
 def _joined(file: _File) -> MeshContent:
     """All instances as one mesh."""
-    found = list[tuple[Any, ...]]()
+    vertices, faces, colours, materials, objects, counts = [], [], [], [], [], []
     start = total = 0
     for name, place, parts in file.instances():
         for material, positions, corners, colour in parts:
             total = _counted(total, corners, positions)
-            moved = positions @ place[:3, :3].T + place[:3, 3]
-            turned = (corners[:, ::-1] if np.linalg.det(place[:3, :3]) < 0 else corners) + start
-            found.append((moved, turned, colour, material, name, len(corners)))
+            vertices.append(positions @ place[:3, :3].T + place[:3, 3])
+            faces.append((corners[:, ::-1] if np.linalg.det(place[:3, :3]) < 0 else corners) + start)
             start += len(positions)
-    if not found:
+            colours.append(colour)
+            materials.append(material)
+            objects.append(name)
+            counts.append(len(corners))
+    if not faces:
         raise ValueError("its default scene holds no triangles")
-    vertices, faces, colours, materials, objects, counts = zip(*found, strict=True)
     colour = np.concatenate(colours)
     names, things = numbered(materials, counts), numbered(objects, counts)
     return MeshContent(

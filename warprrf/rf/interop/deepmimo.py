@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import os
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -125,7 +124,10 @@ def _matrices(paths: Paths, coefficient: np.ndarray, max_paths: int | None) -> d
     count = max(min(most, max_paths or most), 1)
     strength = np.where(paths.valid, np.abs(coefficient), -1.0)
     order = np.argsort(-strength, axis=1, kind="stable")[:, :count]
-    pick = partial(np.take_along_axis, indices=order, axis=1)
+
+    def pick(values: np.ndarray) -> np.ndarray:
+        return np.take_along_axis(values, order, axis=1)
+
     there = pick(paths.valid)
     gain = pick(coefficient)
     bounces = np.isfinite(paths.vertices[..., 0]).sum(axis=-1)
