@@ -150,7 +150,7 @@ class RaySearch:
         Raises:
             ValueError: if a ray is not finite or has no direction, or on an unknown back end, or Embree on a GPU.
         """
-        count = count_rows(o, d, per_origin)
+        count = max(len(o) * per_origin, len(d)) if min(len(o), len(d)) else 0
         if choose_backend(backend, device, count) == "embree" and count:
             t, face = self._nearest_embree(o, d, per_origin, clearance, device)
         else:
@@ -213,7 +213,7 @@ class RaySearch:
         Raises:
             ValueError: if a point is not finite, or on an unknown back end, or Embree on a GPU.
         """
-        count = count_rows(a, b)
+        count = max(len(a), len(b)) if min(len(a), len(b)) else 0
         if choose_backend(backend, device, count) == "embree" and count:
             return self._free_embree(a, b, count, clearance, device)
         mesh, planes = self.on_device(device)
@@ -371,11 +371,6 @@ def check_rows(
     if one not in (1, other) and other not in (1, per_first):
         raise ValueError(f"{second[0]}: got {other} for {one} {first[0]}, expected as many, or one of either")
     return arrays[0], arrays[1]
-
-
-def count_rows(one: np.ndarray, other: np.ndarray, per_one: int = 1) -> int:
-    """How many rays or segments there are of what :func:`check_rows` gives."""
-    return max(len(one) * per_one, len(other)) if min(len(one), len(other)) else 0
 
 
 def _given(array: np.ndarray, dtype: type, device: wp.Device) -> wp.array:

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_choice, check_count, checked
 from warprrf.device import DeviceLike, active_tape, gradient, launch, record, resolve
-from warprrf.geometry.rays import check_rows, count_rows
+from warprrf.geometry.rays import check_rows
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import RADIO, Blending, Rasterizer, uploaded
 from warprrf.kernels.rays import gaussians as kernels
@@ -193,7 +193,7 @@ class GaussianRays:
         still = int(np.count_nonzero(np.linalg.norm(toward, axis=1) == 0))
         if still:
             raise ValueError(f"directions: got {still} of length zero, expected directions")
-        count, on = count_rows(start, toward), self.device
+        count, on = np.broadcast_shapes(start.shape, toward.shape)[0], self.device
         shape = (count, places)
         real = {"dtype": wp.float64, "device": on}
         found = RayHits(
@@ -225,7 +225,7 @@ class GaussianRays:
         """:meth:`transmit` without a tape: the values, and the function that adds the parameters' gradients, which only
         values with ``gradients`` have."""
         start, end = _pairs(("a", a), ("b", b))
-        count, on = count_rows(start, end), self.device
+        count, on = np.broadcast_shapes(start.shape, end.shape)[0], self.device
         values = wp.empty(count, dtype=wp.float64, device=on, requires_grad=gradients)
         parts = [wp.empty(count, dtype=wp.float64, device=on), wp.empty(count, dtype=int, device=on)]
         ends = [wp.array(start, dtype=wp.vec3d, device=on), wp.array(end, dtype=wp.vec3d, device=on)]
