@@ -453,10 +453,8 @@ def _fit(mesh: Mesh, own: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _numbered(label: np.ndarray) -> np.ndarray:
     """Labels from 0 without gaps; negative ones stay -1."""
-    own = label >= 0
-    result = np.full(len(label), -1)
-    result[own] = np.unique(label[own], return_inverse=True)[1].reshape(-1)
-    return result
+    number = np.unique(np.maximum(label, -1), return_inverse=True)[1].reshape(-1)
+    return number - int((label < 0).any())
 
 
 def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
