@@ -14,7 +14,7 @@ from small_room import small_room
 
 import warprrf as wr
 from warprrf import cli
-from warprrf.cli.inputs import load_geometry, read_pointings, read_positions, read_receivers
+from warprrf.cli.inputs import PLACES, POINTINGS, load_geometry, read_positions, read_receivers
 from warprrf.cli.views import _look_at
 from warprrf.rf.fields.bistatic.options import FitOptions
 from warprrf.rf.fields.harmonic.fitting import FieldOptions
@@ -192,7 +192,7 @@ def test_columns_in_another_order_are_refused(names, tmp_path):
     file, row = tmp_path / "r.csv", ",".join("123450"[: names.count(",") + 1])
     file.write_text(f"{names}\n{row}\n")
     with pytest.raises(ValueError, match="expected rows x,y,z"):
-        (read_receivers if names.count(",") == 2 else read_pointings)([str(file)], "candidates")
+        read_receivers([str(file)], "candidates", PLACES if names.count(",") == 2 else POINTINGS)
     file.write_text(f"file,{names}\na.jpg,{row}\n")
     with pytest.raises(ValueError, match="CSV file,x,y,z"):
         read_positions(file)

@@ -540,12 +540,9 @@ def _is_of_numpy(kind: Any) -> bool:
     return str(getattr(typing.get_origin(kind) or kind, "__module__", "")).startswith("numpy")
 
 
-def _is_row(value: object) -> bool:
-    return isinstance(value, (tuple, list)) or (isinstance(value, np.ndarray) and value.ndim > 0)
-
-
 def _as_row(length: int | None, value: Any) -> object:
-    if not _is_row(value) or length not in (None, len(value)):
+    row = np.ndim(value) > 0 if isinstance(value, np.ndarray) else isinstance(value, (tuple, list))
+    if not row or length not in (None, len(value)):
         return _OTHER
     if isinstance(value, np.ndarray):
         return tuple(value.tolist() if value.ndim == 1 else value)

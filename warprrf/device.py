@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from copy import copy
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from types import ModuleType
 from typing import Any, TypeAlias
@@ -276,11 +276,7 @@ def require(module: str, extra: str) -> ModuleType:
         raise ImportError(f'{module} is not installed: pip install "warprrf[{extra}]"') from error
 
 
-def _uploaded(values: Any, dtype: Any, device: str) -> wp.array:
-    return wp.array(values, dtype=dtype, device=device)
-
-
-copyreg.pickle(wp.array, lambda a: (_uploaded, (a.numpy(), a.dtype, str(a.device))))
+copyreg.pickle(wp.array, lambda a: (partial(wp.array, dtype=a.dtype, device=str(a.device)), (a.numpy(),)))
 # Warp's arrays have no pickles of their own, which workers of a cluster need.
 
 _NO_CUDA = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
@@ -299,11 +295,7 @@ def start() -> None:
         UserWarning: of an NVIDIA driver that is too old for Warp.
     """
     with _without_cuda_warning():
-        try:
-            wp.init()
-        except OSError as error:
-            _use_temporary_cache(error)
-            wp.init()
+        _with_kernel_cache(wp.init)
     runtime = wp._src.context.runtime  # Warp's own warning is silenced with its other words
     if runtime.driver_version is not None and runtime.driver_version < runtime.min_driver_version:
         warnings.warn(f"device: there is a CPU alone; {_why_no_gpu()}", UserWarning, stacklevel=2)
@@ -311,24 +303,24 @@ def start() -> None:
 
 def load_module(module: wp.Module, device: wp.Device, block_dim: int) -> None:
     """Load a module of kernels, which is compiled if the cache lacks it."""
+    _with_kernel_cache(partial(module.load, device, block_dim=block_dim))
+
+
+def _with_kernel_cache(use: Callable[[], object]) -> None:
+    """Use Warp's cache of kernels, which is in a temporary folder from now on if it cannot be written."""
     try:
-        module.load(device, block_dim=block_dim)
+        use()
     except OSError as error:
-        _use_temporary_cache(error)
-        module.load(device, block_dim=block_dim)
-
-
-def _use_temporary_cache(error: OSError) -> None:
-    """Keep kernels in a temporary folder from now on, because of ``error``."""
-    folder = tempfile.TemporaryDirectory(prefix="warprrf-kernels-")
-    _temporary.append(folder)
-    warnings.warn(
-        f"kernel cache: {error}; kernels are compiled anew by this process, into {folder.name}. Set WARP_CACHE_PATH to "
-        "a folder that can be written",
-        UserWarning,
-        stacklevel=2,
-    )
-    wp.config.kernel_cache_dir = folder.name
+        folder = tempfile.TemporaryDirectory(prefix="warprrf-kernels-")
+        _temporary.append(folder)
+        warnings.warn(
+            f"kernel cache: {error}; kernels are compiled anew by this process, into {folder.name}. Set WARP_CACHE_PATH to "
+            "a folder that can be written",
+            UserWarning,
+            stacklevel=2,
+        )
+        wp.config.kernel_cache_dir = folder.name
+        use()
 
 
 @contextmanager

@@ -235,9 +235,10 @@ class Store:
                 continue
             with ExitStack() as opened:
                 opened.enter_context(self._stream)
+                file = self._unfinished
                 # Another process may have finished it since: then it is no longer what the name stands for.
-                if self._is_named(self._unfinished):
-                    self._find(self._unfinished)
+                if file.exists() and os.path.samestat(os.fstat(self._stream.fileno()), file.stat()):
+                    self._find(file)
                     self.missing = ~self._sound_rows()
                     opened.pop_all()
                     return self
@@ -328,10 +329,6 @@ class Store:
         except BlockingIOError as error:
             self._file.close()
             raise ValueError(f"store: another process is at work on {self.path}; wait for it") from error
-
-    def _is_named(self, path: Path) -> bool:
-        """Whether ``path`` is the name of the file that is open."""
-        return path.exists() and os.path.samestat(os.fstat(self._stream.fileno()), path.stat())
 
     def _find(self, path: Path) -> None:
         """Where rows are in a file that was laid out, by the line behind what is HDF5's, which no damage gets past."""

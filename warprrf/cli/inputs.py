@@ -307,17 +307,13 @@ def read_rows(path: Path, what: str, columns: int, names: str = "") -> np.ndarra
         return check_array(what, found, (None, columns))
 
 
-def read_receivers(values: Sequence[str], name: str = "--receivers") -> np.ndarray:
-    """(R, 3) positions in metres from a CSV or NPY file, or from `x,y,z` words."""
-    return _read_places(values, name, "x,y,z in metres", 3)
+PLACES = "x,y,z in metres"
+POINTINGS = "x,y,z,azimuth,elevation in metres and degrees"  # that a horn is turned to
 
 
-def read_pointings(values: Sequence[str], name: str) -> np.ndarray:
-    """(R, 5): positions as of :func:`read_receivers`, azimuth and elevation [degrees] that a horn is turned to."""
-    return _read_places(values, name, "x,y,z,azimuth,elevation in metres and degrees", 5)
-
-
-def _read_places(values: Sequence[str], name: str, what: str, count: int) -> np.ndarray:
+def read_receivers(values: Sequence[str], name: str = "--receivers", what: str = PLACES) -> np.ndarray:
+    """(R, 3) positions, or (R, 5) of :data:`POINTINGS`, from a CSV or NPY file or from `x,y,z` words."""
+    count = what.count(",") + 1
     if len(values) == 1 and "," not in values[0]:
         return read_rows(existing(values[0]), f"rows {what}", count, what.split()[0])
     rows = []

@@ -13,6 +13,7 @@ import numpy as np
 import warprrf as wr
 from warprrf.checks import check_count
 from warprrf.cli.inputs import (
+    POINTINGS,
     Add,
     add_effects,
     add_frequency,
@@ -30,7 +31,6 @@ from warprrf.cli.inputs import (
     read_json_or_text,
     read_measured,
     read_pattern,
-    read_pointings,
     read_positions,
     read_receivers,
     read_scale,
@@ -397,7 +397,7 @@ def _suggest(args: argparse.Namespace, out: Output) -> None:
         pointings = read_receivers(args.candidates, "candidates")
         arrival = np.full((len(pointings), 2), 0.5 * np.pi)
     else:
-        pointings = read_pointings(args.candidates, "candidates")
+        pointings = read_receivers(args.candidates, "candidates", POINTINGS)
         arrival = np.radians(np.column_stack([90.0 - pointings[:, 4], pointings[:, 3]]))
     if args.receive_pattern is not None:
         turned = {"arrival": arrival, "receive_pattern": read_pattern(args.receive_pattern)}

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 
 from warprrf.geometry.mesh import Mesh, components, cut, headings, sides_of, vectors_across
 from warprrf.rows import Rows, couples, distinct_rows
@@ -51,7 +52,7 @@ class Edges(Rows):
         return np.cos(half) * self.inward + np.sin(half) * np.cross(self.along, self.inward)
 
 
-def mesh_edges(mesh: Mesh, normal: np.ndarray | None = None, groups: np.ndarray | None = None) -> Edges:
+def mesh_edges(mesh: Mesh, normal: np.ndarray, groups: np.ndarray) -> Edges:
     """The edges of ``mesh``.
 
     Args:
@@ -60,8 +61,6 @@ def mesh_edges(mesh: Mesh, normal: np.ndarray | None = None, groups: np.ndarray 
             say. A face whose normal is zero is left out.
         groups: Index of what each face is made of, shape ``(F,)``: edges end where it changes.
     """
-    normal = mesh.face_normals if normal is None else normal
-    groups = np.zeros(len(mesh.faces), int) if groups is None else groups
     sides, place, reach = _candidates(mesh, normal), mesh.places, mesh.weld_m
     ends = _split(mesh, sides)
     span = place[ends[:, 1]] - place[ends[:, 0]]
@@ -156,15 +155,9 @@ def _depth(mesh: Mesh, face: np.ndarray, point: np.ndarray, toward: np.ndarray) 
 def _merged(pieces: Edges, ends: np.ndarray, group: np.ndarray, reach: float) -> Edges:
     """Collinear ``pieces`` that share an end, between alike faces, as one edge each."""
     count = len(pieces)
-    owner, name = np.tile(np.arange(count), 2), ends.T.reshape(-1)
-    order = np.argsort(name, kind="stable")
-    owner, name = owner[order], name[order]
-    pairs = [np.zeros((0, 2), int)]
-    step = 1
-    while step < len(name) and (same := name[step:] == name[:-step]).any():
-        pairs.append(np.column_stack([owner[:-step][same], owner[step:][same]]))
-        step += 1
-    a, b = np.concatenate(pairs).T
+    owner, size = np.tile(np.arange(count), 2), (count, ends.max(initial=0) + 1)
+    at = sparse.coo_array((np.ones(2 * count, bool), (owner, ends.T.reshape(-1))), shape=size).tocsr()
+    a, b = sparse.triu(at @ at.T, 1).nonzero()
     limit = _ALIKE_RAD + 2.0 * reach / np.minimum(pieces.length[a], pieces.length[b])
     alike = np.abs(pieces.n[a] - pieces.n[b]) <= limit
     for vector in (pieces.along, pieces.inward):

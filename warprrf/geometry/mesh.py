@@ -108,6 +108,7 @@ class Mesh:
             _fixed(array)
         self.face_colours = self._checked_colours(face_colours)
         self.face_label, self.labels = self._checked_labels(face_label, labels)
+        self._boxed = Cache(8)
 
     def _checked_colours(self, colours: ArrayLike | None) -> np.ndarray | None:
         if colours is None:
@@ -468,10 +469,6 @@ class Mesh:
         found = self.distinct_faces[face.numpy()]
         order = np.lexsort((found, row))  # trees differ by device
         return row, found[order]
-
-    @cached_property
-    def _boxed(self) -> Cache:
-        return Cache(8)
 
     def _boxes(self, where: wp.Device) -> tuple[wp.Bvh, wp.array]:
         """Boxes of the distinct faces, which a ray can be asked for all of, and their corners about the centre."""

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import tensor_files
-from warprrf.checks import checked, warn
+from warprrf.checks import check_choice, checked, warn
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh_files import UP
 from warprrf.geometry.photos.config import ReconstructionConfig
@@ -178,8 +178,8 @@ def _check_world(poses: object, depth: object, known_positions: object, scale: o
     for name, value in (("depth", depth), ("up", up)):
         if value is not None and poses is None:
             raise ValueError(f"{name}: got {value!r} without poses, expected both")
-    if up is not None and up not in UP:
-        raise ValueError(f"up: got {up!r}, expected one of {', '.join(UP)}")
+    if up is not None:
+        check_choice("up", up, UP)
     if isinstance(scale, float) and poses is None:
         raise ValueError(
             f'scale: got {scale}, expected ("a.jpg", "b.jpg", metres); a number of metres for each unit goes with poses'

@@ -23,6 +23,7 @@ from warprrf.geometry.edges import Edges, mesh_edges
 from warprrf.geometry.mesh import Mesh, boxes_of, components, vectors_across
 from warprrf.kernels.rays.mesh import OverlapFaces, find_overlaps
 from warprrf.kernels.rays.patches import PatchFaces, lie_in_patches
+from warprrf.rows import sums_of
 
 FLAT_M = 1e-5
 """Corners may lie this far from their patch's plane [m], and six standard deviations of vertices' errors more."""
@@ -429,10 +430,10 @@ def _fit(mesh: Mesh, own: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.nda
     own, p, count = own[order], p[order], int(p.max(initial=-1)) + 1
     largest = own[np.searchsorted(p, np.arange(count), side="right") - 1]
     normal = mesh.face_normals[largest]
-    middle: np.ndarray = np.stack(
-        [np.bincount(p, mesh.areas[own] * mesh.triangles[own, :, k].mean(axis=1)) for k in range(3)], 1
+    middle = (
+        sums_of(mesh.areas[own, None] * mesh.triangles[own].mean(axis=1), p)
+        / np.maximum(np.bincount(p, mesh.areas[own]), 1e-300)[:, None]
     )
-    middle = middle / np.maximum(np.bincount(p, mesh.areas[own]), 1e-300)[:, None]
     x = 0.5 * (mesh.triangles[own] + np.roll(mesh.triangles[own], 1, axis=1)) - middle[p][:, None]
     for _ in range(2):
         frame = np.stack([*vectors_across(normal), normal], axis=1)
@@ -452,10 +453,8 @@ def _fit(mesh: Mesh, own: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _numbered(label: np.ndarray) -> np.ndarray:
     """Labels from 0 without gaps; negative ones stay -1."""
-    own = label >= 0
-    result = np.full(len(label), -1)
-    result[own] = np.unique(label[own], return_inverse=True)[1].reshape(-1)
-    return result
+    number = np.unique(np.maximum(label, -1), return_inverse=True)[1].reshape(-1)
+    return number - int((label < 0).any())
 
 
 def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from warprrf.checks import Count, checked, positive
-from warprrf.geometry.mesh import Mesh, connected_pieces, face_neighbours, smoothed_normals
+from warprrf.geometry.mesh import Mesh, connected_pieces, face_neighbours, sides_of, smoothed_normals
 from warprrf.geometry.planar_patches import PlanarPatches, vertex_noise
 from warprrf.geometry.planes import Plane, PlaneConfig, detect_planes, drawn_by_place
 from warprrf.rows import distinct_rows, sums_of
@@ -148,7 +148,7 @@ def scanned_patches(mesh: Mesh) -> PlanarPatches:
 def _smoothed(mesh: Mesh) -> Mesh:
     """``mesh`` with its noise smoothed away (Taubin, "A signal processing approach to fair surface design", 1995)."""
     faces, count = mesh.welded_faces, len(mesh.vertices)
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    ends = sides_of(faces)
     link = sparse.coo_array((np.ones(len(ends)), ends.T), shape=(count, count)).tocsr()
     link = ((link + link.T) > 0).astype(float)
     degree = np.maximum(np.asarray(link.sum(axis=1)).reshape(-1, 1), 1.0)

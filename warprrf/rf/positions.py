@@ -341,7 +341,7 @@ def ground_height(mesh: Mesh, x: np.ndarray, y: np.ndarray, *, device: DeviceLik
     """Height z of the lowest surface at ``x``, ``y`` [m], of their shape; NaN where there is none."""
     low = mesh.bounds[0, 2] - 1.0
     start = np.column_stack([np.ravel(x), np.ravel(y), np.full(np.size(x), low)])
-    up = mesh.cast(start, np.tile([0.0, 0.0, 1.0], (len(start), 1)), device=device).t
+    up = mesh.cast(start, [0.0, 0.0, 1.0], device=device).t
     return np.where(np.isfinite(up), low + up, np.nan).reshape(np.shape(x))
 
 

@@ -141,8 +141,7 @@ class _SceneFile:
                 raise self.wrong(name, "names no material (a <ref id=...> to a bsdf)")
             element = self.bsdfs.get(link.get("id"), link)
         itu = element.get("id") or _text(element, "type") or ""
-        label = itu.removeprefix("mat-")
-        label = label[4:] if label.startswith(("itu_", "itu-")) else label
+        label = re.sub("^(mat-)?(itu[_-])?", "", itu)
         if not label:
             raise self.wrong(name, "has a material without an id")
         return self.choice.choose(label, lambda: self._declared(element, label, name))

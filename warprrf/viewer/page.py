@@ -70,7 +70,8 @@ class Page:
         require("viser", extra="view")
         from warprrf.viewer.connections import open_server
 
-        self.server, self.url = open_server(host, port, self._refused)
+        dropped = "**A message of a page was dropped: {}**"
+        self.server, self.url = open_server(host, port, lambda wrong: self.say(dropped.format(wrong)))
         self.gui, self.scene = self.server.gui, self.server.scene
         self.message = ""
         self.hidden = {"cameras"}
@@ -89,9 +90,6 @@ class Page:
     def say(self, message: str) -> None:
         """Write ``message`` (Markdown) at the top of the page."""
         self.message = self._status.content = message
-
-    def _refused(self, wrong: str) -> None:
-        self.say(f"**A message of a page was dropped: {wrong}**")
 
     @contextmanager
     def telling(self) -> Iterator[None]:

@@ -95,11 +95,10 @@ def panorama(image: Image, marks: Sequence[tuple[float, float, str]] = (), *, sc
 def combined(caption: str, images: Sequence[Image], view: np.ndarray | None = None) -> bytes:
     """A PNG file of images as :func:`panorama` takes them, below what the browser shows (H, W, 3)."""
     figures = require("matplotlib.figure", extra="view")
-    drawing = figures.Figure(
-        figsize=(9.0, 3.5 * len(images) + (6.8 if view is not None else 0.5)), layout="constrained"
-    )
+    tall = 3.5 * len(images) + (6.8 if view is not None else 0.5)
+    drawing = figures.Figure(figsize=(9.0, tall), layout="constrained")
     drawing.suptitle(caption, fontsize=10)
-    heights = [3.5] * len(images) if view is None else [6.5] + [3.5] * len(images)
+    heights = [6.5] * (view is not None) + [3.5] * len(images)
     axes = list(drawing.subplots(len(heights), height_ratios=heights, squeeze=False).flat) if heights else []
     if view is not None:
         axes[0].imshow(view)

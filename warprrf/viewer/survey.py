@@ -143,10 +143,9 @@ class Survey:
         picture = pictures.coloured(value, low, high)[::-1]
         seen = np.where(np.isnan(value), 0, 255).astype(np.uint8)[::-1]
         width, height = found.cell_m * value.shape[1], found.cell_m * value.shape[0]
-        free, down = found.positions[found.free], np.array([0.0, 0.0, -1.0])
         floor = 0.0
         if self._subject.mesh is not None:  # a little above what is drawn
-            below = self._subject.mesh.cast(free, np.tile(down, (len(free), 1))).point[:, 2]
+            below = self._subject.mesh.cast(found.positions[found.free], [0.0, 0.0, -1.0]).point[:, 2]
             floor = 0.03 + float(np.nanmedian(below))
         self._page.scene.add_image(
             "/map", np.dstack([picture, seen]), width, height,

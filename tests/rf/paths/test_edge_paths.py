@@ -49,7 +49,7 @@ def rewritten(scene, how):
 @pytest.mark.parametrize("how", ["plain", "cut", "half cut", "reversed", "doubled", "turned"])
 def test_edges_and_their_paths_do_not_depend_on_how_faces_are_written(how):
     scene, turn = rewritten(house(), how)
-    edges = mesh_edges(scene.mesh)
+    edges = mesh_edges(scene.mesh, scene.mesh.face_normals, np.zeros(len(scene.mesh.faces), int))
     np.testing.assert_allclose(np.sort(edges.n), [1.5] * 9 + [2.0] * 8, atol=1e-9)
     np.testing.assert_allclose(
         np.sort(edges.length), sorted([2.0] * 3 + [4, 7] + [20.0] * 4 + [30.0] * 4 + [120.0] * 4)

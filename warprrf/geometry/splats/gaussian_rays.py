@@ -187,13 +187,13 @@ class GaussianRays:
     ) -> tuple[RayHits, Callable[[], None]]:
         """:meth:`trace` without a tape: the hits, and the function that adds the parameters' gradients, which only
         hits with ``gradients`` have."""
-        start, toward = _pairs("origins", origins, "directions", directions)
+        start, toward = _pairs(("origins", origins), ("directions", directions))
         places = check_count("k", k)
         check_choice("order", order, ORDERS)
         still = int(np.count_nonzero(np.linalg.norm(toward, axis=1) == 0))
         if still:
             raise ValueError(f"directions: got {still} of length zero, expected directions")
-        count, on = _rows(start, toward), self.device
+        count, on = np.broadcast_shapes(start.shape, toward.shape)[0], self.device
         shape = (count, places)
         real = {"dtype": wp.float64, "device": on}
         found = RayHits(
@@ -224,8 +224,8 @@ class GaussianRays:
     ) -> tuple[wp.array, Callable[[], None]]:
         """:meth:`transmit` without a tape: the values, and the function that adds the parameters' gradients, which only
         values with ``gradients`` have."""
-        start, end = _pairs("a", a, "b", b)
-        count, on = _rows(start, end), self.device
+        start, end = _pairs(("a", a), ("b", b))
+        count, on = np.broadcast_shapes(start.shape, end.shape)[0], self.device
         values = wp.empty(count, dtype=wp.float64, device=on, requires_grad=gradients)
         parts = [wp.empty(count, dtype=wp.float64, device=on), wp.empty(count, dtype=int, device=on)]
         ends = [wp.array(start, dtype=wp.vec3d, device=on), wp.array(end, dtype=wp.vec3d, device=on)]
@@ -252,21 +252,14 @@ class GaussianRays:
         )  # fmt: skip
 
 
-def _pairs(
-    first_name: str, first: ArrayLike, second_name: str, second: ArrayLike
-) -> tuple[np.ndarray, np.ndarray]:
+def _pairs(first: tuple[str, ArrayLike], second: tuple[str, ArrayLike]) -> tuple[np.ndarray, np.ndarray]:
     """Two arrays of float64 rows, one or N of each."""
-    named = (first_name, first), (second_name, second)
-    one, other = check_rows(*named)
-    for (name, _), array in zip(named, (one, other), strict=True):
+    rows = check_rows(first, second)
+    for name, array in zip((first[0], second[0]), rows, strict=True):
         check_array(name, array)
         if np.abs(array).max(initial=0.0) > LARGEST:
             raise ValueError(f"{name}: got numbers above {LARGEST:g}, expected metres")
-    return one, other
-
-
-def _rows(one: np.ndarray, other: np.ndarray) -> int:
-    return max(len(one), len(other)) if min(len(one), len(other)) else 0
+    return rows
 
 
 def _rebuilt(arrays: tuple[np.ndarray, ...], blending: Blending, device: str) -> GaussianRays:

@@ -473,8 +473,7 @@ def itu_name(name: str) -> str | None:
 
     Blender writes ``mat-itu_concrete`` for ``itu_concrete``, and ``mat-itu_concrete.001`` for a second one.
     """
-    plain = re.sub(r"\.\d{3}$", "", name.removeprefix("mat-"))
-    plain = plain[4:] if plain.startswith(("itu_", "itu-")) else plain
+    plain = re.sub(r"^(mat-)?(itu[_-])?|\.\d{3}$", "", name)
     return plain if plain in ITU_BANDS else None
 
 

@@ -375,7 +375,7 @@ def main_lobe(antenna: Antenna) -> Antenna:
         )
     own = replace(antenna.unpolarised(), orientation=(0.0, 0.0, 0.0))
     around = np.linspace(-np.pi, np.pi, 73)
-    gain = own.gain(_off_boresight_directions(angle[:, None], around))
+    gain = own.gain(directions_from_angles(angle[:, None], around)[..., [2, 0, 1]])  # about +x, from +y to +z
     ends = np.array([_flank_end(angle, row, gain.max()) for row in gain.T])
     return replace(antenna, pattern=partial(_within_ends, own, around, ends), polarisation=None)
 
@@ -454,12 +454,6 @@ def _within_ends(
     end = np.interp(np.arctan2(d[..., 2], d[..., 1]), around, ends)
     off = np.arctan2(np.hypot(d[..., 1], d[..., 2]), d[..., 0])
     return np.where(off <= end, antenna.gain(d), 0.0)
-
-
-def _off_boresight_directions(angle: np.ndarray, around: np.ndarray) -> np.ndarray:
-    """Directions at ``angle`` off +x, turned ``around`` it from +y to +z, shape ``(..., 3)``."""
-    y, z = np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around)
-    return np.stack(np.broadcast_arrays(np.cos(angle), y, z), axis=-1)
 
 
 def _flank_end(angle: np.ndarray, gain: np.ndarray, peak: float) -> float:

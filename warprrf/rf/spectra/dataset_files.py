@@ -20,7 +20,7 @@ from warprrf import netcdf_files
 from warprrf.device import require
 from warprrf.files import write_atomically
 from warprrf.netcdf_files import XYZ, Axis, Variable
-from warprrf.rf.spectra.spectrum import Spectrum
+from warprrf.rf.spectra.spectrum import Spectrum, pixel_angles
 from warprrf.tensor_files import named
 
 # What a compact file keeps; of path gain see _rounded.
@@ -48,10 +48,8 @@ _VARIABLES = {
     "line_of_sight": Variable(("receiver",), "1", codes=(False, True)),
 }
 _AXES = {
-    "zenith": Axis(lambda rows: (np.arange(rows) + 0.5) * np.pi / rows, "rad"),
-    "azimuth": Axis(
-        lambda columns: -np.pi + (np.arange(columns) + 0.5) * 2.0 * np.pi / columns, "rad", 2.0 * np.pi
-    ),
+    "zenith": Axis(lambda rows: pixel_angles((rows, 2))[0], "rad"),
+    "azimuth": Axis(lambda columns: pixel_angles((2, columns))[1], "rad", 2.0 * np.pi),
     "xyz": XYZ,
     "angle": Axis(lambda _: np.array(["zenith", "azimuth"])),
 }
