@@ -10,12 +10,10 @@ All rays are turned at mirrors; fewer are connected to images of the transmitter
 the cosine from a stated seed: unbiased, with sampling noise. Slabs are passed straight on, on the way to a surface that scatters
 and behind it.
 
-Diffuse power changes, by some decibels a path, when transmitter and receiver change places: lobes are normalised by the
-direction of incidence (Degli-Esposti et al. 2007). Materials with ``reciprocal`` scatter alike both ways, with |Gamma|^2 the
-mean of both angles.
+Materials with ``reciprocal`` scatter alike both ways (:mod:`warprrf.rf.em.fresnel`), with |Gamma|^2 the mean of both angles.
 
 The directions form a rank-1 lattice of equal solid angles, shifted from row to row and column to column: a regular grid
-would meet upright edges in whole columns, and errs 3 to 5 times more.
+errs 3 to 5 times more.
 """
 
 from __future__ import annotations
@@ -289,8 +287,8 @@ class ExactEngine:
         return _Beams(hits, own, length_m[onward.ray], name + rays.sequence, rays.times)
 
     def _some(self, rays: _Beams, most: int) -> tuple[np.ndarray, int]:
-        """Of the rays those that hit something, at most so many of a pixel, and more where it has more than by default: a lattice
-        again. How many each of them stands for."""
+        """Of the rays those that hit something, at most so many of a pixel (of more than by default, more): a lattice again. How
+        many each of them stands for."""
         per_pixel = self._tracer.grid.per_pixel
         count, most = per_pixel // rays.times, most * max(per_pixel // SUB_PIXELS**2, 1)
         every = next(n for n in range(1, count + 1) if count % n == 0 and count // n <= most)

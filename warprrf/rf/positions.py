@@ -7,9 +7,9 @@ are left (another room), or only walls with two surfaces are left (the open air)
 is air. Where no place is known to be in the air, a closed surface that holds most of the rest is a room's, and so is one
 that is all there is.
 
-A city's mesh is no closed room: buildings often have no floors, and the ground is one sheet. So under the sky places are
-judged by rays upward besides. In a building low, slanting, steep and vertical ones all cross an odd number of surfaces, or out of
-the same number of solids; in a court, under a bridge or below a canopy some of them do not.
+A city's buildings often have no floors. So under the sky places are judged by rays upward besides. In a building low, slanting,
+steep and vertical ones all cross an odd number of surfaces, or out of the same number of solids; in a court, under a bridge
+or below a canopy some of them do not.
 """
 
 from __future__ import annotations

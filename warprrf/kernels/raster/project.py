@@ -17,9 +17,8 @@ gradients of mean, quaternion and scale. In the turned coordinates of the linear
 ``y = (-|M m| (g1^2 + g2^2), |M m| g0 g1, |M m| g0 g2)/|g|^2``.
 
 Bounds of the tiles that an ellipsoid can touch never leave one out: a plane through the ray origin with normal l touches
-it where l^T C l = 0, with its half axes the columns of A, its centre m, and C = A A^T - m m^T. They are float32, as only
-tiles are to be told from them: no difference is taken of numbers that are nearly alike, and bounds reach further by what
-rounding may err.
+it where l^T C l = 0, with its half axes the columns of A, its centre m, and C = A A^T - m m^T. In float32 they reach
+further by what rounding may err.
 """
 
 from typing import Any

@@ -8,11 +8,9 @@ with a_mn the complex gain at the carrier f_c times element amplitudes and the a
 the elements' places add to the path. It is the passband transfer function, phase -2 pi f tau, in complex128: at 300 GHz
 a wavelength is 1 mm. Three choices are the caller's:
 
-- ``wave``: "plane" takes x_mn = -d_m . u_r - d_n . u_t for elements at d and directions u of arrival and departure
-  (Sionna RT's synthetic array); "spherical" takes every element's own distance: to the transmitter's image for line of
-  sight and mirrors, to the first and the last interaction point for diffuse paths, amplitudes changing with distance.
-  Element patterns and polarisations are those in the direction at the array's centre. :func:`plane_wave_error` says
-  what the plane wave costs.
+- ``wave``: "plane" (Sionna RT's synthetic array) or "spherical", every element's own distance, see :mod:`.sums`. Element
+  patterns and polarisations are those in the direction at the array's centre. :func:`plane_wave_error` says what the
+  plane wave costs.
 - ``squint``: whether x_mn counts as a delay, so that beams turn with frequency, or as a phase at the carrier alone, as
   Sionna RT has it.
 - ``diffuse``: a diffuse path is the power of many scatterers, without a phase. "random_phase" turns each by a phase

@@ -7,12 +7,8 @@ IEEE Trans. AP 32 (1984): the two terms of the coefficient that make the field c
 multiplied by that face's reflection. The other two carry the straight path; of a sheet that lets a part through they are
 multiplied by what it stops.
 
-Which incidence a face's coefficient is taken at decides whether the field is reciprocal. Here it is one angle that lies
-between that of the incident ray and that of the diffracted one, nearer to that of the longer leg's end: the straight
-path's own angle to first order, so that value and slope of the field are continuous across the boundaries, and the same
-when the ends are swapped. Its limits are the heuristic's: right for conductors and near the boundaries; in the deep shadow of
-a lossy wedge the level is a guess (some decibels against rigorous solutions), waves along the surface and through the
-wedge are missing, and so is what the pattern's slope across the edge adds (slope diffraction).
+A face's coefficient is taken at one angle between those of the incident and of the diffracted ray, so that the field is
+reciprocal. Why, and what is missing, says ``docs/theory/radio.md`` (Diffraction).
 
 The time factor is exp(+j 2 pi f t). Fields at either end are along two vectors fixed to the edge, (b, p) with p = e x s
 and b = s x p, e being the edge's unit vector and s the direction of propagation: b has the sign of the field along the

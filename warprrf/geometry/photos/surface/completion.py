@@ -1,13 +1,13 @@
 """A mesh made whole: its planes divide space into boxes, and each box is free or solid.
 
-Depth maps leave holes where walls are bare, ragged borders where surfaces meet, and islands in the air. Where most of a
-mesh is planar along three perpendicular directions, its planes cut space into boxes. Lines of sight prove boxes free,
-the surfaces they end on prove the boxes behind solid, and for the rest the surface between free and solid is made as
-small as it can be, along known planes rather than elsewhere (Chauve, Labatut and Pons, "Robust piecewise-planar 3D
-reconstruction and completion from large-scale unstructured point data", 2010; a minimum cut, found by SciPy). That
-surface has no holes and lies exactly on the planes. Faces that no plane explains stay as they are. Of a mesh that is no
-such place every plane is closed by itself: gaps are those of a morphological closing of its cells (Serra, "Image analysis
-and mathematical morphology", 1982), and stay open where a photo looks through. Lengths in metres.
+Where most of a mesh is planar along three perpendicular directions, its planes cut space into boxes. Lines of sight
+prove boxes free, the surfaces they end on prove the boxes behind solid, and for the rest the surface between free and
+solid is made as small as it can be, along known planes rather than elsewhere (Chauve, Labatut and Pons, "Robust
+piecewise-planar 3D reconstruction and completion from large-scale unstructured point data", 2010; a minimum cut, found
+by SciPy). That surface has no holes and lies exactly on the planes. Faces that no plane explains stay as they are. Of a
+mesh that is no such place every plane is closed by itself: gaps are those of a morphological closing of its cells
+(Serra, "Image analysis and mathematical morphology", 1982), and stay open where a photo looks through. Lengths in
+metres.
 """
 
 from __future__ import annotations
