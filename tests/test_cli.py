@@ -118,6 +118,7 @@ HORN = f"{FIT} --frequency 300e9 --noise-floor-db -120 {{tmp}}/horn.csv"
 SUGGEST = "suggest {scene} 2,2,1 --transmitter 13.6 11.2 2.5"
 BAD = {
     "no scene": (SIMULATE.replace("{scene}", "none.xml") + " 2,2,1", "none.xml"),
+    "a folder in the place of the result": (SIMULATE.replace("{tmp}/x.nc", "{tmp}") + " 7,4,1.5", "expected the name of a file"),
     "empty name of the result": (SIMULATE.replace("-o {tmp}/x.nc", "--out=") + " 7,4,1.5", "-o/--out: got ''"),
     "materials of a reconstruction": ("relevance {tmp} --receivers 2,2,1 --materials {tmp}/materials.json", "--materials"),
     "scale that is no number": ("reconstruct {tmp} -o {tmp}/out --scale a.jpg b.jpg far", "--scale"),

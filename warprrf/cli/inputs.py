@@ -32,14 +32,16 @@ def add_point(parser: argparse.ArgumentParser, flag: str, text: str, required: b
 
 
 def add_out(parser: argparse.ArgumentParser, text: str, required: bool = True) -> None:
-    """Define the option that says where the result goes; an empty name is refused before any work is done."""
-    parser.add_argument("-o", "--out", required=required, type=_file_name, help=text)
+    """Define the option that says where the result goes: a file, or, as the ``text`` then begins, a folder. Another name is
+    refused before any work is done."""
+    kind = "folder" if text.startswith("folder") else "file"
 
+    def name(given: str) -> str:
+        if not given.strip() or (kind == "file" and os.path.isdir(given)):
+            raise argparse.ArgumentTypeError(f"got {given!r}, expected the name of a {kind}")
+        return given
 
-def _file_name(text: str) -> str:
-    if not text.strip():
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected the name of a file or folder")
-    return text
+    parser.add_argument("-o", "--out", required=required, type=name, help=text)
 
 
 def existing(path: str | os.PathLike[str]) -> Path:
