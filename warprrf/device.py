@@ -3,10 +3,6 @@
 Warp runs a CPU launch on one thread. :func:`launch` splits the index range over a thread pool (Warp releases the
 interpreter lock), so every kernel of ours takes ``offset`` first and works on index ``offset + wp.tid()``; an index
 owns what it writes, and the result does not depend on the number of threads.
-
-Warp announces on standard error that there is no CUDA driver, from its C library, whatever its log level; and it fails
-where its cache of kernels (``WARP_CACHE_PATH``, a folder below the home folder by default) cannot be written. Both are
-mended where it is started.
 """
 
 from __future__ import annotations

@@ -288,8 +288,6 @@ def add_fit(add: Add) -> None:
 def _fit(args: argparse.Namespace, out: Output) -> None:
     """A radio field from geometry and measured spectra.
 
-    Geometry stays frozen; blending weights are computed once per receiver, then the radio part is fitted on them.
-
       bistatic  line of sight, mirrors and scattering lobes of material groups; holds for other transmitters too
       rf3dgs+   directional gain per Gaussian times the path-length law; delay and departure angle from geometry
       rf3dgs    directional gain without lengths; delay and departure angle as trained channels of their own
@@ -299,7 +297,6 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
       warprrf fit room.glb spectra.nc -o field.safetensors
       warprrf fit scan.stl spectra.nc -o field.safetensors --unit mm --simplify 200000
       warprrf fit splats.ply spectra.nc --mesh mesh.ply -o field.safetensors --model rf3dgs --train 50
-      warprrf fit room spectra.nc -o field.safetensors --effects room
       warprrf fit room spectra.nc -o field.safetensors --effects '{"scatterings":1,"mirrors":1}'
       warprrf fit room.glb horn.csv -o field.safetensors --frequency 300e9 --noise-floor-db -120 --receive-pattern 10
       warprrf fit room horn.csv receive-pattern=10 power.csv samples=1 -o f.safetensors --frequency 300e9 --noise-floor-db -120
