@@ -159,7 +159,11 @@ def test_files_outside_the_folder_are_read_only_if_that_is_asked_for(make, names
     [
         (lambda h: h["accessors"][0].update(count=10**9), "accessor 0 states"),
         (lambda h: h["nodes"][0].update(children=[0]), "two parents"),
-        (lambda h: h.update(extensionsRequired=["KHR_draco_mesh_compression"]), "without compression"),
+        (lambda h: h.update(extensionsRequired=["KHR_draco_mesh_compression"]), "KHR_draco.* without"),
+        (
+            lambda h: h.update(extensionsUsed=["EXT_mesh_gpu_instancing"]),
+            "EXT_mesh_gpu_instancing; export it without",
+        ),
         (lambda h: h["meshes"][0]["primitives"][0].update(mode=6), "fans"),
     ],
 )

@@ -36,6 +36,7 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _JSON = 0x4E4F534A  # kind of the chunk that holds the header
 _HARMLESS = ("KHR_materials_", "KHR_lights_", "KHR_texture_transform", "EXT_texture_webp", "KHR_xmp")
 """Beginnings of the names of extensions that do not change where surfaces are."""
+_INSTANCES = "EXT_mesh_gpu_instancing"
 
 
 def read_gltf(folder: Folder) -> MeshContent:
@@ -77,9 +78,14 @@ class _File:
     def __init__(self, folder: Folder) -> None:
         self.folder, self.triangles = folder, 0  # those that were made
         self.header, binary = _split(folder.path)
-        unread = [x for x in self.header.get("extensionsRequired", []) if not str(x).startswith(_HARMLESS)]
+        needed = [*self.header.get("extensionsRequired", [])]
+        if _INSTANCES in self.header.get(
+            "extensionsUsed", []
+        ):  # copies are missing without it, required or not
+            needed.append(_INSTANCES)
+        unread = [x for x in dict.fromkeys(map(str, needed)) if not x.startswith(_HARMLESS)]
         if unread:
-            raise ValueError(f"it needs the extension {', '.join(unread)}; export it without compression")
+            raise ValueError(f"it needs the extension {', '.join(unread)}; export it without")
         self.buffers = []
         for k, buffer in enumerate(self.header.get("buffers", [])):
             data = self.file(buffer["uri"]) if "uri" in buffer else binary if k == 0 else None

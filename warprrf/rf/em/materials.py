@@ -7,9 +7,8 @@ all bands of a material every question about it is an error, unless it was extra
 from the roughness: S^2 = 1 - rho^2, rho = exp(-8 (pi sigma_h / lambda)^2), the Rayleigh roughness factor at normal
 incidence (Ament 1953; Degli-Esposti et al. 2007, eq. (2), for the power that leaves the mirror direction).
 
-The table is that of ITU-R P.2040, table 3. Rows stand in the order of their edition, and the first whose band holds a
-frequency counts. The rows of edition 3 (2023) stand in edition 4 (2025) too, which adds those above 100 GHz and some
-materials.
+The table is that of ITU-R P.2040, table 3: of edition 3 (2023), then what edition 4 (2025) adds. The first row whose band
+holds a frequency counts.
 """
 
 from __future__ import annotations
