@@ -160,6 +160,19 @@ def test_the_exact_engine_follows_closed_forms():
         assert abs(10.0 * np.log10(ours[sequence].sum() / exact[sequence])) < 0.05, sequence
 
 
+@pytest.mark.parametrize("rays", [4, 16])
+def test_how_many_of_a_pixel_s_rays_go_on_changes_no_total(rays):
+    """With two squared all go on, with four half of them are scattered; with sixteen a quarter is lit by mirrors."""
+    link = replace(floor_and_mirror(), shape=(24, 48))
+    once = exact_runs(link, replace(MIRRORED, scatter_mirror=False), rays, 1)["MS"]
+    assert abs(10.0 * np.log10(once.sum() / closed_forms(link)["MS"])) < 0.05
+    both = replace(link, does=np.full(4, SCATTER))
+    alone = replace(MIRRORED, scatterings=2, mirror_scatter=False, scatter_mirror=False)
+    some, every = (Estimate(exact_runs(both, alone, n, seeds)["SS"]) for n, seeds in ((rays, 4), (2, 40)))
+    assert some.total == pytest.approx(every.total, rel=0.0, abs=4.0 * np.hypot(some.error, every.error))
+    assert every.error < 0.02 * every.total
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("known", "effects", "sub_pixels", "seeds"),

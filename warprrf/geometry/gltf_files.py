@@ -79,10 +79,8 @@ class _File:
         self.folder, self.triangles = folder, 0  # those that were made
         self.header, binary = _split(folder.path)
         needed = [*self.header.get("extensionsRequired", [])]
-        if _INSTANCES in self.header.get(
-            "extensionsUsed", []
-        ):  # copies are missing without it, required or not
-            needed.append(_INSTANCES)
+        if _INSTANCES in self.header.get("extensionsUsed", []):
+            needed.append(_INSTANCES)  # without it copies are missing, required or not
         unread = [x for x in dict.fromkeys(map(str, needed)) if not x.startswith(_HARMLESS)]
         if unread:
             raise ValueError(f"it needs the extension {', '.join(unread)}; export it without")
