@@ -8,7 +8,8 @@ import io
 import os
 from collections import Counter
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -16,12 +17,11 @@ from warprrf.device import DeviceLike, Progress, require
 from warprrf.files import write_text
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.posed.photo_files import read_photo, spread
+from warprrf.geometry.photos.posed.undistort import Lens
 from warprrf.geometry.report.sight import CLASSES, colours_of, from_outside, how_seen, painted
+from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.render import render
-
-if TYPE_CHECKING:  # it imports this module
-    from warprrf.geometry.reconstruction import Reconstruction
 
 SHOWN = 6  # photos beside their renderings
 PICTURE_WIDTH = 420  # of one of them [pixels]
@@ -42,9 +42,23 @@ th, td { padding: .3rem .8rem .3rem 0; border-bottom: 1px solid #ddd; text-align
 """
 
 
+class Subject(Protocol):
+    """What a report is about: a :class:`~warprrf.geometry.reconstruction.Reconstruction`, whose attributes these are."""
+
+    cameras: dict[str, Camera]
+    photos: dict[str, Path]
+    held_out: tuple[str, ...]
+    unposed: tuple[str, ...]
+    causes: dict[str, str]
+    lenses: dict[str, Lens]
+    guessed: tuple[str, ...]
+    metric: bool
+    scale_rms_m: float
+
+
 def write_report(
     path: str | os.PathLike[str],
-    subject: Reconstruction,
+    subject: Subject,
     gaussians: Gaussians | None,
     mesh: Mesh | None,
     *,
@@ -90,7 +104,7 @@ def colours_matched(picture: np.ndarray, photo: np.ndarray) -> np.ndarray:
     return (given @ change).reshape(picture.shape)
 
 
-def _head(subject: Reconstruction, gaussians: Gaussians | None, mesh: Mesh | None) -> str:
+def _head(subject: Subject, gaussians: Gaussians | None, mesh: Mesh | None) -> str:
     total = len(subject.cameras) + len(subject.unposed)
     rows = [
         ("photos", f"{len(subject.cameras)} of {total} posed, {len(subject.held_out)} held out of the fit")
@@ -111,7 +125,7 @@ def _head(subject: Reconstruction, gaussians: Gaussians | None, mesh: Mesh | Non
     return f"<h1>Reconstruction</h1>{_table(rows)}"
 
 
-def _warnings(subject: Reconstruction) -> str:
+def _warnings(subject: Subject) -> str:
     said = list(subject.guessed)
     if not subject.metric and not any(text.startswith("scale") for text in said):
         said.append("scale: lengths are not metres")
@@ -121,7 +135,7 @@ def _warnings(subject: Reconstruction) -> str:
     return f"<h2>What is guessed</h2><ul>{items}</ul>"
 
 
-def _from_above(subject: Reconstruction, mesh: Mesh | None) -> str:
+def _from_above(subject: Subject, mesh: Mesh | None) -> str:
     """Cameras with the directions that they look in, over a section of the mesh at their median height, as SVG."""
     cameras = subject.cameras
     places = np.array([c.position for c in cameras.values()])
@@ -173,7 +187,7 @@ def _from_above(subject: Reconstruction, mesh: Mesh | None) -> str:
     )
 
 
-def _beside(subject: Reconstruction, gaussians: Gaussians | None, device: DeviceLike) -> str:
+def _beside(subject: Subject, gaussians: Gaussians | None, device: DeviceLike) -> str:
     """Photos beside what the Gaussians show, those held out where there are some."""
     if gaussians is None:
         return ""
@@ -201,7 +215,7 @@ def _beside(subject: Reconstruction, gaussians: Gaussians | None, device: Device
     return f'<h2>{title} beside renderings</h2><p class="note">{text}</p>{"".join(rows)}'
 
 
-def _surface(mesh: Mesh, gaussians: Gaussians | None, subject: Reconstruction, device: DeviceLike) -> str:
+def _surface(mesh: Mesh, gaussians: Gaussians | None, subject: Subject, device: DeviceLike) -> str:
     """The mesh from four sides, in its colours and by how often it was seen."""
     views = [(from_outside(mesh, np.pi * turn, device=device), name) for turn, name in SIDES]
     grey = np.zeros((1, 3)), np.full((1, 3), 0.8)
@@ -234,7 +248,7 @@ def _four(
     return f'<div class="two">{figures}</div>'
 
 
-def _lenses(subject: Reconstruction) -> str:
+def _lenses(subject: Subject) -> str:
     groups = Counter(
         (c.width, c.height, *(round(x, 2) for x in (c.fx, c.fy, c.cx, c.cy)))
         for c in subject.cameras.values()
@@ -252,7 +266,7 @@ def _lenses(subject: Reconstruction) -> str:
     return f"<h2>Lenses</h2>{_table(rows)}{more}{_taken_with(subject)}"
 
 
-def _taken_with(subject: Reconstruction) -> str:
+def _taken_with(subject: Subject) -> str:
     """Lenses before photos were undistorted and reduced."""
     if not subject.lenses:
         return ""
@@ -263,7 +277,7 @@ def _taken_with(subject: Reconstruction) -> str:
     return f"<p>They were taken with:</p>{_table(rows)}"
 
 
-def _unposed(subject: Reconstruction) -> str:
+def _unposed(subject: Subject) -> str:
     if not subject.unposed:
         return ""
     rows = [(name, subject.causes.get(name, "cause not known")) for name in subject.unposed]
