@@ -65,7 +65,22 @@ def test_no_figure_is_typed(page):
 
 
 STALE = {
+    "arrays",
+    "bare_mesh",
+    "beams",
+    "bistatic",
+    "edited",
+    "lobby",
+    "lobby_seeds",
     "locate",
+    "map",
+    "measured_flat",
+    "measured_hall",
+    "measured_office",
+    "measurements",
+    "office",
+    "outside",
+    "suggest",
 }  # fmt: skip
 """Result files of before what they depend on computed something else; their pages say so. What is made anew leaves this list."""
 
@@ -86,7 +101,7 @@ def test_result_files_say_which_code_made_them_and_whether_it_is_todays():
 
 GOLDENS = {
     "bistatic": (
-        9,
+        10,
         "d2bcbb07",
         ("bistatic_field", "bistatic_field_of_a_bare_mesh", "bistatic_field_with_held_out_receivers"),
     ),

@@ -16,11 +16,12 @@ from mitsuba_reference import (
     mitsuba_sequences,
 )
 from places import LOBBY
-from radio_scenes import RadioScene, SlabMaterial
+from radio_scenes import RadioScene, SlabMaterial, box_mesh
 from rooms import rms_change_db
 from sionna_room import sionna_or_skip
 
 import warprrf as wr
+from warprrf.geometry.mesh import Mesh
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.spectra.beam import beam_operator
@@ -127,10 +128,7 @@ ROOMS = {"floor": (floor_and_mirror, 1), "lobby": (lobby, 3)}  # and scatterings
 LOOK = "9 rays a pixel where a mirror shows the ceiling beside the transmitter: 0.14 dB where 0.10 are asked"
 FEW = "3 rays a pixel see what mirrors light: 0.36 dB where 0.14 are asked"
 LIT = "mirrors light whole pieces of cells, or none of them: 1.5 dB where 0.18 are asked"
-ELEMENTS = (
-    "light is taken to reach elements from everywhere alike: 1.2 % of SS; 128 rays of each: 0.6 dB where 0.20 are asked; "
-    "SSS 0.3 where 0.22"
-)
+ELEMENTS = "elements are half a metre wide and have 128 rays: 0.57 dB of SS where 0.20 are asked, SSS 0.29 where 0.22"
 
 
 def cases(**wrong: str) -> list[object]:
@@ -173,6 +171,19 @@ def test_how_many_of_a_pixel_s_rays_go_on_changes_no_total(rays):
     assert every.error < 0.02 * every.total
 
 
+def test_what_is_scattered_twice_was_reflected_as_its_angle_has_it():
+    """As the mean of |Gamma|^2 over all angles has it 5.6 % too much comes here, and 6.4 % too little in the lobby."""
+    room, ends = (
+        Mesh(*box_mesh([0, 0, 0], [6, 5, 3], inward=True)),
+        np.array([[1.2, 1.5, 2.2], [4.3, 3.1, 1.3]]),
+    )
+    link = Link(room, np.full(12, SCATTER), *ends, 60e9, permittivity=3.0, shape=(24, 48))
+    alone = replace(MIRRORED, scatterings=2, mirror_scatter=False, scatter_mirror=False)
+    exact = Estimate(exact_runs(link, alone, 4, 60)["SS"])
+    assert exact.error < 0.003 * exact.total
+    assert sequences(link)["SS"].sum() == pytest.approx(exact.total, rel=0.01, abs=0.0)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("known", "effects", "sub_pixels", "seeds"),
@@ -201,7 +212,7 @@ def test_mitsuba_follows_closed_forms():
         assert found.total == pytest.approx(exact[sequence], rel=1e-4, abs=4.0 * found.error)
 
 
-@pytest.mark.parametrize(("room", "sequence"), cases(lobby_SSS=ELEMENTS))
+@pytest.mark.parametrize(("room", "sequence"), cases())
 def test_totals_are_those_of_mitsuba(room, sequence):
     sionna_or_skip()
     ours, found = compared(room, sequence)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from scipy.fft import irfft, rfft
 from scipy.sparse import csr_matrix
@@ -33,14 +31,10 @@ class BeamOperator:
         even = np.full(directions.shape[1], 1.0 / directions.shape[1])
         # what row i of column 0 gives to each pixel, shape (row, column, i)
         self._kernel = np.stack([spread(d, even, shape, sigma, device=device) for d in directions], axis=-1)
-        transform = np.moveaxis(rfft(self._kernel, axis=1), 1, 0)
-        back = np.swapaxes(transform, 1, 2).conj()
         # a matrix over the rows for each frequency, shape (frequency, row, row)
-        self._matrices = {
-            (name, real): np.ascontiguousarray(one, dtype=np.result_type(real, np.complex64))
-            for name, one in (("forward", transform), ("backward", back))
-            for real in (np.float32, np.float64)
-        }
+        transform = np.ascontiguousarray(np.moveaxis(rfft(self._kernel, axis=1), 1, 0))
+        self._exact, self._quick = transform, transform.astype(np.complex64)
+        self._back = np.ascontiguousarray(np.swapaxes(self._quick, 1, 2).conj())
 
     @cached_property
     def _matrix(self) -> csr_matrix:
@@ -58,21 +52,21 @@ class BeamOperator:
         Double precision is used whatever comes, because the errors of a transform are shared by pixels 100 dB apart;
         ``quick`` does without (errors of 1e-6 of the largest, half the time).
         """
-        return self._apply("forward", images, np.float32 if quick else np.float64)
+        return self._apply(self._quick if quick else self._exact, images)
 
-    def adjoint(self, images: np.ndarray, *, quick: bool = False) -> np.ndarray:
-        """The transposed map of ``images`` (H, W, ...)."""
-        return self._apply("backward", images, np.float32 if quick else np.float64)
+    def adjoint(self, images: np.ndarray) -> np.ndarray:
+        """The transposed map of ``images`` (H, W, ...), by single precision."""
+        return self._apply(self._back, images)
 
-    def _apply(self, name: str, images: np.ndarray, real: type[np.floating[Any]]) -> np.ndarray:
+    def _apply(self, matrices: np.ndarray, images: np.ndarray) -> np.ndarray:
         rows, columns = self.shape
-        flat: np.ndarray = np.asarray(images, real).reshape(rows, columns, -1)
+        flat: np.ndarray = np.asarray(images, matrices.real.dtype).reshape(rows, columns, -1)
         x = np.moveaxis(rfft(flat, axis=1), 1, 0)
-        out = irfft(np.moveaxis(self._matrices[name, real] @ x, 0, 1), n=columns, axis=1)
+        out = irfft(np.moveaxis(matrices @ x, 0, 1), n=columns, axis=1)
         size = np.abs(out)
         # half the time of both axes at once, as is a product to a mask
         largest = size.max(axis=0).max(axis=0)
-        out *= size >= 50.0 * np.finfo(real).eps * largest
+        out *= size >= 50.0 * np.finfo(flat.dtype).eps * largest
         return out.reshape(images.shape).astype(images.dtype, copy=False)
 
     def at(self, pixels: np.ndarray) -> csr_matrix:

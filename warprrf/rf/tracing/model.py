@@ -16,7 +16,7 @@ from scipy.sparse import block_diag, bsr_matrix, csr_matrix, identity
 
 from warprrf.checks import Expected, check_array, check_arrays, check_number, check_type, checked, whole
 from warprrf.kernels.radio.records import EXCESS_COLUMN, MIRRORED_COLUMN, THROUGH_COLUMN
-from warprrf.rf.em.fresnel import EXCESS, fresnel_curves
+from warprrf.rf.em.fresnel import COSINES, EXCESS, fresnel_curves
 from warprrf.rf.em.materials import NARROWEST_LOBE
 from warprrf.rf.paths.slabs import MOST_SLABS
 
@@ -146,6 +146,13 @@ class Parameters:
     def scattered_share(self) -> np.ndarray:
         """Share of power that each group scatters under even light, ``(G,)``: lobe weights times 2 int F cos dcos."""
         return self.weight.sum(axis=1) * fresnel_curves().even(self.log_excess)[0]
+
+    def scattered_over_even(self, group: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+        """What groups (K,) scatter of light at cosines of incidence (K,), by what they do of as much even light, ``(K,)``."""
+        curves = fresnel_curves()
+        table = curves.at(curves.curves, self.log_excess)[0] / curves.even(self.log_excess)[0][:, None]
+        found = table[group, np.rint((COSINES - 1) * cosine).astype(int)]
+        return 0.5 * (1.0 + found) if self.reciprocal else found
 
     @property
     def mirrored_share(self) -> np.ndarray:

@@ -2,7 +2,8 @@
 
 Surfaces light each other: elements are a source that records may start from in the transmitter's place. Rays from every
 side of an element, density by the cosine, see what the transmitter lights; that is what the element gets of first
-scatterings. What elements get of others after that is even over each. Elements are half a metre wide in a room.
+scatterings. What elements get of others after that is even over each. Each ray's light is reflected as its angle of
+incidence has it. Elements are half a metre wide in a room.
 """
 
 from __future__ import annotations
@@ -138,11 +139,11 @@ class Interreflection:
         most: slabs that first scatterings may pass, at most.
 
     Attributes:
-        lit: what the rays of sides see of first scatterings, by sequence: of surfaces that the transmitter lights, ``"S"``, of
-            those that it lights through slabs, ``"TS"``, and of lit ones that are seen through slabs, ``"ST"``. Records whose
-            ray is the side, of irradiance where the transmitter gives cos(theta_i) / d1^2 [1/m^2].
-        between: irradiance of sides (rows) by radiance of sides (columns), shape ``(E, E)``: of what light can reach of them;
-            solids' inner ones are left dark.
+        side: of the element that each ray starts from, shape ``(K,)``; solids' inner ones have no rays.
+        cosine: of each ray to the normal there, shape ``(K,)``.
+        lit: what the rays see of first scatterings, by sequence: of surfaces that the transmitter lights, ``"S"``, of those
+            that it lights through slabs, ``"TS"``, and of lit ones that are seen through slabs, ``"ST"``. Records of
+            irradiance where the transmitter gives cos(theta_i) / d1^2 [1/m^2].
     """
 
     def __init__(self, tracer: Tracer, most: int) -> None:
@@ -160,34 +161,45 @@ class Interreflection:
         chosen = np.clip(np.searchsorted(upto, below), first, last - 1)
         start = tile[order[chosen]].ravel()
         hits = grid.hit_from(start, point[start], *(x.ravel() for x in turn))
-        rays = Rays(hits, np.repeat(known, ELEMENT_RAYS))
+        self.side, self.cosine = np.repeat(known, ELEMENT_RAYS), np.sqrt(1.0 - turn[0].ravel())
+        rays = Rays(hits, np.arange(len(self.side)))
         self.lit = tracer.lit(rays, most)
         if most:
             self.lit["ST"] = tracer.lit(tracer.behind(rays, most), 0)["S"]
         scale = np.float32(np.pi / ELEMENT_RAYS * (4.0 * np.pi / tracer.wavelength_m) ** 2)
         self.lit = {name: replace(found, power=scale * found.power) for name, found in self.lit.items()}
-        hit, met = grid.tiles_met(hits)
-        left = np.pi / ELEMENT_RAYS * np.broadcast_to(grid.transmittance(hits.range_m[hit]), len(hit))
-        self.between = csr_matrix((left, (rays.ray[hit], surface.tile_side[met])), shape=(sides, sides))
+        self._hit, met = grid.tiles_met(hits)
+        self._met = surface.tile_side[met]
+        self._left = (
+            np.pi / ELEMENT_RAYS * np.broadcast_to(grid.transmittance(hits.range_m[self._hit]), len(met))
+        )
+
+    def between(self, weight: np.ndarray, sides: int) -> csr_matrix:
+        """Irradiance of ``sides`` sides (rows) by radiance of sides (columns), shape ``(E, E)``, by rays of ``weight`` (K,)."""
+        place = self.side[self._hit], self._met
+        return csr_matrix((self._left * weight[self._hit], place), shape=(sides, sides))
 
 
 def irradiance(tracer: Tracer, p: Parameters, effects: Effects) -> np.ndarray | None:
     """Irradiance of elements' sides by surfaces that scattered before, under parameters of groups, in units in which the
-    transmitter gives cos(theta_i) / d1^2 [1/m^2], shape ``(E,)``; None where ``effects`` hold no second scattering."""
+    transmitter gives cos(theta_i) / d1^2 [1/m^2], shape ``(E,)``: as much even light as would be scattered alike; None where
+    ``effects`` hold no second scattering."""
     if effects.scatterings < 2:
         return None
-    most, sides = effects.transmissions, tracer.surface.element_sides
+    most, group, sides = effects.transmissions, tracer.surface.side_group, tracer.surface.element_sides
     light = tracer.kept.get(("interreflection", most), lambda: Interreflection(tracer.of_transmitter, most))
     materials = Materials(p, tracer.slabs, device=tracer.grid.device)
-    share = p.scattered_share[tracer.surface.side_group] / np.pi
+    share = p.scattered_share[group] / np.pi
+    over_even = p.scattered_over_even(group[light.side], light.cosine)
+    between = light.between(over_even, sides)
     tables = [table for name, table in light.lit.items() if name != "ST" or effects.scatter_mirror]
-    got = sum(np.bincount(r.ray, r.powers(materials), minlength=sides) for r in tables)
+    got = sum(np.bincount(light.side[r.ray], r.powers(materials) * over_even[r.ray], sides) for r in tables)
     if effects.mirror_scatter:
-        for onto in (tracer.mirrored(slabs).onto for slabs in {0, most}):
-            got = got + light.between @ (
-                share * np.bincount(onto.ray, onto.powers(materials), minlength=sides)
-            )
+        for mirrored in (tracer.mirrored(slabs) for slabs in {0, most}):
+            side = mirrored.onto.ray
+            power = mirrored.onto.powers(materials) * p.scattered_over_even(group[side], mirrored.cosine)
+            got = got + between @ (share * np.bincount(side, power, minlength=sides))
     first = got
     for _ in range(2, effects.scatterings):
-        got = first + light.between @ (share * got)
+        got = first + between @ (share * got)
     return np.asarray(got)

@@ -514,6 +514,7 @@ class MirroredLight:
         before: what its light meets on the way to the middle of the piece.
         onto: its light on the sides of elements: records whose ray is the side, of irradiance where the transmitter gives
             cos(theta_i) / d1^2 [1/m^2].
+        cosine: of incidence of each of those.
     """
 
     def __init__(self, tracer: Tracer, most: int = 0) -> None:
@@ -560,7 +561,7 @@ class MirroredLight:
         way = s.images(tracer.transmitter)[patch] - centre[piece]
         length = np.linalg.norm(way, axis=1)
         toward = way / np.maximum(length, 1e-12)[:, None]
-        cos_in = np.maximum((toward * normal).sum(axis=1), 0.0)
+        cos_in = self.cosine = np.maximum((toward * normal).sum(axis=1), 0.0)
         behind = s.is_behind(middle[piece], -normal).astype(int)
         ray = s.tile_side[tile[piece] + behind * len(tiles.face)]
         share = area[behind, piece] / np.maximum(np.bincount(s.tile_side, open_m2.ravel())[ray], 1e-12)

@@ -269,11 +269,10 @@ def test_the_beam_keeps_power_and_its_adjoint_is_one():
     beam = BeamOperator(SHAPE, SIGMA)
     rng = np.random.default_rng(1)
     x, y = rng.random((*SHAPE, 2)), rng.random((*SHAPE, 2))
-    whole, back = beam(x), beam.adjoint(y)
+    whole = beam(x)
     assert whole.sum() == pytest.approx(x.sum(), rel=1e-9)
-    assert (whole * y).sum() == pytest.approx((x * beam.adjoint(y.astype(np.float32))).sum(), rel=1e-5)
+    assert (whole * y).sum() == pytest.approx((x * beam.adjoint(y)).sum(), rel=1e-6)
     assert 0 < np.abs(beam(x, quick=True) - whole).max() < 3e-6 * whole.max()
-    assert np.abs(beam.adjoint(y, quick=True) - back).max() < 3e-6 * back.max()
 
 
 def test_element_at_the_transmitter_is_bounded(field):

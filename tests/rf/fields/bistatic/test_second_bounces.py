@@ -216,7 +216,8 @@ def test_light_reaches_what_is_open_and_from_there_elements_are_lit():
     partly = [side for side in hidden if 0.0 < open_share[side] < 0.9]
     assert len(partly) > 4
     # Whatever surrounds it sends the same: each place gets all of it.
-    even = Interreflection(tracer, 0).between @ np.ones(surface.element_sides)
+    light, sides = Interreflection(tracer, 0), surface.element_sides
+    even = light.between(np.ones(len(light.side)), sides) @ np.ones(sides)
     np.testing.assert_allclose(even[open_share > 0], np.pi, rtol=1e-6)
 
 
@@ -250,3 +251,23 @@ def test_no_light_gets_behind_a_wall_of_metal_wherever_it_stands():
             behind, before = (field.spectra(places).path_gain.sum() for places in (sealed, lit))
             assert behind < 1e-5 * before
             assert before > 1e-7
+
+
+@pytest.mark.parametrize("reciprocal", [False, True])
+def test_what_groups_scatter_at_an_angle_is_told_from_what_they_do_of_even_light(reciprocal):
+    """By quadrature of a Lambertian surface's |Gamma|^2, of reciprocal lobes the mean of that at both angles."""
+    node, weight = np.polynomial.legendre.leggauss(64)
+    cosine, weight = 0.5 * (node + 1.0), 0.5 * weight
+    p = replace(Parameters.prior(2, (0,), reciprocal=reciprocal), log_excess=np.log([2.0, 200.0]))
+    for group, eta in enumerate((3.0, 201.0)):
+        root = np.sqrt(eta - 1.0 + cosine**2)
+        te, tm = (cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root)
+        reflected = np.tile(0.5 * (te**2 + tm**2), (64, 1))  # at cosines of incidence, the columns
+        if reciprocal:
+            reflected = 0.5 * (reflected + reflected.T)
+        scattered = 2.0 * (cosine * weight) @ reflected
+        even = 2.0 * (cosine * weight) @ scattered
+        found = p.scattered_over_even(np.full(64, group), cosine)
+        np.testing.assert_allclose(found, scattered / even, rtol=0.06)  # of a table in steps of 1 / 256
+        assert 2.0 * (cosine * weight) @ found == pytest.approx(1.0, rel=2e-3)
+        np.testing.assert_allclose(0.5 * even, p.scattered_share[group], rtol=2e-3)

@@ -131,7 +131,7 @@ class SpectrumPixels(ByPixels):
         if self.pixels is not None:
             image = np.zeros((int(np.prod(self.beam.shape)), readings.shape[1]), np.float32)
             image[self.pixels] = readings
-        return self.beam.adjoint(image.reshape(*self.beam.shape, -1), quick=True).reshape(image.shape)
+        return self.beam.adjoint(image.reshape(*self.beam.shape, -1)).reshape(image.shape)
 
     def of_paths(self, view: View) -> np.ndarray:
         """Each path's beam."""
