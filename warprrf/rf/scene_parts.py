@@ -54,9 +54,7 @@ class MaterialChoice:
         TypeError, ValueError, FileNotFoundError: if ``given`` is no such mapping or file.
     """
 
-    def __init__(
-        self, given: Materials | None, beside: Path | None = None, extrapolate: bool = False
-    ) -> None:
+    def __init__(self, given: Materials | None, beside: Path | None, extrapolate: bool) -> None:
         self._beside = beside
         self._given: dict[str, Material] = {}
         self._wanted: set[str] = set()
