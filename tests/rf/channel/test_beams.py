@@ -110,6 +110,8 @@ def test_spectrum_is_taken_as_powers_at_its_pixels():
     best = np.abs(wr.channel.dft_codebook(rx).amplitude(along[None])[:, 0]).argmax()
     assert chosen.rx[0] == best
     two = wr.Spectrum.stack([spectrum, dataclasses.replace(spectrum, path_gain=gain[::-1], aod=aod[::-1])])
+    with pytest.raises(ValueError, match="spectra: got aod of shapes"):
+        wr.Spectrum.stack([spectrum, dataclasses.replace(spectrum, aod=None)])
     together = wr.channel.select_beams(two, tx, rx, count=3)
     for k, row in enumerate(together.gain):
         np.testing.assert_array_equal(row, wr.channel.select_beams(two[k], tx, rx, count=3).gain)

@@ -98,6 +98,10 @@ def test_numbers_on_a_grid_are_interpolated_across_seam_and_poles():
     closed = np.append(azimuth, azimuth[0] + 2 * np.pi)  # the last repeats the first
     repeated = Antenna.from_grid(zenith, closed, np.concatenate([gain, gain[:, :1]], axis=1))
     np.testing.assert_allclose(repeated.gain(d), Antenna.from_grid(zenith, azimuth, gain).gain(d), rtol=1e-12)
+    samples = np.concatenate([gain, gain[:, :1]], axis=1)
+    own = Antenna.from_grid(zenith, closed, samples)
+    samples[:] = 0.0  # the caller's array, used again
+    np.testing.assert_allclose(own.gain(d), repeated.gain(d), rtol=1e-12)
     # A magnitude with a polarisation is a field of that slant.
     slanted = Antenna.from_grid(zenith, azimuth, gain, polarisation="cross").field(at)
     np.testing.assert_allclose(

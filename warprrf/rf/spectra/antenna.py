@@ -424,7 +424,8 @@ class _OffBoresight:
 
 
 def _gridded(zenith: np.ndarray, azimuth: np.ndarray, values: np.ndarray) -> Shape:
-    """Values ``(T, P)``, or ``(T, P, 2)``, between zeniths (T,) and azimuths (P,), all the way round."""
+    """Values ``(T, P)``, or ``(T, P, 2)``, between zeniths (T,) and azimuths (P,), all the way round; copies."""
+    zenith, azimuth, values = zenith.copy(), azimuth.copy(), values.copy()
     if azimuth[-1] - azimuth[0] < 2.0 * np.pi - 1e-6:
         azimuth = np.append(azimuth, azimuth[0] + 2.0 * np.pi)
         values = np.concatenate([values, values[:, :1]], axis=1)

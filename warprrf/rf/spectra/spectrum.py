@@ -473,10 +473,14 @@ class Spectrum:
         """Spectra of several receivers as one; floor and range are those of the first.
 
         Raises:
-            TypeError, ValueError: for none, or what are no spectra.
+            TypeError, ValueError: for none, for what are no spectra, or not of one shape, and where only some have delays, say.
         """
         each, several = check_items("spectra", spectra, Spectrum, 1), dict[str, Any]()
         for name, first in each[0]._arrays().items():
+            if len(shapes := {np.shape(getattr(one, name)) for one in each}) > 1:
+                raise ValueError(
+                    f"spectra: got {name} of shapes {shapes}, expected one; () where there is none"
+                )
             several[name] = None if first is None else np.stack([getattr(one, name) for one in each])
         several["attributes"] = {n: [one.attributes.get(n) for one in each] for n in each[0].attributes}
         return replace(each[0], **several)
