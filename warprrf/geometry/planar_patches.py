@@ -23,7 +23,7 @@ from warprrf.geometry.edges import Edges, mesh_edges
 from warprrf.geometry.mesh import Mesh, boxes_of, components, vectors_across
 from warprrf.kernels.rays.mesh import OverlapFaces, find_overlaps
 from warprrf.kernels.rays.patches import PatchFaces, lie_in_patches
-from warprrf.rows import sums_of
+from warprrf.rows import spans, sums_of
 
 FLAT_M = 1e-5
 """Corners may lie this far from their patch's plane [m], and six standard deviations of vertices' errors more."""
@@ -379,11 +379,9 @@ def _joined(faces: _Faces, piece: np.ndarray, pairs: np.ndarray) -> np.ndarray |
     small, big = small[fits], big[fits]
     order = np.argsort(piece, kind="stable")
     ends = np.searchsorted(piece[order], np.arange(len(area) + 1))
-    count = np.diff(ends)[small]
-    row = np.repeat(np.arange(len(small)), count)
-    face = order[np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count) + ends[small][row]]
+    row, place = spans(ends[small], np.diff(ends)[small])
     gap = np.zeros(len(small))
-    np.maximum.at(gap, row, faces.gap(face, normal[big][row], offset[big][row]))
+    np.maximum.at(gap, row, faces.gap(order[place], normal[big][row], offset[big][row]))
     fits = gap <= faces.distance_m
     small, big = small[fits], big[fits]
     if len(small) == 0:

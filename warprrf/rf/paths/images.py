@@ -27,7 +27,7 @@ from warprrf.kernels.radio import mirrors as kernels
 from warprrf.kernels.radio.edges import find_over_edges
 from warprrf.kernels.radio.mirrors import IN_PLANE
 from warprrf.rf.paths.ways import Ways, stops_of
-from warprrf.rows import Rows
+from warprrf.rows import Rows, spans
 
 MOST_KEPT = 4_000_000  # pairs of a chain and a patch to try up to which all chains are found once and kept
 BLOCK = 500_000  # chains that are unfolded at once
@@ -332,10 +332,9 @@ class EdgeLeaves:
     def __init__(self, edges: Edges, where: wp.Device) -> None:
         longest_m = 20.0  # longer edges are cut, so that balls around neighbours stay small
         count = np.maximum(1, np.ceil(edges.length / longest_m)).astype(int)
-        edge = np.repeat(np.arange(len(edges)), count)
+        edge, place = spans(0 * count, count)
         piece = edges.length[edge] / count[edge]
-        start = (np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)) * piece
-        start = edges.start[edge] + start[:, None] * edges.along[edge]
+        start = edges.start[edge] + (place * piece)[:, None] * edges.along[edge]
         middle = start + 0.5 * piece[:, None] * edges.along[edge]
         order = _along_curve(middle)
         self.edge, start, piece, middle = edge[order], start[order], piece[order], middle[order]

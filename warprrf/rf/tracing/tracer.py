@@ -36,6 +36,7 @@ from warprrf.rf.tracing.model import Effects
 from warprrf.rf.tracing.rays import NEAREST_M, Hits, RayGrid, quasi_random
 from warprrf.rf.tracing.records import Interactions, Records
 from warprrf.rf.tracing.surface import Surface
+from warprrf.rows import spans
 
 MIRROR_SLACK_M = 0.1
 """How far beside its faces a patch may still mirror [m]: outlines of a reconstructed mesh are torn."""
@@ -571,7 +572,4 @@ class MirroredLight:
     def pairs(self, tile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows of ``tile`` (N,), and images that light them, one for each pair."""
         piece = self._piece[tile]
-        first, end = self._first[piece], self._first[piece + 1]
-        count = end - first
-        within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-        return np.repeat(np.arange(len(piece)), count), np.repeat(first, count) + within
+        return spans(self._first[piece], np.diff(self._first)[piece])
