@@ -20,7 +20,7 @@ from warprrf.cache import Cache, cached_property
 from warprrf.checks import check_similarity, warn
 from warprrf.device import filled, launch, resolve
 from warprrf.geometry.edges import Edges, mesh_edges
-from warprrf.geometry.mesh import Mesh, boxes_of, components, vectors_across
+from warprrf.geometry.mesh import Mesh, boxes_of, components, headings, vectors_across
 from warprrf.kernels.rays.mesh import OverlapFaces, find_overlaps
 from warprrf.kernels.rays.patches import PatchFaces, lie_in_patches
 from warprrf.rows import spans, sums_of
@@ -444,8 +444,7 @@ def _fit(mesh: Mesh, own: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.nda
         )
         det = np.maximum(aa * bb - ab**2, 1e-300)
         slope = np.stack([(bb * ar - ab * br) / det, (aa * br - ab * ar) / det], axis=1)
-        normal = normal - np.einsum("pi,pij->pj", slope, frame[:, :2])
-        normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        normal = headings(normal - np.einsum("pi,pij->pj", slope, frame[:, :2]))[0]
     return normal, np.einsum("pi,pi->p", normal, middle)
 
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from warprrf.checks import LARGEST_M, Shaped, check_count, check_similarity, checked, one_line
-from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.mesh import Mesh, headings
 from warprrf.geometry.ply_files import read_ply, write_ply
 from warprrf.kernels.raster import sh as _sh
 from warprrf.kernels.raster.sh import COEFFICIENTS
@@ -192,8 +192,7 @@ def _turned_harmonics(rotation: np.ndarray, count: int) -> np.ndarray:
     A turned harmonic is a sum of those of its degree, so values at more directions than harmonics fix the sum.
     """
     kernels = _sh.build(wp.float64)
-    directions = np.random.default_rng(0).standard_normal((4 * count, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = headings(np.random.default_rng(0).standard_normal((4 * count, 3)))[0]
     before, after = (
         np.array([[float(v) for v in kernels.basis(wp.vec3d(*d))][:count] for d in turned])
         for turned in (directions, directions @ rotation.T)

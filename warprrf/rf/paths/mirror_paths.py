@@ -268,9 +268,7 @@ class ZoneRays:
 
     def _past(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Points so far behind b, seen from a, that a ray to them misses nothing at b, where no surface is, shape ``(N, 3)``."""
-        way = b - a
-        length = np.linalg.norm(way, axis=1, keepdims=True)
-        return np.asarray(b + 2.0 * self.position_error_m / np.maximum(length, 1e-12) * way)
+        return np.asarray(b + 2.0 * self.position_error_m * headings(b - a)[0])
 
     def _mirror_share(self, ways: Ways, beside: Walls | None) -> np.ndarray:
         """That of mirror paths; a zone cuts a patch's plane in an ellipse, longer by 1 / cos."""
