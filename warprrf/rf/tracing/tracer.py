@@ -23,6 +23,7 @@ import numpy as np
 
 from warprrf.cache import Cache, making
 from warprrf.device import DeviceLike, Progress, resolve
+from warprrf.geometry.mesh import headings
 from warprrf.kernels.radio.records import MIRROR, SCATTER, SLAB, SOURCE
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -329,10 +330,10 @@ class Tracer:
     def lit(self, rays: Rays, most: int) -> dict[str, Records]:
         """What rays see of surfaces that the transmitter lights, ``"S"``, and, if ``most`` is not 0, through slabs, up to that
         many, ``"TS"``."""
-        light = self.grid.light(rays.hits, self.transmitter)
-        found = {"S": self.scattered(rays, light.lit, light.strength[light.lit], light.angle[light.lit])}
+        light, lit = self.grid.light(rays.hits, self.transmitter)
+        found = {"S": self.scattered(rays, lit, light.strength[lit], light.angle[lit])}
         if most:
-            row = np.setdiff1d(np.flatnonzero(light.strength > 0), light.lit)
+            row = np.setdiff1d(np.flatnonzero(light.strength > 0), lit)
             arrived, slabs = self.walls(most).between(self.transmitter, light.point[row])
             own = np.flatnonzero(slabs.count > 0)
             row, slabs = row[arrived[own]], slabs.take(own)
@@ -363,8 +364,7 @@ class Tracer:
         k = np.flatnonzero(light.strength > 0)
         strength = light.strength[k] * self.grid.dtype.type(times)
         if before is None:
-            way = images[patch[k]] - light.point[k]
-            way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
+            way = headings(images[patch[k]] - light.point[k])[0]
             cosine = np.abs(np.einsum("ni,ni->n", way, s.plane_normal[patch[k]]))
             mirrors = Interactions.of_mirrors(s.patch_group[patch[k]], cosine)
         else:
@@ -559,9 +559,7 @@ class MirroredLight:
         paths = tracer.specular(described(ways, 1, walls))
         self.before, self.patch = paths, patch
         self._first = np.searchsorted(piece, np.arange(len(middle) + 1))
-        way = s.images(tracer.transmitter)[patch] - centre[piece]
-        length = np.linalg.norm(way, axis=1)
-        toward = way / np.maximum(length, 1e-12)[:, None]
+        toward, length = headings(s.images(tracer.transmitter)[patch] - centre[piece])
         cos_in = self.cosine = np.maximum((toward * normal).sum(axis=1), 0.0)
         behind = s.is_behind(middle[piece], -normal).astype(int)
         ray = s.tile_side[tile[piece] + behind * len(tiles.face)]
