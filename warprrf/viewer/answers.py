@@ -165,7 +165,7 @@ def strongest(found: Sequence[Paths], count: int) -> list[tuple[Paths, int]]:
 def described(paths: Paths, index: int) -> tuple[str, str, str, str, str]:
     """One path in words: kind, gain, delay, zenith and azimuth of arrival, and of departure."""
     degrees = [float(np.rad2deg(getattr(paths, n)[index])) for n in ("theta_r", "phi_r", "theta_t", "phi_t")]
-    gain = 10.0 * np.log10(max(float(paths.power[index]), 1e-300))
+    gain = float(to_db(paths.power[index], 1e-300))
     return (
         str(paths.kind[index]), f"{gain:.1f} dB", f"{paths.tau[index] * 1e9:.2f} ns",
         f"{degrees[0]:.0f}°, {degrees[1]:.0f}°", f"{degrees[2]:.0f}°, {degrees[3]:.0f}°",
@@ -205,10 +205,8 @@ def reading_errors(field: RadioField, readings: Readings, progress: Progress | N
         steady[rows] = (single**2).sum(axis=1)
         if progress is not None:
             progress("readings", k + 1, len(links))
-    floor = 10.0 * np.log10(np.asarray(readings.floor))
-    predicted = 10.0 * np.log10(np.maximum(power, 1e-300))
-    with np.errstate(divide="ignore"):
-        read = 10.0 * np.log10(readings.power) - fading_db(readings.samples, steady)[0]
+    floor, predicted = to_db(readings.floor), to_db(power)
+    read = to_db(readings.power) - fading_db(readings.samples, steady)[0]
     error = np.maximum(predicted, floor) - np.maximum(read, floor)
     error[np.isnan(readings.power) | (predicted <= floor) & (readings.power <= readings.floor)] = np.nan
     chain = np.asarray(readings.chain)
@@ -226,7 +224,7 @@ def delay_profile(paths: Sequence[Paths], bandwidth_hz: float) -> tuple[np.ndarr
     index = np.round((tau - first) * bandwidth_hz).astype(int)
     inside = index < taps
     total = np.bincount(index[inside], power[inside], minlength=taps)
-    return (first + np.arange(taps) / bandwidth_hz) * 1e9, 10.0 * np.log10(np.maximum(total, 1e-300))
+    return (first + np.arange(taps) / bandwidth_hz) * 1e9, to_db(total, 1e-300)
 
 
 def best_beam(paths: Sequence[Paths], size: int, azimuth_rad: float) -> tuple[float, np.ndarray, np.ndarray]:
