@@ -150,15 +150,6 @@ def check_chosen(name: str, value: ArrayLike, count: int, least: int = 0) -> np.
     return chosen.astype(np.int64)
 
 
-def check_seed(seed: object) -> int:
-    """``seed`` as a whole number of at least 0.
-
-    Raises:
-        ValueError: otherwise.
-    """
-    return check_count("seed", seed, 0, 2**63 - 1)
-
-
 def check_number(name: str, value: object, least: float = -np.inf, most: float = np.inf) -> float:
     """``value`` as a finite number from ``least`` to ``most``.
 
@@ -493,14 +484,22 @@ def _converter(kind: Any, name: str) -> Callable[[Any], object]:
     origin, inside = typing.get_origin(kind) or kind, typing.get_args(kind)
     if origin is Annotated:
         checks = tuple(one for one in inside[1:] if not isinstance(one, Shaped))
-        return functools.partial(_as_allowed, name, _converter(inside[0], name), checks)
+        convert = _converter(inside[0], name)
+
+        def as_allowed(value: object) -> object:
+            found = convert(value)
+            for check in checks:
+                found = found if found is _OTHER else check(name, found)
+            return found
+
+        return as_allowed
     if origin in (typing.Union, types.UnionType):
         if bytes in inside:  # ArrayLike, whose numbers are arrays too
             inside = tuple(one for one in inside if one not in _NUMBERS and one not in (bool, str, bytes))
         # What need not become an array comes before what must, None, which is rarely given, last.
         order = sorted(inside, key=lambda one: (one is types.NoneType, _is_of_numpy(one)))
         every = [_converter(one, name) for one in order]
-        return functools.partial(_as_one_of, every)
+        return lambda value: next((found for one in every if (found := one(value)) is not _OTHER), _OTHER)
     if kind is bool:
         return _as_bool
     if kind in _NUMBERS:
@@ -518,22 +517,6 @@ def _converter(kind: Any, name: str) -> Callable[[Any], object]:
         known = getattr(origin, "_is_runtime_protocol", False)
         return lambda value: value if not known or isinstance(value, origin) else _OTHER
     return functools.partial(_as_object, origin)
-
-
-def _as_allowed(
-    name: str, convert: Callable[[Any], object], checks: Sequence[Callable[[str, Any], Any]], value: object
-) -> object:
-    found = convert(value)
-    for check in checks:
-        found = found if found is _OTHER else check(name, found)
-    return found
-
-
-def _as_one_of(every: list[Callable[[Any], object]], value: object) -> object:
-    for convert in every:
-        if (found := convert(value)) is not _OTHER:
-            return found
-    return _OTHER
 
 
 def _is_of_numpy(kind: Any) -> bool:
