@@ -1,4 +1,4 @@
-"""Argument checks that name the argument, what came and what was expected."""
+"""Argument checks that name the argument, what came and what was expected: in a TypeError for another kind, else a ValueError."""
 
 from __future__ import annotations
 
@@ -84,11 +84,7 @@ def check_array(
 
 
 def check_each(name: str, value: ArrayLike, count: int, *shape: int) -> np.ndarray:
-    """``value``, one of ``shape`` for all or one for each of ``count``, as a new array ``(count, *shape)``.
-
-    Raises:
-        TypeError, ValueError: naming the argument.
-    """
+    """``value``, one of ``shape`` for all or one for each of ``count``, as a new array ``(count, *shape)``."""
     found = check_array(name, value)
     if found.shape not in (shape, (count, *shape)):
         raise ValueError(f"{name}: got shape {found.shape}, expected {shape} or {(count, *shape)}")
@@ -109,11 +105,7 @@ def check_alike(**arrays: ArrayLike) -> None:
 
 
 def check_count(name: str, value: object, least: int = 1, most: int = 2**31 - 1) -> int:
-    """``value`` as a whole number from ``least`` to ``most``.
-
-    Raises:
-        ValueError: otherwise, naming the argument.
-    """
+    """``value`` as a whole number from ``least`` to ``most``."""
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not whole or not least <= value <= most:  # type: ignore[operator]
         limit = f"{least} to {most}" if most < 2**31 - 1 else f"at least {least}"
@@ -122,11 +114,7 @@ def check_count(name: str, value: object, least: int = 1, most: int = 2**31 - 1)
 
 
 def check_choice(name: str, value: T, allowed: Iterable[object]) -> T:
-    """``value``, if it is one of those ``allowed``.
-
-    Raises:
-        ValueError: otherwise, naming the argument.
-    """
+    """``value``, if it is one of those ``allowed``."""
     known = tuple(allowed)
     if value not in known:
         raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(map(str, known))}")
@@ -134,11 +122,7 @@ def check_choice(name: str, value: T, allowed: Iterable[object]) -> T:
 
 
 def check_chosen(name: str, value: ArrayLike, count: int, least: int = 0) -> np.ndarray:
-    """Indices, ``least`` or more, of ``count`` rows that ``value`` names by whole numbers or a mask.
-
-    Raises:
-        ValueError: for anything else, naming the argument.
-    """
+    """Indices, ``least`` or more, of ``count`` rows that ``value`` names by whole numbers or a mask."""
     chosen = np.asarray(value)
     if chosen.dtype == bool and chosen.shape == (count,):
         chosen = np.flatnonzero(chosen)
@@ -151,11 +135,7 @@ def check_chosen(name: str, value: ArrayLike, count: int, least: int = 0) -> np.
 
 
 def check_number(name: str, value: object, least: float = -np.inf, most: float = np.inf) -> float:
-    """``value`` as a finite number from ``least`` to ``most``.
-
-    Raises:
-        ValueError: otherwise, naming the argument.
-    """
+    """``value`` as a finite number from ``least`` to ``most``."""
     number = _number(value)
     if not (abs(number) <= LARGEST and least <= number <= most):
         limits = [f"at least {least:g}"] * (least > -np.inf) + [f"at most {most:g}"] * (most < np.inf)
@@ -166,11 +146,7 @@ def check_number(name: str, value: object, least: float = -np.inf, most: float =
 
 
 def check_positive(name: str, value: object, what: str = "number") -> float:
-    """``value`` as a finite number above zero; ``what`` says of what kind it is.
-
-    Raises:
-        ValueError: otherwise, naming the argument.
-    """
+    """``value`` as a finite number above zero; ``what`` says of what kind it is."""
     number = _number(value)
     if not 1 / LARGEST <= number <= LARGEST:
         raise ValueError(f"{name}: got {value!r}, expected a positive {what}")
@@ -184,11 +160,7 @@ def check_type(name: str, value: object, kind: type, hint: str = "") -> None:
 
 
 def check_items(name: str, values: Iterable[T], kind: type, least: int = 0) -> list[T]:
-    """``values`` as a list, each of them a ``kind``.
-
-    Raises:
-        TypeError, ValueError: otherwise, or for less than ``least``, naming the argument and the item.
-    """
+    """``values`` as a list of at least ``least``, each of them a ``kind``."""
     found = list(values)
     if len(found) < least:
         raise ValueError(f"{name}: got {len(found) or 'none'}, expected at least {least}")
@@ -214,9 +186,6 @@ def check_similarity(scale: object, rotation: object, shift: object) -> tuple[fl
         scale: from 1e-6 to 1e6.
         rotation: shape ``(3, 3)``; None for none.
         shift: shape ``(3,)``, each up to 20,000 km [m].
-
-    Raises:
-        TypeError, ValueError: for numbers out of range, or a matrix that is no rotation.
     """
     turn = np.eye(3) if rotation is None else check_array("rotation", rotation, (3, 3))
     if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0:
@@ -273,12 +242,7 @@ class Expected:
 def check_arrays(
     arrays: Mapping[str, np.ndarray], expected: Mapping[str, Expected], **sizes: int
 ) -> dict[str, int]:
-    """The sizes by name, once every array is as ``expected``; ``sizes`` are known beforehand.
-
-    Raises:
-        KeyError: if one is missing.
-        TypeError, ValueError: naming the array, what came and what was expected.
-    """
+    """The sizes by name, once every array is as ``expected``; ``sizes`` are known beforehand."""
     for name, wanted in expected.items():
         array = np.asarray(arrays[name])
         if array.dtype.kind not in wanted.kind:
@@ -471,7 +435,6 @@ _OTHER = object()  # what does not fit its annotation
 
 
 def _described(value: object) -> str:
-    """A value by its type, and as it is written where that is short."""
     if isinstance(value, np.ndarray):
         return f"an array of {value.dtype}"
     written = f" {value!r}" if isinstance(value, (str, bytes, numbers.Number)) else ""

@@ -225,7 +225,6 @@ def filled(struct: Any, device: DeviceLike, **values: Any) -> Any:
 
 
 def _as_taken(value: Any, kind: Any, device: wp.Device) -> Any:
-    """``value`` as an argument of the type ``kind``."""
     if isinstance(value, np.ndarray) and isinstance(kind, wp.array):
         return wp.array(value, dtype=kind.dtype, device=device)
     return value

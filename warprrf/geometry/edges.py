@@ -56,7 +56,6 @@ def mesh_edges(mesh: Mesh, normal: np.ndarray, groups: np.ndarray) -> Edges:
     """The edges of ``mesh``.
 
     Args:
-        mesh: Any triangle mesh.
         normal: Normals that say how faces lie, shape ``(F, 3)``, in place of their own: of the planes that they are part of,
             say. A face whose normal is zero is left out.
         groups: Index of what each face is made of, shape ``(F,)``: edges end where it changes.

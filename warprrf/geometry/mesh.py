@@ -535,9 +535,6 @@ GeometryLike: TypeAlias = Mesh | Geometry
 def as_mesh(mesh_or_scene: GeometryLike, name: str = "mesh_or_scene") -> Mesh:
     """The mesh of a scene, a reconstruction or anything else that has one, or the mesh itself; ``name`` is
     the argument that it came by.
-
-    Raises:
-        TypeError: if it is neither.
     """
     if isinstance(mesh_or_scene, Mesh):
         return mesh_or_scene

@@ -175,11 +175,7 @@ def material_name(name: str | None, textured: bool) -> str | None:
 
 
 def read_picture(data: bytes, what: str) -> np.ndarray:
-    """A picture's pixels, ``(H, W, 3)`` uint8, first row on top.
-
-    Raises:
-        ValueError: naming it by ``what``, if it cannot be read.
-    """
+    """A picture's pixels, ``(H, W, 3)`` uint8, first row on top."""
     pillow = require("PIL.Image", extra="mesh")
     try:
         with pillow.open(io.BytesIO(data)) as picture:

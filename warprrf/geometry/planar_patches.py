@@ -94,7 +94,6 @@ class PlanarPatches:
         """Patches whose planes are known, of a reconstruction, say: its normals point to the side that photos saw.
 
         Args:
-            mesh: The mesh, F faces.
             face_patch: Patch of each face, -1 for none, shape ``(F,)``.
             normal, offset: Planes ``normal . x = offset`` [m], shapes ``(P, 3)`` and ``(P,)``.
             tolerance_m, two_sided: As the attributes.
@@ -197,9 +196,6 @@ def planar_patches(mesh: Mesh, groups: ArrayLike | None = None) -> PlanarPatches
 
     Returns:
         Patches, largest first. Faces with hardly any area that fit no neighbour have none.
-
-    Raises:
-        ValueError: on groups of another shape.
 
     Warns:
         UserWarning: if faces at one place are of different groups: the first is taken.

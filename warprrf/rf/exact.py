@@ -103,7 +103,6 @@ class _Beams:
 
     @property
     def seen(self) -> Rays:
-        """What they hit, by their rows."""
         return Rays(self.hits, np.arange(len(self.ray)))
 
 
@@ -111,16 +110,10 @@ class ExactEngine:
     """Propagation from one transmitter in a scene.
 
     Args:
-        scene: Scene with ``mesh``, ``face_material`` and ``materials``.
-        transmitter: Position [m], shape ``(3,)``.
-        frequency_hz: Carrier frequency [Hz].
-        shape: Rows and columns of the spectrum.
-        beam_sigma_rad: Receiver beam width [rad].
         effects: What is modelled; by default :data:`SINGLE`.
         sub_pixels: Square root of the number of directions per pixel.
         seed: Of the directions in which light is scattered on.
         gas: Absorption of the air: see :meth:`Paths.with_gas`.
-        device: Where rays are cast and beams spread.
     """
 
     def __init__(

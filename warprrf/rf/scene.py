@@ -209,7 +209,6 @@ class Scene:
         return to_sionna_scene(self._parts(), self.transmitters, self.receivers, self.antennas, frequency_hz)
 
     def _parts(self) -> list[ScenePart]:
-        """One part for each object and material."""
         order = np.lexsort((self.face_material, self.face_object))
         key = np.stack([self.face_object[order], self.face_material[order]], axis=1)
         starts = np.flatnonzero(np.r_[True, (np.diff(key, axis=0) != 0).any(axis=1)])

@@ -144,7 +144,6 @@ def _shortest(values: Any) -> np.ndarray:
 
 
 def _read(rt: Any, radio: Any, name: str, frequency: float) -> Material:
-    """Our material of a radio material of Sionna's."""
     if isinstance(radio, rt.AbsorberRadioMaterial):
         return Material.custom(name, relative_permittivity=1.0)
     if not isinstance(radio, rt.RadioMaterial):
@@ -287,7 +286,6 @@ def _sionna_pattern(rt: Any, antenna: Antenna) -> Any:
 
 
 def _radio_material(rt: Any, material: Material, name: str, frequency: float) -> Any:
-    """Sionna's material of ours at this frequency."""
     directive = material.pattern == "directive"
     # Largest exponent of a lobe that Sionna RT can normalise: it divides by 2^alpha_r in single precision
     narrowest_sionna_lobe = 127

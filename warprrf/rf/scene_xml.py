@@ -35,7 +35,6 @@ def read_scene_xml(path: Path, choice: MaterialChoice, *, allow_outside: bool = 
     """The objects of a scene file.
 
     Args:
-        path: the file.
         choice: which material a name stands for.
         allow_outside: read files outside the folder of ``path`` too.
 
@@ -248,7 +247,6 @@ def _text(element: Element, name: str, tag: str = "string") -> str | None:
 
 
 def _value(element: Element, name: str, default: float) -> float:
-    """A number's property ``name``."""
     for tag in ("float", "integer"):
         text = _text(element, name, tag)
         if text is not None:
@@ -298,11 +296,7 @@ def _radio_material(element: Element, label: str) -> Material | None:
 
 
 def to_world(parts: list[Element]) -> np.ndarray:
-    """The matrix of the parts of a ``transform`` element, shape ``(4, 4)``: they apply one after the other, first to last.
-
-    Raises:
-        ValueError: for parts that are unknown or hold no such numbers.
-    """
+    """The matrix of the parts of a ``transform`` element, shape ``(4, 4)``: they apply one after the other, first to last."""
     matrix = np.eye(4)
     for part in parts:
         if part.tag not in _TRANSFORMS:

@@ -91,11 +91,7 @@ def as_asked(source: Source, asked: Asked) -> Source:
 
 
 def answer(source: Source, receiver: np.ndarray, transmitters: Sequence[np.ndarray], asked: Asked) -> Answer:
-    """Ask a field (:func:`as_asked`) for spectrum and paths, or trace the paths of a scene or a mesh that do not scatter.
-
-    Raises:
-        ValueError: for a place that ``source`` does not hold at.
-    """
+    """Ask a field (:func:`as_asked`) for spectrum and paths, or trace the paths of a scene or a mesh that do not scatter."""
     start = time.perf_counter()
     spectra, paths = [], []
     for transmitter in transmitters:

@@ -207,7 +207,6 @@ class Rays:
 
 
 def _table(rows: Sequence[tuple[str, ...]]) -> str:
-    """HTML of paths."""
     head = "".join(
         f"<th>{name}</th>" for name in ("kind", "gain", "delay", "arrives from", "departs towards")
     )

@@ -221,12 +221,7 @@ def discs_on_mesh(mesh: Mesh, count: int = 30_000, *, seed: int = 0) -> Gaussian
     They stand in for a reconstruction where a mesh is known and there are no photos.
 
     Args:
-        mesh: surface to cover.
         count: wanted number; a few per cent fewer come out.
-        seed: of the sampling.
-
-    Raises:
-        ValueError: for a count below 1.
     """
     check_count("count", count)
     rng = np.random.default_rng(seed)

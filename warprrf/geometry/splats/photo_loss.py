@@ -38,7 +38,6 @@ class PhotoLoss:
     """Loss of rendered images.
 
     Args:
-        device: Warp device.
         ssim_share: weight ``s`` of 1 - SSIM.
         real: scalar type of the images.
         panorama: images of one number a pixel that wrap around, not photos.
@@ -100,13 +99,11 @@ class PhotoLoss:
         return room.score, room.gradient
 
     def _numbers(self, shape: tuple[int, ...]) -> int:
-        """Numbers in a row of a plane."""
         return self.channels * shape[-1] + 2 * self.wrapped
 
     def _launch(
         self, kernel: wp.Kernel, shape: tuple[int, ...], inputs: list[object], *, height: bool = False
     ) -> None:
-        """Launch a kernel over the blocks of planes."""
         count = self._numbers(shape)
         blocks = kernels.blocks_of(count, self.lanes)
         layout = [*shape[-2:-1][: int(height)], kernels.stride_of(count), blocks]

@@ -255,9 +255,6 @@ def random_turns(paths: PathArrays, seed: int) -> np.ndarray:
     is, not on its place in a list, on others in it, or on which receivers are asked together.
 
     Source: the mixing function of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014).
-
-    Raises:
-        ValueError: for a seed that is not a whole number of at least 0.
     """
     state = np.full(len(paths.gain), check_count("seed", seed, 0, 2**63 - 1), dtype=np.uint64)
     place = np.zeros(3) if paths.receiver is None else paths.receiver

@@ -271,11 +271,7 @@ def is_name_alone(material: object) -> bool:
 
 
 def check_known(materials: Iterable[Material]) -> None:
-    """Refuse materials that are names alone.
-
-    Raises:
-        ValueError: naming them all.
-    """
+    """Refuse materials that are names alone."""
     unknown = sorted({material.name for material in materials if is_name_alone(material)})
     if unknown:
         raise ValueError(

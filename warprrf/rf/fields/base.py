@@ -203,11 +203,7 @@ class RadioField(ABC):
     @classmethod
     @abstractmethod
     def _put_together(cls, tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict[str, Any]:
-        """What :meth:`_taken_apart` took apart, by the names of the attributes.
-
-        Raises:
-            KeyError, TypeError, ValueError: for what is missing or does not fit.
-        """
+        """What :meth:`_taken_apart` took apart, by the names of the attributes."""
 
     @abstractmethod
     def with_gas(self, gas: Gas = True) -> Self:
@@ -613,12 +609,7 @@ Options = TypeVar("Options", bound=Any)
 
 
 def with_settings(options: Options, settings: Mapping[str, Any]) -> Options:
-    """``options`` of a fit, a dataclass, with ``settings`` in place of the attributes that they name.
-
-    Raises:
-        TypeError: for a name that is no option.
-        ValueError: for a value out of range.
-    """
+    """``options`` of a fit, a dataclass, with ``settings`` in place of the attributes that they name."""
     names = [f.name for f in fields(options)]
     if unknown := sorted(set(settings) - set(names)):
         raise TypeError(f"fit: got unknown option {', '.join(unknown)}, expected among {', '.join(names)}")

@@ -158,7 +158,6 @@ def _matrices(paths: Paths, coefficient: np.ndarray, max_paths: int | None) -> d
 
 
 def _end(name: str, identity: int, points: int, active: int) -> dict[str, Any]:
-    """Description of a set of transmitters or receivers."""
     return {
         "name": name,
         "id_orig": identity,

@@ -103,10 +103,8 @@ class EdgeFinder:
 
     Args:
         images: The transmitter and what mirrors.
-        wavelength_m: Wavelength [m].
         table: Radio properties of the patches' groups; None for a bare mesh: fields without polarisation, reflected
             without a sign change.
-        walls: What may be passed, if anything.
         group: Row of ``table`` of each face; it is looked at if there are walls.
     """
 
@@ -127,9 +125,7 @@ class EdgeFinder:
         """All paths to ``receivers`` (R, 3) over one edge and at most ``mirrors`` mirrors, or a slab, by receiver, then by length.
 
         Args:
-            receivers: Positions [m].
             mirrors: Most mirrors on a path, 0 or 1.
-            progress: Called with the stage ``"edges"``.
         """
         nothing = np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2), int)
         parts, waiting = list[EdgePaths](), [nothing]
@@ -235,7 +231,6 @@ class EdgeFinder:
         return replace(ways, slab=face, thickness_m=thickness, stop=stop)
 
     def _unobstructed(self, ways: _EdgeWays) -> np.ndarray:
-        """Whether both legs are free."""
         beside = self._beside(ways)
         found = np.ones(len(ways.edge), bool)
         for j in range(2):

@@ -63,14 +63,8 @@ class MirrorImages:
     """Images of one transmitter in the patches of a mesh, to any order.
 
     Args:
-        patches: What mirrors.
-        transmitter: Position [m], shape ``(3,)``.
         slack_m: Boxes of patches are widened by it [m]: their tolerance by default.
         max_chains: Searches that would try more chains are refused.
-        device: Where chains are tried.
-
-    Raises:
-        ValueError: if ``max_chains`` is not positive.
 
     Warns:
         UserWarning: of smooth surfaces that were cut into flat mirrors.
@@ -108,11 +102,6 @@ class MirrorImages:
 
         Args:
             points: Where the chains end [m], shape ``(N, 3)``.
-            order: Most reflections.
-            progress: Called with the stage ``"mirrors"``.
-
-        Raises:
-            ValueError: before anything is traced, if more than ``max_chains`` chains would be tried.
         """
         work, seconds = self._work(points, order)
         if sum(work) > self.max_chains:
@@ -322,12 +311,7 @@ class _Ends:
 
 
 class EdgeLeaves:
-    """Edges in pieces, in leaves of 32 neighbours with a ball around each.
-
-    Args:
-        edges: Which edges.
-        where: Where ways over them are sought.
-    """
+    """Edges in pieces, in leaves of 32 neighbours with a ball around each."""
 
     def __init__(self, edges: Edges, where: wp.Device) -> None:
         longest_m = 20.0  # longer edges are cut, so that balls around neighbours stay small

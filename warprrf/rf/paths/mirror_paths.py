@@ -127,9 +127,6 @@ def exact_paths(
 
     A mirror point lies in its patch's faces. Paths through one place on two patches (faces that overlap, or the seam
     between them) count once.
-
-    Raises:
-        ValueError: before anything is traced, if more chains would be tried than ``images`` allow.
     """
     patches, parts = images.patches, list[MirrorPaths]()
     for k, ways in enumerate(images.search(receivers, order, progress)):
@@ -165,17 +162,9 @@ def zone_paths(
     Args:
         images: Its boxes say how far beside its faces a patch may still mirror, the tolerance of its patches what the position
             error of the surface is: zones are wider, and rays end that much before it [m].
-        receivers: Positions [m].
-        order: Most reflections.
-        wavelength_m: Wavelength [m].
-        progress: Called with the stage ``"mirrors"``.
-        walls: What may be passed.
 
     Returns:
         Rows by order. Those with less than a twentieth of their field, -26 dB, are left out.
-
-    Raises:
-        ValueError: before anything is traced, if more chains would be tried than ``images`` allow.
     """
     zone, parts = ZoneRays(images, wavelength_m), list[MirrorPaths]()
 

@@ -267,7 +267,6 @@ class MirrorTracer:
         return self._held(self.find(points, mirror_order, progress), points)
 
     def _over(self, found: EdgePaths, k: int, point: np.ndarray) -> Paths:
-        """The paths over edges of receiver ``k``, at ``point``."""
         own = found.take(np.flatnonzero(found.receiver == k))
         jones = (self.wavelength_m / (4.0 * np.pi * own.length_m))[:, None, None] * own.matrix
         kind = np.full(len(own), "edge", "<U7")
@@ -279,12 +278,7 @@ class MirrorTracer:
     def find(
         self, receivers: ArrayLike, mirror_order: int = 1, progress: Progress | None = None
     ) -> MirrorPaths:
-        """Geometry of all paths to ``receivers`` (R, 3), sorted by receiver.
-
-        Raises:
-            ValueError: on another order or shape, NaN, a receiver at the transmitter's place, or a search that would
-                try too many chains.
-        """
+        """Geometry of all paths to ``receivers`` (R, 3), sorted by receiver."""
         order = check_count("mirror_order", mirror_order, 0)
         points = check_array("receivers", receivers, (None, 3))
         if (points == self.transmitter).all(axis=1).any():

@@ -135,6 +135,5 @@ def _cut(key: str, rest: list[str], lines: list[str], line: int) -> np.ndarray:
 
 
 def _rising(angle: np.ndarray, loss: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each angle once, rising, with its first loss."""
     once, first = np.unique(angle, return_index=True)
     return once, loss[first]

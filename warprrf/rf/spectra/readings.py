@@ -340,11 +340,7 @@ def _check_once(names: Sequence[str]) -> None:
 
 
 def _read_csv(file: Path) -> dict[str, np.ndarray]:
-    """Columns of a CSV file by name: numbers, and text where they are not known.
-
-    Raises:
-        ValueError: naming line and column.
-    """
+    """Columns of a CSV file by name: numbers, and text where they are not known."""
     with file.open(newline="", encoding="utf-8-sig") as text:
         rows = csv.reader(text, skipinitialspace=True, strict=True)
         header = [name.strip() or f"(column {k} without a name)" for k, name in enumerate(next(rows, []), 1)]
@@ -434,11 +430,7 @@ def path_weights(
 
 
 def check_turned(name: str, value: ArrayLike, count: int) -> np.ndarray:
-    """Zeniths and azimuths (count, 2) [rad] that antennas are turned to.
-
-    Raises:
-        ValueError: for another shape, or zeniths that are none.
-    """
+    """Zeniths and azimuths (count, 2) [rad] that antennas are turned to."""
     angles = check_array(name, value, (count, 2))
     wrong = angles[np.abs(angles[:, 0] - np.pi / 2) > np.pi / 2 + 1e-6, 0]
     if len(wrong):

@@ -95,9 +95,6 @@ class Cells:
         squares: number of each row's squares, shape ``(R,)``.
         cell: of each square, shape ``(T,)`` int32.
         element: of each cell, shape ``(X,)`` int32.
-
-    Raises:
-        TypeError, ValueError: for arrays that do not fit each other, or values out of range.
     """
 
     axis: np.ndarray
@@ -198,12 +195,10 @@ class Cells:
 
     @cached_property
     def _row(self) -> np.ndarray:
-        """First row of each face."""
         return np.cumsum(self.rows, dtype=np.int64) - self.rows
 
     @cached_property
     def _square(self) -> np.ndarray:
-        """First square of each row."""
         return np.cumsum(self.squares, dtype=np.int64) - self.squares
 
 

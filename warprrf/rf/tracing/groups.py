@@ -69,7 +69,6 @@ def colour_groups(
     than luminance, which is also shade.
 
     Args:
-        mesh: F faces.
         patch: planar patch of each, -1 for none, shape ``(F,)``.
         colours: on its faces.
 
@@ -200,7 +199,6 @@ def shape_groups(mesh: Mesh, patch: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     """Groups of faces by planar patch and connected part.
 
     Args:
-        mesh: F faces.
         patch: planar patch of each, -1 for none, shape ``(F,)``.
 
     Returns:

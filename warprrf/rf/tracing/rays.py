@@ -93,12 +93,9 @@ class RayGrid:
     """Rays that fill the sphere around a receiver, and other rays, on one surface.
 
     Args:
-        surface: what is hit.
-        shape: rows and columns of a spectrum.
         sub_pixels: square root of the rays per pixel.
         loss_per_m: absorption by the air [neper/m].
         dtype: precision of angles and of light.
-        device: where rays are cast.
     """
 
     def __init__(

@@ -166,10 +166,6 @@ class Tracer:
     """Geometry under one transmitter.
 
     Args:
-        surface: what is hit.
-        transmitter: position (3,) [m].
-        frequency_hz: carrier.
-        grid: rays of a receiver.
         walls: what may be passed, where that is known; else the surface tells.
 
     Attributes:
@@ -507,7 +503,6 @@ class MirroredLight:
     is what faces one of six ways of a cell.
 
     Args:
-        tracer: of the transmitter.
         most: if not 0, the images are those whose light comes through some slabs, before or behind the mirror, up to that many.
 
     Attributes:

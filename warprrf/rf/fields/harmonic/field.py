@@ -247,7 +247,6 @@ class HarmonicField(RadioField):
         }
 
     def _on_device(self) -> Parameters:
-        """The Gaussians where they are rendered, uploaded once."""
         return self._uploaded.get("gaussians", lambda: Rasterizer(device=self.device).upload(self.gaussians))
 
     def _bounces(self, seen: Transport, transmitter: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
