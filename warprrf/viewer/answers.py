@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from warprrf.device import Progress
+from warprrf.device import Progress, with_progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.beams import dft_codebook
@@ -193,14 +193,12 @@ def reading_errors(field: RadioField, readings: Readings, progress: Progress | N
     field, (power, steady) = field.with_gas(readings.air), np.empty((2, len(readings)))
     ends = np.column_stack([readings.transmitters, readings.receivers])
     links, own = np.unique(ends, axis=0, return_inverse=True)
-    for k, link in enumerate(links):
+    for k, link in enumerate(with_progress(links, "readings", progress)):
         rows, paths = np.flatnonzero(own.reshape(-1) == k), field.paths(link[3:], link[:3])
         weight = path_weights(readings, rows, paths.arrival, paths.departure, paths.tau) * paths.power
         power[rows] = weight.sum(axis=1)
         single = weight[:, paths.kind != "diffuse"] / np.maximum(power[rows], 1e-300)[:, None]
         steady[rows] = (single**2).sum(axis=1)
-        if progress is not None:
-            progress("readings", k + 1, len(links))
     floor, predicted = to_db(readings.floor), to_db(power)
     read = to_db(readings.power) - fading_db(readings.samples, steady)[0]
     error = np.maximum(predicted, floor) - np.maximum(read, floor)

@@ -13,7 +13,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_count, checked, whole
-from warprrf.device import DeviceLike, Progress
+from warprrf.device import DeviceLike, Progress, silent
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, GeometryLike, as_mesh
 from warprrf.geometry.planar_patches import planar_patches
 from warprrf.rf.em.absorption import Gas
@@ -91,7 +91,7 @@ def trace_paths(
     ends = Ends.of(receivers, transmitter)
     most = {"transmissions": transmissions, "diffractions": diffractions}
     _check_question(mesh_or_scene, ends, frequency_hz, device, **most)
-    tell: Progress = progress or (lambda stage, done, total: None)
+    tell = progress or silent
     found: dict[int, Paths] = {}
     for source, own in ends.groups():
         tell("patches", 0, 1)

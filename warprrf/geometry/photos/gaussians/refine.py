@@ -17,7 +17,7 @@ import warp as wp
 
 from warprrf import tensor_files
 from warprrf.checks import check_count
-from warprrf.device import DeviceLike, Progress, launch, resolve
+from warprrf.device import DeviceLike, Progress, launch, resolve, silent
 from warprrf.geometry.photos.config import RefineConfig
 from warprrf.geometry.photos.gaussians.densify import (
     PARAMETERS,
@@ -70,7 +70,7 @@ def refine(
         run.restore(Path(checkpoint))
     else:
         run.start(gaussians)
-    report = progress or (lambda stage, done, total: None)
+    report = progress or silent
     report("refine", run.done(), PARTS)
     while run.iteration < config.iterations:
         run.step()
