@@ -62,6 +62,13 @@ def write_atomically(
         partial.unlink(missing_ok=True)
 
 
+def file_at(path: str | os.PathLike[str], what: str = "file") -> Path:
+    """``path``, at which there must be a file; the FileNotFoundError says of ``what`` kind."""
+    if not os.path.isfile(path):
+        raise FileNotFoundError(f"path: there is no {what} {os.fspath(path)}")
+    return Path(path)
+
+
 @contextmanager
 def folder_in_place(folder: Path) -> Iterator[Path]:
     """A new folder to fill, which then takes the place of ``folder``: a kill or an error leaves the earlier one or the new one."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -16,6 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from warprrf.checks import LARGEST_M, Shaped, check_count, check_similarity, checked, one_line
+from warprrf.files import file_at
 from warprrf.geometry.mesh import Mesh, headings
 from warprrf.geometry.ply_files import read_ply, write_ply
 from warprrf.kernels.raster import sh as _sh
@@ -154,9 +154,7 @@ class Gaussians:
             FileNotFoundError: if there is no such file.
             ValueError: if it is no PLY, is cut short, or lacks a property of the layout.
         """
-        if not Path(path).is_file():
-            raise FileNotFoundError(f"path: there is no file {os.fspath(path)!r}")
-        table = read_ply(path).get("vertex", {})
+        table = read_ply(file_at(path)).get("vertex", {})
 
         def columns(*names: str) -> np.ndarray:
             missing = [name for name in names if not isinstance(table.get(name), np.ndarray)]

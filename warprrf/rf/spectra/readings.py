@@ -31,6 +31,7 @@ from warprrf.checks import (
     warn,
     within,
 )
+from warprrf.files import file_at
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import NEPER, Hertz
 from warprrf.rf.spectra.antenna import Antenna, Pattern, as_antenna, main_lobe, turned_gain
@@ -279,9 +280,7 @@ class Readings(PowerTable):
         Warns:
             UserWarning: as :meth:`from_table`.
         """
-        file = Path(path)
-        if not file.is_file():
-            raise FileNotFoundError(f"path: there is no file {file}")
+        file = file_at(path)
         try:
             return cls.from_table(_read_csv(file), **settings)
         except (TypeError, ValueError, csv.Error) as error:
