@@ -446,7 +446,7 @@ def _fit(mesh: Mesh, own: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _numbered(label: np.ndarray) -> np.ndarray:
     """Labels from 0 without gaps; negative ones stay -1."""
-    number = np.unique(np.maximum(label, -1), return_inverse=True)[1].reshape(-1)
+    number = np.unique(np.maximum(label, -1), return_inverse=True)[1]
     return number - int((label < 0).any())
 
 
