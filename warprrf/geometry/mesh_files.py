@@ -50,14 +50,9 @@ def load_mesh(
     simplify: int | None = None,
     allow_outside: bool = False,
 ) -> MeshContent:
-    """Read a mesh file into metres, z up; vertices at one place become one. Arguments are those of :meth:`Mesh.load`.
+    """Read a mesh file into metres, z up; vertices at one place become one.
 
-    Raises:
-        OSError, ValueError: as :func:`read_mesh`.
-        ImportError: if a package that the format or ``simplify`` needs is not installed.
-
-    Warns:
-        UserWarning: if no unit is given and the mesh is very large or small for one in metres.
+    Arguments, errors and warnings are those of :meth:`Mesh.load`.
     """
     for name, value, known in (("unit", unit, METRES), ("up", up, UP)):
         if value is not None:

@@ -38,12 +38,7 @@ _FOLDERS = (
 def parts_of(rt_scene: Any, choice: MaterialChoice) -> tuple[list[ScenePart], dict[str, Any]]:
     """Objects of a ``sionna.rt.Scene``; and its transmitters, receivers and antennas by the arguments of :class:`Scene`.
 
-    Raises:
-        TypeError: for what is no such scene.
-        ValueError: for a scene without objects, or a material that cannot be read, naming it.
-
-    Warns:
-        UserWarning: of arrays that do not stand in rows and columns.
+    Errors and warnings are those of :meth:`Scene.from_sionna`.
     """
     rt = sionna_rt()
     if not isinstance(rt_scene, rt.Scene):

@@ -32,16 +32,7 @@ Element = ElementTree.Element
 
 
 def read_scene_xml(path: Path, choice: MaterialChoice, *, allow_outside: bool = False) -> list[ScenePart]:
-    """The objects of a scene file.
-
-    Args:
-        choice: which material a name stands for.
-        allow_outside: read files outside the folder of ``path`` too.
-
-    Raises:
-        FileNotFoundError: if a file is missing.
-        ValueError: naming the file and the object, for what cannot be read.
-    """
+    """The objects of a scene file; errors are those of :meth:`Scene.load`."""
     return _SceneFile(path, choice, allow_outside).parts()
 
 
