@@ -203,7 +203,11 @@ class RadioField(ABC):
     @classmethod
     @abstractmethod
     def _put_together(cls, tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict[str, Any]:
-        """What :meth:`_taken_apart` took apart, by the names of the attributes."""
+        """What :meth:`_taken_apart` took apart, by the names of the attributes.
+
+        Raises:
+            KeyError, TypeError, ValueError: for what is missing or does not fit.
+        """
 
     @abstractmethod
     def with_gas(self, gas: Gas = True) -> Self:
