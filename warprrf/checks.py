@@ -1,4 +1,4 @@
-"""Argument checks that name the argument, what came and what was expected."""
+"""Argument checks that name the argument, what came and what was expected: in a TypeError for another kind, else a ValueError."""
 
 from __future__ import annotations
 
@@ -84,11 +84,7 @@ def check_array(
 
 
 def check_each(name: str, value: ArrayLike, count: int, *shape: int) -> np.ndarray:
-    """``value``, one of ``shape`` for all or one for each of ``count``, as a new array ``(count, *shape)``.
-
-    Raises:
-        TypeError, ValueError: naming the argument.
-    """
+    """``value``, one of ``shape`` for all or one for each of ``count``, as a new array ``(count, *shape)``."""
     found = check_array(name, value)
     if found.shape not in (shape, (count, *shape)):
         raise ValueError(f"{name}: got shape {found.shape}, expected {shape} or {(count, *shape)}")
@@ -109,11 +105,7 @@ def check_alike(**arrays: ArrayLike) -> None:
 
 
 def check_count(name: str, value: object, least: int = 1, most: int = 2**31 - 1) -> int:
-    """``value`` as a whole number from ``least`` to ``most``.
-
-    Raises:
-        ValueError: otherwise, naming the argument.
-    """
+    """``value`` as a whole number from ``least`` to ``most``."""
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not whole or not least <= value <= most:  # type: ignore[operator]
         limit = f"{least} to {most}" if most < 2**31 - 1 else f"at least {least}"
@@ -122,11 +114,7 @@ def check_count(name: str, value: object, least: int = 1, most: int = 2**31 - 1)
 
 
 def check_choice(name: str, value: T, allowed: Iterable[object]) -> T:
-    """``value``, if it is one of those ``allowed``.
-
-    Raises:
-        ValueError: otherwise, naming the argument.
-    """
+    """``value``, if it is one of those ``allowed``."""
     known = tuple(allowed)
     if value not in known:
         raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(map(str, known))}")
@@ -134,11 +122,7 @@ def check_choice(name: str, value: T, allowed: Iterable[object]) -> T:
 
 
 def check_chosen(name: str, value: ArrayLike, count: int, least: int = 0) -> np.ndarray:
-    """Indices, ``least`` or more, of ``count`` rows that ``value`` names by whole numbers or a mask.
-
-    Raises:
-        ValueError: for anything else, naming the argument.
-    """
+    """Indices, ``least`` or more, of ``count`` rows that ``value`` names by whole numbers or a mask."""
     chosen = np.asarray(value)
     if chosen.dtype == bool and chosen.shape == (count,):
         chosen = np.flatnonzero(chosen)
@@ -150,21 +134,8 @@ def check_chosen(name: str, value: ArrayLike, count: int, least: int = 0) -> np.
     return chosen.astype(np.int64)
 
 
-def check_seed(seed: object) -> int:
-    """``seed`` as a whole number of at least 0.
-
-    Raises:
-        ValueError: otherwise.
-    """
-    return check_count("seed", seed, 0, 2**63 - 1)
-
-
 def check_number(name: str, value: object, least: float = -np.inf, most: float = np.inf) -> float:
-    """``value`` as a finite number from ``least`` to ``most``.
-
-    Raises:
-        ValueError: otherwise, naming the argument.
-    """
+    """``value`` as a finite number from ``least`` to ``most``."""
     number = _number(value)
     if not (abs(number) <= LARGEST and least <= number <= most):
         limits = [f"at least {least:g}"] * (least > -np.inf) + [f"at most {most:g}"] * (most < np.inf)
@@ -175,11 +146,7 @@ def check_number(name: str, value: object, least: float = -np.inf, most: float =
 
 
 def check_positive(name: str, value: object, what: str = "number") -> float:
-    """``value`` as a finite number above zero; ``what`` says of what kind it is.
-
-    Raises:
-        ValueError: otherwise, naming the argument.
-    """
+    """``value`` as a finite number above zero; ``what`` says of what kind it is."""
     number = _number(value)
     if not 1 / LARGEST <= number <= LARGEST:
         raise ValueError(f"{name}: got {value!r}, expected a positive {what}")
@@ -193,11 +160,7 @@ def check_type(name: str, value: object, kind: type, hint: str = "") -> None:
 
 
 def check_items(name: str, values: Iterable[T], kind: type, least: int = 0) -> list[T]:
-    """``values`` as a list, each of them a ``kind``.
-
-    Raises:
-        TypeError, ValueError: otherwise, or for less than ``least``, naming the argument and the item.
-    """
+    """``values`` as a list of at least ``least``, each of them a ``kind``."""
     found = list(values)
     if len(found) < least:
         raise ValueError(f"{name}: got {len(found) or 'none'}, expected at least {least}")
@@ -223,9 +186,6 @@ def check_similarity(scale: object, rotation: object, shift: object) -> tuple[fl
         scale: from 1e-6 to 1e6.
         rotation: shape ``(3, 3)``; None for none.
         shift: shape ``(3,)``, each up to 20,000 km [m].
-
-    Raises:
-        TypeError, ValueError: for numbers out of range, or a matrix that is no rotation.
     """
     turn = np.eye(3) if rotation is None else check_array("rotation", rotation, (3, 3))
     if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0:
@@ -282,12 +242,7 @@ class Expected:
 def check_arrays(
     arrays: Mapping[str, np.ndarray], expected: Mapping[str, Expected], **sizes: int
 ) -> dict[str, int]:
-    """The sizes by name, once every array is as ``expected``; ``sizes`` are known beforehand.
-
-    Raises:
-        KeyError: if one is missing.
-        TypeError, ValueError: naming the array, what came and what was expected.
-    """
+    """The sizes by name, once every array is as ``expected``; ``sizes`` are known beforehand."""
     for name, wanted in expected.items():
         array = np.asarray(arrays[name])
         if array.dtype.kind not in wanted.kind:
@@ -480,7 +435,6 @@ _OTHER = object()  # what does not fit its annotation
 
 
 def _described(value: object) -> str:
-    """A value by its type, and as it is written where that is short."""
     if isinstance(value, np.ndarray):
         return f"an array of {value.dtype}"
     written = f" {value!r}" if isinstance(value, (str, bytes, numbers.Number)) else ""
@@ -493,14 +447,22 @@ def _converter(kind: Any, name: str) -> Callable[[Any], object]:
     origin, inside = typing.get_origin(kind) or kind, typing.get_args(kind)
     if origin is Annotated:
         checks = tuple(one for one in inside[1:] if not isinstance(one, Shaped))
-        return functools.partial(_as_allowed, name, _converter(inside[0], name), checks)
+        convert = _converter(inside[0], name)
+
+        def as_allowed(value: object) -> object:
+            found = convert(value)
+            for check in checks:
+                found = found if found is _OTHER else check(name, found)
+            return found
+
+        return as_allowed
     if origin in (typing.Union, types.UnionType):
         if bytes in inside:  # ArrayLike, whose numbers are arrays too
             inside = tuple(one for one in inside if one not in _NUMBERS and one not in (bool, str, bytes))
         # What need not become an array comes before what must, None, which is rarely given, last.
         order = sorted(inside, key=lambda one: (one is types.NoneType, _is_of_numpy(one)))
         every = [_converter(one, name) for one in order]
-        return functools.partial(_as_one_of, every)
+        return lambda value: next((found for one in every if (found := one(value)) is not _OTHER), _OTHER)
     if kind is bool:
         return _as_bool
     if kind in _NUMBERS:
@@ -518,22 +480,6 @@ def _converter(kind: Any, name: str) -> Callable[[Any], object]:
         known = getattr(origin, "_is_runtime_protocol", False)
         return lambda value: value if not known or isinstance(value, origin) else _OTHER
     return functools.partial(_as_object, origin)
-
-
-def _as_allowed(
-    name: str, convert: Callable[[Any], object], checks: Sequence[Callable[[str, Any], Any]], value: object
-) -> object:
-    found = convert(value)
-    for check in checks:
-        found = found if found is _OTHER else check(name, found)
-    return found
-
-
-def _as_one_of(every: list[Callable[[Any], object]], value: object) -> object:
-    for convert in every:
-        if (found := convert(value)) is not _OTHER:
-            return found
-    return _OTHER
 
 
 def _is_of_numpy(kind: Any) -> bool:

@@ -43,12 +43,15 @@ kept; the last call of a stage has ``done == total``. What shows it makes second
 """
 
 
+def silent(stage: str, done: int, total: int) -> None:
+    """Progress that nobody asked for."""
+
+
 def with_progress(items: Sequence[Any] | np.ndarray, stage: str, progress: Progress | None) -> Iterator[Any]:
     """``items`` one after another; ``progress`` is called once each is done with."""
     for done, item in enumerate(items, 1):
         yield item
-        if progress is not None:
-            progress(stage, done, len(items))
+        (progress or silent)(stage, done, len(items))
 
 
 RECENT_S = 15.0  # the rate is that of so many seconds
@@ -225,7 +228,6 @@ def filled(struct: Any, device: DeviceLike, **values: Any) -> Any:
 
 
 def _as_taken(value: Any, kind: Any, device: wp.Device) -> Any:
-    """``value`` as an argument of the type ``kind``."""
     if isinstance(value, np.ndarray) and isinstance(kind, wp.array):
         return wp.array(value, dtype=kind.dtype, device=device)
     return value

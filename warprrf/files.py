@@ -62,13 +62,16 @@ def write_atomically(
         partial.unlink(missing_ok=True)
 
 
+def file_at(path: str | os.PathLike[str], what: str = "file") -> Path:
+    """``path``, at which there must be a file; the FileNotFoundError says of ``what`` kind."""
+    if not os.path.isfile(path):
+        raise FileNotFoundError(f"path: there is no {what} {os.fspath(path)}")
+    return Path(path)
+
+
 @contextmanager
 def folder_in_place(folder: Path) -> Iterator[Path]:
-    """A new folder to fill, which then takes the place of ``folder``: a kill or an error leaves the earlier one or the new one.
-
-    Raises:
-        OSError: if the system does not take it.
-    """
+    """A new folder to fill, which then takes the place of ``folder``: a kill or an error leaves the earlier one or the new one."""
     part = partial_path(folder)
     # no partial file: the only one, if this is killed just then
     earlier = part.with_name(f"{part.name}.earlier.kept")
@@ -109,9 +112,6 @@ def partial_path(path: str | os.PathLike[str]) -> Path:
     """An unused name for what becomes ``path``: in the same folder, which is made, and of the same suffix.
 
     What dead processes of this machine left half written in the folder is removed.
-
-    Raises:
-        ValueError: for a path without a name.
     """
     target = Path(path)
     if not target.name:
@@ -181,11 +181,7 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 def write_arrays(
     path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], *, compress: bool = True
 ) -> None:
-    """Write ``arrays`` in NumPy's zipped format, whatever the file's suffix.
-
-    Raises:
-        TypeError: for arrays of Python objects.
-    """
+    """Write ``arrays`` in NumPy's zipped format, whatever the file's suffix."""
     for name, array in arrays.items():
         if np.asarray(array).dtype.hasobject:
             raise TypeError(f"{name}: got an array of Python objects, expected numbers or text")

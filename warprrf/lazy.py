@@ -19,7 +19,6 @@ def attach(file: str, about: str) -> tuple[Callable[[str], Any], Callable[[], li
     """``__getattr__``, ``__dir__`` and ``__doc__`` of the package whose ``__init__.py`` is ``file``.
 
     Args:
-        file: the package's ``__file__``.
         about: its docstring, which the table of contents follows.
     """
     homes: dict[str, tuple[str, str]] = {}

@@ -100,12 +100,7 @@ def encoded(fields: Mapping[str, Any], variables: Mapping[str, Variable]) -> dic
 
 
 def decoded(arrays: Mapping[str, np.ndarray], variables: Mapping[str, Variable]) -> dict[str, Any]:
-    """The fields that ``arrays`` of ``variables`` hold, by name.
-
-    Raises:
-        KeyError: for one part of a field without the other.
-        TypeError, ValueError: naming the array, for values that it cannot have.
-    """
+    """The fields that ``arrays`` of ``variables`` hold, by name."""
     limits = {name: it.expected for name, it in variables.items() if name in arrays}
     check_arrays(arrays, {name: expected for name, expected in limits.items() if expected is not None})
     fields = dict[str, Any]()
@@ -195,7 +190,6 @@ class Store:
     not fit are missing. With the last row it is sealed and gets its name. One process at a time works on it.
 
     Args:
-        path: of the file.
         known: arrays that are written at once.
         variables: what these and the rows' are.
         attributes: of the file; ``key`` among them, by which a store is known.
@@ -284,7 +278,6 @@ class Store:
 
     @property
     def _row_names(self) -> list[str]:
-        """Names of the arrays that rows are written of."""
         return sorted(self._places.keys() - {_SUMS})
 
     def _mapped(self, path: Path, name: str) -> np.ndarray:
@@ -475,8 +468,6 @@ def check_heaps(path: str | os.PathLike[str]) -> None:
 
 @dataclass(frozen=True)
 class _Found:
-    """A variable as a file holds it."""
-
     name: str
     dimensions: tuple[str, ...]
     array: np.ndarray
@@ -529,7 +520,6 @@ class _Found:
 
 
 def _plain(value: Any) -> Any:
-    """An attribute as a Python value."""
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.reshape(-1)[0]
     if isinstance(value, np.generic):

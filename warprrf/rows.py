@@ -51,6 +51,13 @@ def couples(rows: np.ndarray) -> np.ndarray:
     return np.argsort(index, kind="stable")[[last - 1, last]]
 
 
+def spans(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``count`` (N,) whole numbers from ``first`` (N,) on, one stretch after another: which stretch each is of, and the
+    numbers."""
+    owner = np.repeat(np.arange(len(count)), count)
+    return owner, np.arange(len(owner)) + (first - np.cumsum(count) + count)[owner]
+
+
 def sums_of(values: np.ndarray, owner: np.ndarray, count: int = 0) -> np.ndarray:
     """Sums of the rows of ``values`` (N, K) that are each owner's, ``owner`` (N,), of at least ``count``: shape ``(C, K)``."""
     return np.stack([np.bincount(owner, column, minlength=count) for column in values.T], axis=1)

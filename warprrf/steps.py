@@ -24,7 +24,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from warprrf.device import Progress
+from warprrf.device import Progress, silent
 from warprrf.files import check_seal, plain, read_arrays, read_json, write_arrays, write_json
 
 _RECORDED = {
@@ -91,7 +91,7 @@ class Steps:
     ) -> None:
         self.folder = Path(folder)
         self._own = self.folder / RECORDS
-        self._fresh, self._progress, self._shared = fresh, progress, shared
+        self._fresh, self._progress, self._shared = fresh, progress or silent, shared
         self._lock: IO[str] | None = None
         self.records: dict[str, dict[str, Any]] = {}
 
@@ -163,8 +163,7 @@ class Steps:
             now = time.monotonic()
             record["stages"][stage] = record["stages"].get(stage, 0.0) + now - last
             last = now
-            if self._progress is not None:
-                self._progress(stage, done, total)
+            self._progress(stage, done, total)
             if now - written > HEARTBEAT_S:
                 written = now
                 write()

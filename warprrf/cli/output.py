@@ -27,11 +27,6 @@ class Output:
     With ``lines`` everything is JSON on standard output, an object a line, distinguished by ``event``: ``progress`` (when a
     stage begins and ends, and each second), ``result`` and ``error``. Otherwise results go there as text, and bars and
     errors to standard error.
-
-    Args:
-        name: of the program, before errors.
-        lines: JSON instead of text.
-        quiet: no progress.
     """
 
     def __init__(self, name: str = "", lines: bool = False, quiet: bool = False) -> None:
@@ -150,7 +145,6 @@ class Output:
 
 
 def _clock(seconds: float | None) -> str:
-    """Minutes and seconds, with hours where there are some."""
     if seconds is None:
         return "?"
     minutes, rest = divmod(round(seconds), 60)

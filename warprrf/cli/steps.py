@@ -354,7 +354,6 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
 
 
 def _option(text: str) -> tuple[str, Any]:
-    """Name and value of an option."""
     name, _, value = text.partition("=")
     return name, (read_effects if name == "effects" else read_json_or_text)(value)
 

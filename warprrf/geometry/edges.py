@@ -56,7 +56,6 @@ def mesh_edges(mesh: Mesh, normal: np.ndarray, groups: np.ndarray) -> Edges:
     """The edges of ``mesh``.
 
     Args:
-        mesh: Any triangle mesh.
         normal: Normals that say how faces lie, shape ``(F, 3)``, in place of their own: of the planes that they are part of,
             say. A face whose normal is zero is left out.
         groups: Index of what each face is made of, shape ``(F,)``: edges end where it changes.
@@ -65,8 +64,7 @@ def mesh_edges(mesh: Mesh, normal: np.ndarray, groups: np.ndarray) -> Edges:
     ends = _split(mesh, sides)
     span = place[ends[:, 1]] - place[ends[:, 0]]
     span *= np.where(span @ _SIDE < 0, -1.0, 1.0)[:, None]
-    length = np.linalg.norm(span, axis=1)
-    along = span / np.maximum(length, 1e-300)[:, None]
+    along, length = headings(span)
     middle = 0.5 * (place[ends[:, 0]] + place[ends[:, 1]])
     piece, inward, n, face = _gaps(mesh, normal, middle, along, length, reach)
     keep = n > 1.0 + LEAST_BEND_RAD / np.pi
@@ -144,8 +142,7 @@ def _depth(mesh: Mesh, face: np.ndarray, point: np.ndarray, toward: np.ndarray) 
     corner, normal = mesh.triangles[face], mesh.face_normals[face]
     depth = np.full(len(face), np.inf)
     for k in range(3):
-        side = np.cross(normal, corner[:, (k + 1) % 3] - corner[:, k])
-        side /= np.linalg.norm(side, axis=1, keepdims=True)
+        side = headings(np.cross(normal, corner[:, (k + 1) % 3] - corner[:, k]))[0]
         left = np.maximum((side * (point - corner[:, k])).sum(axis=1), 0.0)
         pace = -(side * toward).sum(axis=1)
         depth = np.where(pace > 1e-9, np.minimum(depth, left / np.maximum(pace, 1e-9)), depth)
@@ -173,10 +170,7 @@ def _merged(pieces: Edges, ends: np.ndarray, group: np.ndarray, reach: float) ->
     begins = np.flatnonzero(np.diff(label[first], prepend=-1))
     first, last = first[begins], last[begins]
     start = pieces.start[first]
-    span = pieces.start[last] + pieces.length[last, None] * pieces.along[last] - start
-    length = np.linalg.norm(span, axis=1)
-    along = span / np.maximum(length, 1e-300)[:, None]
+    along, length = headings(pieces.start[last] + pieces.length[last, None] * pieces.along[last] - start)
     inward = pieces.inward[longest]
-    inward = inward - (inward * along).sum(axis=1, keepdims=True) * along
-    inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-300)
+    inward = headings(inward - (inward * along).sum(axis=1, keepdims=True) * along)[0]
     return Edges(start, along, length, inward, pieces.n[longest], pieces.face[longest])

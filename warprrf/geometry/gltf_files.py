@@ -97,20 +97,17 @@ class _File:
         self.parts = lru_cache(None)(self._parts)
 
     def file(self, uri: str) -> bytes:
-        """What a URI gives: data in itself, or a file's content."""
         if not uri.startswith("data:"):
             return self.folder.find(unquote(uri)).read_bytes()
         return base64.b64decode(uri.partition("base64,")[2], validate=True)
 
     def row(self, table: str, index: object) -> dict[str, Any]:
-        """One row of a table of the header."""
         rows = self.header.get(table, [])
         if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(rows):
             raise ValueError(f"it names {table} {index!r} of {len(rows)}")
         return dict(rows[index])
 
     def view(self, index: object) -> bytes:
-        """The bytes of a buffer view."""
         row = self.row("bufferViews", index)
         self.row("buffers", row["buffer"])
         data, start = self.buffers[row["buffer"]], row.get("byteOffset", 0)
@@ -179,7 +176,6 @@ class _File:
         return material.name, positions.astype(np.float64), corners, colours
 
     def _picture(self, source: str | int) -> np.ndarray:
-        """The picture of a URI or a buffer view."""
         data = self.file(source) if isinstance(source, str) else self.view(source)
         return read_picture(data, f"texture {source!r:.60}")
 
@@ -225,7 +221,6 @@ class _File:
 
 
 def _split(path: Path) -> tuple[dict[str, Any], bytes | None]:
-    """The header, and the binary chunk of a GLB file."""
     data, binary = path.read_bytes(), None
     if data[:4] == b"glTF":
         version, whole, size, kind = np.frombuffer(data[4:20], "<u4").tolist()
@@ -272,7 +267,6 @@ def _corners(index: np.ndarray, mode: int) -> np.ndarray:
 
 
 def _texture(material: Mapping[str, Any]) -> dict[str, Any]:
-    """The entry of a material's base colour texture; empty without any."""
     return dict(material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {}))
 
 
@@ -288,7 +282,6 @@ def _transform(node: Mapping[str, Any]) -> np.ndarray:
 
 
 def _joined(file: _File) -> MeshContent:
-    """All instances as one mesh."""
     vertices, faces, colours, materials, objects, counts = [], [], [], [], [], []
     start = total = 0
     for name, place, parts in file.instances():

@@ -510,8 +510,7 @@ def _fixed(array: np.ndarray) -> np.ndarray:
 
 def vectors_across(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two unit vectors across each unit direction ``(N, 3)`` and each other."""
-    u = np.cross(direction, np.eye(3)[np.abs(direction).argmin(axis=1)])
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    u = headings(np.cross(direction, np.eye(3)[np.abs(direction).argmin(axis=1)]))[0]
     return u, np.cross(direction, u)
 
 
@@ -536,9 +535,6 @@ GeometryLike: TypeAlias = Mesh | Geometry
 def as_mesh(mesh_or_scene: GeometryLike, name: str = "mesh_or_scene") -> Mesh:
     """The mesh of a scene, a reconstruction or anything else that has one, or the mesh itself; ``name`` is
     the argument that it came by.
-
-    Raises:
-        TypeError: if it is neither.
     """
     if isinstance(mesh_or_scene, Mesh):
         return mesh_or_scene
@@ -552,25 +548,18 @@ def as_mesh(mesh_or_scene: GeometryLike, name: str = "mesh_or_scene") -> Mesh:
 
 def _closest_on_triangles(p: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Nearest point of triangle k to point k: the foot on the plane if inside, else the nearest on its edges."""
-    corners = [triangles[:, k] for k in range(3)]
-    ab, ac, ap = corners[1] - corners[0], corners[2] - corners[0], p - corners[0]
-    gram = [np.einsum("ni,ni->n", x, y) for x, y in ((ab, ab), (ab, ac), (ac, ac), (ap, ab), (ap, ac))]
-    det = gram[0] * gram[2] - gram[1] ** 2
-    safe = np.where(det > 0, det, 1.0)
-    v = (gram[2] * gram[3] - gram[1] * gram[4]) / safe
-    w = (gram[0] * gram[4] - gram[1] * gram[3]) / safe
-    inside = (det > 0) & (v >= 0) & (w >= 0) & (v + w <= 1)
-    best = corners[0] + v[:, None] * ab + w[:, None] * ac
-    best_distance = np.where(inside, np.linalg.norm(best - p, axis=1), np.inf)
-    for k in range(3):
-        start, edge = corners[k], corners[(k + 1) % 3] - corners[k]
-        square = np.einsum("ni,ni->n", edge, edge)
-        along = np.einsum("ni,ni->n", p - start, edge) / np.where(square > 0, square, 1.0)
-        foot = start + along.clip(0.0, 1.0)[:, None] * edge
-        distance = np.linalg.norm(foot - p, axis=1)
-        nearer = distance < best_distance
-        best[nearer], best_distance[nearer] = foot[nearer], distance[nearer]
-    return best
+    edge, off = np.roll(triangles, -1, axis=1) - triangles, p[:, None] - triangles
+    square = (edge**2).sum(axis=2)
+    along = (off * edge).sum(axis=2) / np.where(square > 0, square, 1.0)
+    feet = triangles + along.clip(0.0, 1.0)[..., None] * edge
+    normal = np.cross(edge[:, 0], edge[:, 1])[:, None]
+    size = (normal**2).sum(axis=2)
+    inside = ((np.cross(edge, off) * normal).sum(axis=2) >= 0).all(axis=1) & (size[:, 0] > 0)
+    height = (off[:, :1] * normal).sum(axis=2) / np.where(size > 0, size, 1.0)
+    feet = np.concatenate([p[:, None] - height[..., None] * normal, feet], axis=1)
+    distance = np.linalg.norm(feet - p[:, None], axis=2)
+    distance[~inside, 0] = np.inf
+    return feet[np.arange(len(p)), distance.argmin(axis=1)]
 
 
 def boxes_of(points: np.ndarray, owner: np.ndarray, count: int) -> np.ndarray:

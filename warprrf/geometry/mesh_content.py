@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import require
+from warprrf.rows import spans
 
 LARGEST_BYTES = 4 << 30
 LARGEST_FACES = 50_000_000
@@ -128,8 +129,8 @@ def triangulated(
     ears are cut off it one by one (Meisters, "Polygons have ears", 1975).
     """
     n = np.asarray(lengths, np.int64)
-    first, start, polygon = np.cumsum(n) - n, np.cumsum(n - 2) - (n - 2), np.repeat(np.arange(len(n)), n - 2)
-    place = np.arange(len(polygon)) - start[polygon]
+    first, start = np.cumsum(n) - n, np.cumsum(n - 2) - (n - 2)
+    polygon, place = spans(0 * n, n - 2)
     index = first[polygon, None] + np.stack([0 * place, place + 1, place + 2], axis=1)
     if corners.min(initial=0) < 0 or corners.max(initial=0) >= len(vertices):
         return index, polygon  # refused by whoever reads them
@@ -174,11 +175,7 @@ def material_name(name: str | None, textured: bool) -> str | None:
 
 
 def read_picture(data: bytes, what: str) -> np.ndarray:
-    """A picture's pixels, ``(H, W, 3)`` uint8, first row on top.
-
-    Raises:
-        ValueError: naming it by ``what``, if it cannot be read.
-    """
+    """A picture's pixels, ``(H, W, 3)`` uint8, first row on top."""
     pillow = require("PIL.Image", extra="mesh")
     try:
         with pillow.open(io.BytesIO(data)) as picture:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import LARGEST_M, check_array, check_choice, check_count, warn
+from warprrf.files import file_at
 from warprrf.geometry.gltf_files import read_gltf
 from warprrf.geometry.mesh_content import (
     LARGEST_BYTES,
@@ -49,14 +50,9 @@ def load_mesh(
     simplify: int | None = None,
     allow_outside: bool = False,
 ) -> MeshContent:
-    """Read a mesh file into metres, z up; vertices at one place become one. Arguments are those of :meth:`Mesh.load`.
+    """Read a mesh file into metres, z up; vertices at one place become one.
 
-    Raises:
-        OSError, ValueError: as :func:`read_mesh`.
-        ImportError: if a package that the format or ``simplify`` needs is not installed.
-
-    Warns:
-        UserWarning: if no unit is given and the mesh is very large or small for one in metres.
+    Arguments, errors and warnings are those of :meth:`Mesh.load`.
     """
     for name, value, known in (("unit", unit, METRES), ("up", up, UP)):
         if value is not None:
@@ -98,9 +94,7 @@ def read_mesh(
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise ValueError(f"path: got {path}, expected a mesh file: {', '.join(READERS)}")
-    if not path.is_file():
-        raise FileNotFoundError(f"path: there is no mesh file {path}")
-    if path.stat().st_size > LARGEST_BYTES:
+    if file_at(path, "mesh file").stat().st_size > LARGEST_BYTES:
         raise ValueError(f"path: {path} has {path.stat().st_size} bytes, expected at most {LARGEST_BYTES}")
     content = reader(Folder(path, allow_outside, colours))
     vertices, faces = content.vertices, content.faces

@@ -48,7 +48,6 @@ class _Lines:
     runs: list[tuple[int, str | None, str | None]] = field(default_factory=lambda: [(0, None, None)])
 
     def add(self, words: list[str]) -> None:
-        """One statement."""
         least, most = _STATEMENTS.get(words[0], (0, -1))
         if not least <= len(words) - 1 <= most:
             raise ValueError(f"it is no statement of an OBJ file, or has {len(words) - 1} words after it")
@@ -149,7 +148,6 @@ def _index(word: str, count: int) -> int:
 
 
 def _read_materials(folder: Folder, library: str) -> dict[str, _Material]:
-    """The materials of an MTL file by name."""
     known: dict[str, _Material] = {}
     name: str | None = None
 

@@ -325,7 +325,6 @@ def _said_of_surface(unseen: float, plain: float, skipped: float) -> tuple[str, 
 
 
 def _kept(steps: Steps, name: str, make: Callable[[Attempt], Arrays], inputs: Sequence[Any]) -> Arrays:
-    """Arrays of a step, from its file if it was made from the same inputs."""
     path = steps.folder / f"{name}.safetensors"
 
     def write(attempt: Attempt) -> None:

@@ -20,10 +20,10 @@ from warprrf.cache import Cache, cached_property
 from warprrf.checks import check_similarity, warn
 from warprrf.device import filled, launch, resolve
 from warprrf.geometry.edges import Edges, mesh_edges
-from warprrf.geometry.mesh import Mesh, boxes_of, components, vectors_across
+from warprrf.geometry.mesh import Mesh, boxes_of, components, headings, vectors_across
 from warprrf.kernels.rays.mesh import OverlapFaces, find_overlaps
 from warprrf.kernels.rays.patches import PatchFaces, lie_in_patches
-from warprrf.rows import sums_of
+from warprrf.rows import spans, sums_of
 
 FLAT_M = 1e-5
 """Corners may lie this far from their patch's plane [m], and six standard deviations of vertices' errors more."""
@@ -94,7 +94,6 @@ class PlanarPatches:
         """Patches whose planes are known, of a reconstruction, say: its normals point to the side that photos saw.
 
         Args:
-            mesh: The mesh, F faces.
             face_patch: Patch of each face, -1 for none, shape ``(F,)``.
             normal, offset: Planes ``normal . x = offset`` [m], shapes ``(P, 3)`` and ``(P,)``.
             tolerance_m, two_sided: As the attributes.
@@ -197,9 +196,6 @@ def planar_patches(mesh: Mesh, groups: ArrayLike | None = None) -> PlanarPatches
 
     Returns:
         Patches, largest first. Faces with hardly any area that fit no neighbour have none.
-
-    Raises:
-        ValueError: on groups of another shape.
 
     Warns:
         UserWarning: if faces at one place are of different groups: the first is taken.
@@ -379,11 +375,9 @@ def _joined(faces: _Faces, piece: np.ndarray, pairs: np.ndarray) -> np.ndarray |
     small, big = small[fits], big[fits]
     order = np.argsort(piece, kind="stable")
     ends = np.searchsorted(piece[order], np.arange(len(area) + 1))
-    count = np.diff(ends)[small]
-    row = np.repeat(np.arange(len(small)), count)
-    face = order[np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count) + ends[small][row]]
+    row, place = spans(ends[small], np.diff(ends)[small])
     gap = np.zeros(len(small))
-    np.maximum.at(gap, row, faces.gap(face, normal[big][row], offset[big][row]))
+    np.maximum.at(gap, row, faces.gap(order[place], normal[big][row], offset[big][row]))
     fits = gap <= faces.distance_m
     small, big = small[fits], big[fits]
     if len(small) == 0:
@@ -446,14 +440,13 @@ def _fit(mesh: Mesh, own: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.nda
         )
         det = np.maximum(aa * bb - ab**2, 1e-300)
         slope = np.stack([(bb * ar - ab * br) / det, (aa * br - ab * ar) / det], axis=1)
-        normal = normal - np.einsum("pi,pij->pj", slope, frame[:, :2])
-        normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        normal = headings(normal - np.einsum("pi,pij->pj", slope, frame[:, :2]))[0]
     return normal, np.einsum("pi,pi->p", normal, middle)
 
 
 def _numbered(label: np.ndarray) -> np.ndarray:
     """Labels from 0 without gaps; negative ones stay -1."""
-    number = np.unique(np.maximum(label, -1), return_inverse=True)[1].reshape(-1)
+    number = np.unique(np.maximum(label, -1), return_inverse=True)[1]
     return number - int((label < 0).any())
 
 

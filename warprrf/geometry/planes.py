@@ -196,8 +196,6 @@ def detect_planes(
         points: shape ``(P, 3)`` [m].
         normals: unit normals on the seen side, shape ``(P, 3)``.
         weights: how many points each one counts for (an area, for the faces of a mesh), shape ``(P,)``.
-        config: widths and limits.
-        seed: seed of the draws.
     """
     weight = np.ones(len(points)) if weights is None else weights
     free = np.arange(len(points))

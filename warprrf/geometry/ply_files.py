@@ -70,12 +70,7 @@ def read_ply(path: str | os.PathLike[str]) -> dict[str, Element]:
 
 
 def holds_gaussians(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is a PLY whose header states Gaussians, which have scales.
-
-    Raises:
-        OSError: naming the file, if it cannot be read.
-        ValueError: naming it, if it ends in ``.ply`` and is no PLY file.
-    """
+    """Whether a file is a PLY whose header states Gaussians, which have scales."""
     if Path(path).suffix.lower() != ".ply" or Path(path).is_dir():
         return False
     with Path(path).open("rb") as file:

@@ -146,9 +146,6 @@ class RaySearch:
         """Distance (N,) [m], float64, and face (N,) of what rays meet beyond ``clearance`` [m]; inf and -1 at a miss.
 
         ``reach`` [m] is one number or N: no need to look further.
-
-        Raises:
-            ValueError: if a ray is not finite or has no direction, or on an unknown back end, or Embree on a GPU.
         """
         count = max(len(o) * per_origin, len(d)) if min(len(o), len(d)) else 0
         if choose_backend(backend, device, count) == "embree" and count:
@@ -208,11 +205,7 @@ class RaySearch:
     def free(
         self, a: np.ndarray, b: np.ndarray, *, clearance: float, device: wp.Device, backend: str
     ) -> np.ndarray:
-        """Whether nothing lies between ``a`` and ``b`` but within ``clearance`` [m] of an end, shape (N,), bool.
-
-        Raises:
-            ValueError: if a point is not finite, or on an unknown back end, or Embree on a GPU.
-        """
+        """Whether nothing lies between ``a`` and ``b`` but within ``clearance`` [m] of an end, shape (N,), bool."""
         count = max(len(a), len(b)) if min(len(a), len(b)) else 0
         if choose_backend(backend, device, count) == "embree" and count:
             return self._free_embree(a, b, count, clearance, device)
@@ -284,9 +277,6 @@ class EmbreeScene:
     """Triangles in Embree's hierarchy: those of ``faces`` that ``kept`` names.
 
     Open3D keeps the interpreter lock while it casts, so one call runs on all threads.
-
-    Raises:
-        ImportError: if Open3D is not installed.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, kept: np.ndarray) -> None:
@@ -316,11 +306,7 @@ class EmbreeScene:
 
 
 def open3d() -> ModuleType:
-    """Open3D, which stage 1 and Embree's rays use: the one place that imports it, when first called.
-
-    Raises:
-        ImportError: naming the extra that brings it, if it is not installed.
-    """
+    """Open3D, which stage 1 and Embree's rays use: the one place that imports it, when first called."""
     return require("open3d", extra="photos")
 
 
@@ -357,9 +343,6 @@ def check_rows(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Two named arrays of vectors as float64 rows, one or N of each; they may hold numbers that are not finite. If there are
     N / ``per_first`` of the first, there may be as many of the second as ``per_first``.
-
-    Raises:
-        ValueError: on a wrong shape, or as many rows of neither one nor the other.
     """
     arrays = []
     for name, value in (first, second):
@@ -379,7 +362,6 @@ def _given(array: np.ndarray, dtype: type, device: wp.Device) -> wp.array:
 
 
 def _refuse(*ends: tuple[str, np.ndarray]) -> None:
-    """Say what is wrong with rays or segments of which some are bad."""
     for name, array in ends:
         check_array(name, array)
         if name == "directions" and (np.linalg.norm(array, axis=1) == 0).any():

@@ -25,7 +25,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count, check_seed
+from warprrf.checks import check_array, check_count
 from warprrf.device import DeviceLike, resolve
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE
 from warprrf.kernels.radio.records import MIRROR, SCATTER
@@ -103,7 +103,6 @@ class _Beams:
 
     @property
     def seen(self) -> Rays:
-        """What they hit, by their rows."""
         return Rays(self.hits, np.arange(len(self.ray)))
 
 
@@ -111,16 +110,10 @@ class ExactEngine:
     """Propagation from one transmitter in a scene.
 
     Args:
-        scene: Scene with ``mesh``, ``face_material`` and ``materials``.
-        transmitter: Position [m], shape ``(3,)``.
-        frequency_hz: Carrier frequency [Hz].
-        shape: Rows and columns of the spectrum.
-        beam_sigma_rad: Receiver beam width [rad].
         effects: What is modelled; by default :data:`SINGLE`.
         sub_pixels: Square root of the number of directions per pixel.
         seed: Of the directions in which light is scattered on.
         gas: Absorption of the air: see :meth:`Paths.with_gas`.
-        device: Where rays are cast and beams spread.
     """
 
     def __init__(
@@ -139,7 +132,7 @@ class ExactEngine:
     ) -> None:
         check_count("sub_pixels", sub_pixels)
         self.shape, self.beam_sigma_rad = check_shape(shape), beam_sigma_rad
-        self.effects, self.seed, self.air = effects, check_seed(seed), air_of(gas)
+        self.effects, self.seed, self.air = effects, check_count("seed", seed, 0, 2**63 - 1), air_of(gas)
         self.mirrors = MirrorTracer(
             scene, transmitter=transmitter, frequency_hz=frequency_hz, transmissions=effects.transmissions,
             diffractions=effects.diffractions, device=device,

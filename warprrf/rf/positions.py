@@ -44,11 +44,7 @@ _AT_ONCE = 20_000  # places whose rays are cast in one launch
 
 
 def check_receivers(name: str, value: ArrayLike) -> np.ndarray:
-    """A copy of ``value``, positions (3,) or (R, 3) [m], R at least 1: callers may move theirs on in place.
-
-    Raises:
-        ValueError: on another shape or numbers that are not finite.
-    """
+    """A copy of ``value``, positions (3,) or (R, 3) [m], R at least 1: callers may move theirs on in place."""
     array = check_array(name, value).copy()
     if array.ndim not in (1, 2) or array.shape[-1] != 3 or array.size == 0:
         raise ValueError(f"{name}: got shape {array.shape}, expected (3,) or (R, 3) with R at least 1")
@@ -155,11 +151,8 @@ def check_positions(
         mesh: What blocks; None checks distances between antennas alone.
         transmitter: Position [m], shape ``(3,)``, or that of each receiver, ``(R, 3)``; each link is looked at once.
         receivers: Positions [m], shape ``(3,)`` or ``(R, 3)``.
-        wavelength_m: Wavelength [m].
-        names: Of the two arguments.
         known: A place that is in the air for certain [m], shape ``(3,)``; the transmitter by default.
         on_surfaces: Whether antennas may be mounted flush with a surface.
-        device: Where rays are cast.
 
     Raises:
         ValueError: naming the first place outside the scene, on a surface, inside a solid, or so near to the
@@ -371,9 +364,7 @@ def warn_of_unmodelled(
     Args:
         mesh: The scene's; None if there is none.
         transmitter, receivers: Positions [m], shapes ``(3,)``, and ``(3,)`` or ``(R, 3)``.
-        frequency_hz: Carrier frequency [Hz].
         transmission, diffraction: Whether transmission through walls is modelled, and diffraction.
-        device: Where rays are cast.
     """
     least_hz = 100e9  # below it walls let much through, and waves bend round edges, indoors too
     reasons = [f"below {least_hz / 1e9:g} GHz"] if frequency_hz < least_hz else []

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from warprrf.checks import NotNegative, check_array, check_arrays, check_items, check_type, checked, index_to
 from warprrf.device import DeviceLike
+from warprrf.files import file_at
 from warprrf.geometry.mesh import Mesh, joined
 from warprrf.geometry.mesh_files import is_mesh_file
 from warprrf.rf.channel.arrays import PlanarArray
@@ -124,9 +125,7 @@ class Scene:
             import sionna.rt
             scene = wr.Scene.load(sionna.rt.scene.munich, materials={"brick": wr.em.itu_material("concrete")})
         """
-        path = Path(path)
-        if not path.is_file():
-            raise FileNotFoundError(f"path: there is no scene file {path}")
+        path = file_at(path, "scene file")
         choice = MaterialChoice(materials, path.parent / "materials.json", extrapolate)
         if is_mesh_file(path):
             found = read_mesh_scene(
@@ -209,7 +208,6 @@ class Scene:
         return to_sionna_scene(self._parts(), self.transmitters, self.receivers, self.antennas, frequency_hz)
 
     def _parts(self) -> list[ScenePart]:
-        """One part for each object and material."""
         order = np.lexsort((self.face_material, self.face_object))
         key = np.stack([self.face_object[order], self.face_material[order]], axis=1)
         starts = np.flatnonzero(np.r_[True, (np.diff(key, axis=0) != 0).any(axis=1)])

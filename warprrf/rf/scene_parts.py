@@ -49,9 +49,6 @@ class MaterialChoice:
         given: a mapping, every name of which must be asked for, or a table's file, which may hold more.
         beside: the file of the scene's own table, which may be missing; read when a name is not among ``given``.
         extrapolate: see :meth:`Material.extrapolated`.
-
-    Raises:
-        TypeError, ValueError, FileNotFoundError: if ``given`` is no such mapping or file.
     """
 
     def __init__(self, given: Materials | None, beside: Path | None, extrapolate: bool) -> None:
@@ -86,11 +83,7 @@ class MaterialChoice:
         return self._chosen[name]
 
     def check_used(self) -> None:
-        """Refuse names that nothing is made of.
-
-        Raises:
-            ValueError: naming one, and what there is.
-        """
+        """Refuse names that nothing is made of."""
         for name in sorted(self._wanted - set(self._chosen)):
             raise ValueError(
                 f"materials: got {name!r}, of which nothing in the scene is made; it has "

@@ -38,12 +38,7 @@ _FOLDERS = (
 def parts_of(rt_scene: Any, choice: MaterialChoice) -> tuple[list[ScenePart], dict[str, Any]]:
     """Objects of a ``sionna.rt.Scene``; and its transmitters, receivers and antennas by the arguments of :class:`Scene`.
 
-    Raises:
-        TypeError: for what is no such scene.
-        ValueError: for a scene without objects, or a material that cannot be read, naming it.
-
-    Warns:
-        UserWarning: of arrays that do not stand in rows and columns.
+    Errors and warnings are those of :meth:`Scene.from_sionna`.
     """
     rt = sionna_rt()
     if not isinstance(rt_scene, rt.Scene):
@@ -144,7 +139,6 @@ def _shortest(values: Any) -> np.ndarray:
 
 
 def _read(rt: Any, radio: Any, name: str, frequency: float) -> Material:
-    """Our material of a radio material of Sionna's."""
     if isinstance(radio, rt.AbsorberRadioMaterial):
         return Material.custom(name, relative_permittivity=1.0)
     if not isinstance(radio, rt.RadioMaterial):
@@ -287,7 +281,6 @@ def _sionna_pattern(rt: Any, antenna: Antenna) -> Any:
 
 
 def _radio_material(rt: Any, material: Material, name: str, frequency: float) -> Any:
-    """Sionna's material of ours at this frequency."""
     directive = material.pattern == "directive"
     # Largest exponent of a lobe that Sionna RT can normalise: it divides by 2^alpha_r in single precision
     narrowest_sionna_lobe = 127

@@ -32,17 +32,7 @@ Element = ElementTree.Element
 
 
 def read_scene_xml(path: Path, choice: MaterialChoice, *, allow_outside: bool = False) -> list[ScenePart]:
-    """The objects of a scene file.
-
-    Args:
-        path: the file.
-        choice: which material a name stands for.
-        allow_outside: read files outside the folder of ``path`` too.
-
-    Raises:
-        FileNotFoundError: if a file is missing.
-        ValueError: naming the file and the object, for what cannot be read.
-    """
+    """The objects of a scene file; errors are those of :meth:`Scene.load`."""
     return _SceneFile(path, choice, allow_outside).parts()
 
 
@@ -248,7 +238,6 @@ def _text(element: Element, name: str, tag: str = "string") -> str | None:
 
 
 def _value(element: Element, name: str, default: float) -> float:
-    """A number's property ``name``."""
     for tag in ("float", "integer"):
         text = _text(element, name, tag)
         if text is not None:
@@ -298,11 +287,7 @@ def _radio_material(element: Element, label: str) -> Material | None:
 
 
 def to_world(parts: list[Element]) -> np.ndarray:
-    """The matrix of the parts of a ``transform`` element, shape ``(4, 4)``: they apply one after the other, first to last.
-
-    Raises:
-        ValueError: for parts that are unknown or hold no such numbers.
-    """
+    """The matrix of the parts of a ``transform`` element, shape ``(4, 4)``: they apply one after the other, first to last."""
     matrix = np.eye(4)
     for part in parts:
         if part.tag not in _TRANSFORMS:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from warprrf.cache import Cache, making
 from warprrf.checks import NotNegative, Seed, check_array, check_count, checked, one_of
 from warprrf.cluster import each
-from warprrf.device import DeviceLike, Progress
+from warprrf.device import DeviceLike, Progress, silent
 from warprrf.geometry.mesh import as_mesh
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.fresnel import surface_table
@@ -124,7 +124,7 @@ def simulate(
     if workspace is not None:
         known = {k: _kept(workspace, inputs, point) for k, point in enumerate(points)}
         results = {k: held for k, held in known.items() if held is not None}
-    tell = progress or (lambda *_: None)
+    tell = progress or silent
     tell("simulate", len(results), len(points))
     missing = [k for k in range(len(points)) if k not in results]
     receiver = _Receiver(scene, common, effects if exact else sampling, seed, air, device)

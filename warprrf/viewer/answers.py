@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from warprrf.device import Progress
+from warprrf.device import Progress, with_progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.beams import dft_codebook
@@ -91,11 +91,7 @@ def as_asked(source: Source, asked: Asked) -> Source:
 
 
 def answer(source: Source, receiver: np.ndarray, transmitters: Sequence[np.ndarray], asked: Asked) -> Answer:
-    """Ask a field (:func:`as_asked`) for spectrum and paths, or trace the paths of a scene or a mesh that do not scatter.
-
-    Raises:
-        ValueError: for a place that ``source`` does not hold at.
-    """
+    """Ask a field (:func:`as_asked`) for spectrum and paths, or trace the paths of a scene or a mesh that do not scatter."""
     start = time.perf_counter()
     spectra, paths = [], []
     for transmitter in transmitters:
@@ -165,7 +161,7 @@ def strongest(found: Sequence[Paths], count: int) -> list[tuple[Paths, int]]:
 def described(paths: Paths, index: int) -> tuple[str, str, str, str, str]:
     """One path in words: kind, gain, delay, zenith and azimuth of arrival, and of departure."""
     degrees = [float(np.rad2deg(getattr(paths, n)[index])) for n in ("theta_r", "phi_r", "theta_t", "phi_t")]
-    gain = 10.0 * np.log10(max(float(paths.power[index]), 1e-300))
+    gain = float(to_db(paths.power[index], 1e-300))
     return (
         str(paths.kind[index]), f"{gain:.1f} dB", f"{paths.tau[index] * 1e9:.2f} ns",
         f"{degrees[0]:.0f}°, {degrees[1]:.0f}°", f"{degrees[2]:.0f}°, {degrees[3]:.0f}°",
@@ -197,18 +193,14 @@ def reading_errors(field: RadioField, readings: Readings, progress: Progress | N
     field, (power, steady) = field.with_gas(readings.air), np.empty((2, len(readings)))
     ends = np.column_stack([readings.transmitters, readings.receivers])
     links, own = np.unique(ends, axis=0, return_inverse=True)
-    for k, link in enumerate(links):
+    for k, link in enumerate(with_progress(links, "readings", progress)):
         rows, paths = np.flatnonzero(own.reshape(-1) == k), field.paths(link[3:], link[:3])
         weight = path_weights(readings, rows, paths.arrival, paths.departure, paths.tau) * paths.power
         power[rows] = weight.sum(axis=1)
         single = weight[:, paths.kind != "diffuse"] / np.maximum(power[rows], 1e-300)[:, None]
         steady[rows] = (single**2).sum(axis=1)
-        if progress is not None:
-            progress("readings", k + 1, len(links))
-    floor = 10.0 * np.log10(np.asarray(readings.floor))
-    predicted = 10.0 * np.log10(np.maximum(power, 1e-300))
-    with np.errstate(divide="ignore"):
-        read = 10.0 * np.log10(readings.power) - fading_db(readings.samples, steady)[0]
+    floor, predicted = to_db(readings.floor), to_db(power)
+    read = to_db(readings.power) - fading_db(readings.samples, steady)[0]
     error = np.maximum(predicted, floor) - np.maximum(read, floor)
     error[np.isnan(readings.power) | (predicted <= floor) & (readings.power <= readings.floor)] = np.nan
     chain = np.asarray(readings.chain)
@@ -226,7 +218,7 @@ def delay_profile(paths: Sequence[Paths], bandwidth_hz: float) -> tuple[np.ndarr
     index = np.round((tau - first) * bandwidth_hz).astype(int)
     inside = index < taps
     total = np.bincount(index[inside], power[inside], minlength=taps)
-    return (first + np.arange(taps) / bandwidth_hz) * 1e9, 10.0 * np.log10(np.maximum(total, 1e-300))
+    return (first + np.arange(taps) / bandwidth_hz) * 1e9, to_db(total, 1e-300)
 
 
 def best_beam(paths: Sequence[Paths], size: int, azimuth_rad: float) -> tuple[float, np.ndarray, np.ndarray]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.spectra.spectrum import to_db
 from warprrf.rf.tracing.model import Effects
 from warprrf.viewer import answers, pictures
 from warprrf.viewer.answers import Answer, Asked
@@ -162,7 +163,7 @@ class Rays:
             scene.remove_by_name("/paths")
             self.legend.content = ""
             return
-        gain = 10.0 * np.log10(np.maximum([p.power[k] for p, k in listed], 1e-300))
+        gain = to_db([p.power[k] for p, k in listed], 1e-300)
         shades = pictures.coloured(gain, gain[0] - range_db, gain[0], COLOURS)
         each = np.repeat(shades, [len(own) for own in self._legs], axis=0)[::-1, None]
         scene.add_line_segments(
@@ -206,7 +207,6 @@ class Rays:
 
 
 def _table(rows: Sequence[tuple[str, ...]]) -> str:
-    """HTML of paths."""
     head = "".join(
         f"<th>{name}</th>" for name in ("kind", "gain", "delay", "arrives from", "departs towards")
     )

@@ -52,9 +52,6 @@ class Page:
         url: where it is.
         message: what its first line says.
         hidden: names of what is not shown.
-
-    Raises:
-        ValueError, TypeError: for a host or port that is none.
     """
 
     def __init__(self, host: str, port: int, bounds: np.ndarray) -> None:

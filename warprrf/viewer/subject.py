@@ -137,7 +137,6 @@ _FILES = {".safetensors": RadioField, ".nc": SpectrumDataset, ".xml": Scene}
 
 
 def _opened(path: Path) -> list[Any]:
-    """What the file or folder ``path`` holds."""
     if path.is_dir():
         return _folder(path)
     if not path.is_file():

@@ -119,7 +119,6 @@ class Survey:
         self.legend.content = "".join(self._meanings.values())
 
     def _list(self, places: np.ndarray, labels: list[str]) -> None:
-        """A button for each of ``places`` (K, 3), in place of the last ones."""
         for button in self.listed:
             button.remove()
         names = [

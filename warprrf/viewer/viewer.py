@@ -186,7 +186,6 @@ class Viewer:
             self.add_transmitter(hit.point[0] - 0.2 * direction)
 
     def _asked(self) -> answers.Source | None:
-        """What is asked, as the settings say."""
         source, asked = self.subject.field or self.subject.scene or self.subject.mesh, self._channel.asked
         if source is None:
             return None
@@ -209,11 +208,7 @@ class Viewer:
                 self._changed.notify_all()
 
     def _answer(self) -> Answer | None:
-        """Ask, and send what came to the page.
-
-        Raises:
-            ValueError: where there is no answer.
-        """
+        """Ask, and send what came to the page."""
         page = self._page
         source = self._asked()
         if source is None:
@@ -252,7 +247,6 @@ class Viewer:
         return pictures.combined(self.message.replace("**", ""), self._channel.images, view)
 
     def _html(self) -> bytes:
-        """The scene as it stands, with spectrum and figures in a corner."""
         said = html.escape(self.message.replace("**", ""))
         shown = (
             self._channel.spectra, self._channel.table, self._rays.legend, self._room.legend, self._survey.legend

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from warprrf.device import DeviceLike, Progress, require
+from warprrf.device import DeviceLike, Progress, require, silent
 from warprrf.files import write_text
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.posed.photo_files import read_photo, spread
@@ -65,13 +65,8 @@ def write_report(
     progress: Progress | None = None,
     device: DeviceLike = None,
 ) -> None:
-    """Write the page of ``subject`` to ``path``.
-
-    Raises:
-        OSError: if ``path`` cannot be written.
-        ImportError: if Pillow is not installed.
-    """
-    report = progress or (lambda stage, done, total: None)
+    """Write the page of ``subject`` to ``path``."""
+    report = progress or silent
     report("report", 0, 3)
     parts = [_head(subject, gaussians, mesh), _warnings(subject)]
     if subject.cameras:

@@ -172,7 +172,6 @@ def check_camera(cam: object) -> None:
 
 
 def _check_pose(pose: np.ndarray) -> None:
-    """Refuse what is no rigid transform."""
     rotation = pose[:3, :3]
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
         raise ValueError(

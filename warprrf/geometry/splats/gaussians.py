@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -16,7 +15,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from warprrf.checks import LARGEST_M, Shaped, check_count, check_similarity, checked, one_line
-from warprrf.geometry.mesh import Mesh
+from warprrf.files import file_at
+from warprrf.geometry.mesh import Mesh, headings
 from warprrf.geometry.ply_files import read_ply, write_ply
 from warprrf.kernels.raster import sh as _sh
 from warprrf.kernels.raster.sh import COEFFICIENTS
@@ -154,9 +154,7 @@ class Gaussians:
             FileNotFoundError: if there is no such file.
             ValueError: if it is no PLY, is cut short, or lacks a property of the layout.
         """
-        if not Path(path).is_file():
-            raise FileNotFoundError(f"path: there is no file {os.fspath(path)!r}")
-        table = read_ply(path).get("vertex", {})
+        table = read_ply(file_at(path)).get("vertex", {})
 
         def columns(*names: str) -> np.ndarray:
             missing = [name for name in names if not isinstance(table.get(name), np.ndarray)]
@@ -192,8 +190,7 @@ def _turned_harmonics(rotation: np.ndarray, count: int) -> np.ndarray:
     A turned harmonic is a sum of those of its degree, so values at more directions than harmonics fix the sum.
     """
     kernels = _sh.build(wp.float64)
-    directions = np.random.default_rng(0).standard_normal((4 * count, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = headings(np.random.default_rng(0).standard_normal((4 * count, 3)))[0]
     before, after = (
         np.array([[float(v) for v in kernels.basis(wp.vec3d(*d))][:count] for d in turned])
         for turned in (directions, directions @ rotation.T)
@@ -222,12 +219,7 @@ def discs_on_mesh(mesh: Mesh, count: int = 30_000, *, seed: int = 0) -> Gaussian
     They stand in for a reconstruction where a mesh is known and there are no photos.
 
     Args:
-        mesh: surface to cover.
         count: wanted number; a few per cent fewer come out.
-        seed: of the sampling.
-
-    Raises:
-        ValueError: for a count below 1.
     """
     check_count("count", count)
     rng = np.random.default_rng(seed)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warprrf.cache import Cache
 from warprrf.device import DeviceLike, launch, resolve
 from warprrf.kernels import ssim as kernels
 
@@ -37,7 +38,6 @@ class PhotoLoss:
     """Loss of rendered images.
 
     Args:
-        device: Warp device.
         ssim_share: weight ``s`` of 1 - SSIM.
         real: scalar type of the images.
         panorama: images of one number a pixel that wrap around, not photos.
@@ -57,7 +57,7 @@ class PhotoLoss:
         self.lanes = lanes or (1 if self.device.is_cuda else kernels.LANES)
         self.channels, self.wrapped = (1, WRAPPED) if panorama else (3, 0)
         self.kernels = kernels.build(real, self.lanes, self.channels)
-        self.rooms: dict[tuple[int, ...], _Room] = {}
+        self.rooms = Cache(SIZES)
 
     def plane(self, values: np.ndarray | None, shape: tuple[int, ...]) -> wp.array:
         """An image ``(*shape, 3)``, or panorama ``shape``, as a plane, zero if None."""
@@ -99,13 +99,11 @@ class PhotoLoss:
         return room.score, room.gradient
 
     def _numbers(self, shape: tuple[int, ...]) -> int:
-        """Numbers in a row of a plane."""
         return self.channels * shape[-1] + 2 * self.wrapped
 
     def _launch(
         self, kernel: wp.Kernel, shape: tuple[int, ...], inputs: list[object], *, height: bool = False
     ) -> None:
-        """Launch a kernel over the blocks of planes."""
         count = self._numbers(shape)
         blocks = kernels.blocks_of(count, self.lanes)
         layout = [*shape[-2:-1][: int(height)], kernels.stride_of(count), blocks]
@@ -113,12 +111,12 @@ class PhotoLoss:
 
     def _room(self, shape: tuple[int, ...]) -> _Room:
         """Planes to work in; those of the sizes asked for last are kept."""
-        if shape not in self.rooms:
-            if len(self.rooms) == SIZES:
-                del self.rooms[next(iter(self.rooms))]
+
+        def room() -> _Room:
             row = 1, shape[-1]
             inside = self.plane(np.ones((*row, self.channels)), row)
             one, two, three, *others = (self.plane(None, shape) for _ in range(12))
             groups = ((others[k], others[k + 1], others[k + 2]) for k in (0, 3, 6))
-            self.rooms[shape] = _Room(inside, one, two, three, *groups)
-        return self.rooms[shape]
+            return _Room(inside, one, two, three, *groups)
+
+        return self.rooms.get(shape, room)

@@ -170,7 +170,6 @@ class Rasterizer:
         return partial(Rasterizer, device=device, blending=blending, real=real, per_pixel=self.per_pixel), ()
 
     def _vector(self, size: int) -> Any:
-        """Warp's vector type of this precision."""
         return wp.types.vector(size, self.real)
 
     def upload(self, g: Gaussians) -> Parameters:

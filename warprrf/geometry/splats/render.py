@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count, checked, one_line
+from warprrf.checks import check_array, checked, one_line
 from warprrf.device import DeviceLike, resolve
 from warprrf.geometry.splats.camera import Camera, check_camera
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -114,7 +114,6 @@ def blend_weights(
         TypeError, ValueError: naming the argument that does not fit.
     """
     _check(g, cam)
-    check_count("top_k", top_k)
     raster = Rasterizer(device=device, blending=blending)
     found = raster.strongest(raster.prepare(*raster.upload(g), cam), top_k)
     indices, weights, ranges, alpha = (array.numpy() for array in found)

@@ -152,11 +152,7 @@ def hemisphere(shape: tuple[int, int]) -> np.ndarray:
 
 
 def check_steering(array: PlanarArray, directions: ArrayLike) -> np.ndarray:
-    """``directions`` (..., 3) of unit length, if ``array`` is one that spectra are of.
-
-    Raises:
-        TypeError, ValueError: naming the argument.
-    """
+    """``directions`` (..., 3) of unit length, if ``array`` is one that spectra are of."""
     check_type("array", array, PlanarArray)
     check_unpolarised("array", array)
     found = check_array("directions", directions, (..., None, 3))

@@ -359,11 +359,7 @@ Rays = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def rays_of_users(sources: Source | Iterable[Source], tx: Codebook) -> list[Rays]:
-    """:func:`rays_of` of every user.
-
-    Raises:
-        ValueError: if there is none.
-    """
+    """:func:`rays_of` of every user."""
     given: Iterable[Source] = [sources] if isinstance(sources, Spectrum | PathArrays) else sources
     found = [rays for source in given for rays in rays_of(source, tx)]
     if not found:

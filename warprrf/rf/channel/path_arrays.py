@@ -161,7 +161,6 @@ class PathArrays:
         return replace(self._taken(receiver), receiver=point, transmitter=source)
 
     def _taken(self, index: int | slice | np.ndarray) -> Self:
-        """Every array at ``index``."""
         arrays: dict[str, Any] = {name: getattr(self, name) for name in PADDING}
         taken: dict[str, Any] = {name: None if v is None else v[index] for name, v in arrays.items()}
         return replace(self, **taken)
@@ -356,11 +355,7 @@ def _padded(array: np.ndarray, axis: int, length: int, fill: float) -> np.ndarra
 
 
 def _common(parts: Sequence[PathArrays]) -> dict[str, Any]:
-    """What all parts share.
-
-    Raises:
-        ValueError: if they differ in carrier, transmitter or air.
-    """
+    """What all parts share."""
     first = parts[0]
     for p in parts[1:]:
         same = p.frequency_hz == first.frequency_hz and p.air == first.air

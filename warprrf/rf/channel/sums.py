@@ -28,6 +28,7 @@ import scipy.fft
 from scipy.sparse import csr_array
 
 from warprrf.device import threads
+from warprrf.geometry.mesh import headings
 from warprrf.kernels.radio.records import EDGE, MIRROR
 from warprrf.rf.channel.path_arrays import PathArrays, length_along, points_along
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
@@ -271,7 +272,7 @@ def spherical_lengths(paths: PathArrays, sending: np.ndarray, receiving: np.ndar
     tx, rx, bounces = _ends(paths)
     points = points_along(tx, paths.vertices, rx)
     last, length = points[np.arange(len(points)), bounces], length_along(points)
-    toward = (last - rx) / np.linalg.norm(last - rx, axis=1, keepdims=True)
+    toward = headings(last - rx)[0]
     # The image lies ``length`` away along the arrival; its array is mirrored at every turn of the way.
     mirrored = np.einsum("pij,nj->npi", _mirrorings(points, paths.interactions), sending)
     target = length[:, None] * toward + mirrored
@@ -301,15 +302,12 @@ def _ends(paths: PathArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _mirrorings(points: np.ndarray, interactions: np.ndarray) -> np.ndarray:
     """What mirrors and edges do to directions, shape ``(P, 3, 3)``: a product of reflections; slabs do nothing."""
-    legs = np.diff(points, axis=1)
-    legs = legs / np.maximum(np.linalg.norm(legs, axis=2, keepdims=True), 1e-300)
+    legs = headings(np.diff(points, axis=1))[0]
     turned = np.broadcast_to(np.eye(3), (len(points), 3, 3))
     turns = np.isin(interactions, (MIRROR, EDGE))
     for k in range(turns.shape[1]):
-        normal = legs[:, k + 1] - legs[:, k]
-        there = turns[:, k] & (np.linalg.norm(np.nan_to_num(normal), axis=1) > 1e-9)
-        unit = np.where(there[:, None], normal, 1.0)
-        unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
+        unit, size = headings(np.nan_to_num(legs[:, k + 1] - legs[:, k]))
+        there = turns[:, k] & (size > 1e-9)
         mirror = np.eye(3) - 2.0 * np.where(there[:, None, None], unit[:, :, None] * unit[:, None, :], 0.0)
         turned = mirror @ turned
     return turned

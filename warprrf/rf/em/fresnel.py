@@ -72,11 +72,7 @@ class SurfaceTable:
 
 
 def surface_table(materials: Sequence[Material], frequency_hz: float) -> SurfaceTable:
-    """The table of ``materials`` at ``frequency_hz``.
-
-    Raises:
-        ValueError: if the frequency lies outside a material's band, or materials are names alone.
-    """
+    """The table of ``materials`` at ``frequency_hz``."""
     check_known(materials)
     alpha = [LAMBERTIAN if m.pattern == "lambertian" else int(m.alpha_r) for m in materials]
     return SurfaceTable(

@@ -19,7 +19,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
-from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
 import numpy as np
@@ -35,7 +34,7 @@ from warprrf.checks import (
     checked,
     within,
 )
-from warprrf.files import read_json
+from warprrf.files import file_at, read_json
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, Hertz
 
 VACUUM_PERMITTIVITY = 8.8541878128e-12  # F/m, CODATA 2018
@@ -271,11 +270,7 @@ def is_name_alone(material: object) -> bool:
 
 
 def check_known(materials: Iterable[Material]) -> None:
-    """Refuse materials that are names alone.
-
-    Raises:
-        ValueError: naming them all.
-    """
+    """Refuse materials that are names alone."""
     unknown = sorted({material.name for material in materials if is_name_alone(material)})
     if unknown:
         raise ValueError(
@@ -400,9 +395,7 @@ def load_materials(path: str | os.PathLike[str]) -> dict[str, Material]:
         FileNotFoundError: if there is no such file.
         ValueError: naming the file, the material and what is wrong with it.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"path: there is no table of materials {path}")
+    path = file_at(path, "table of materials")
     whole = read_json(path)
     table = whole.get("materials")
     if table is None:

@@ -17,11 +17,7 @@ CARRIERS_HZ = (1e5, 1e16)
 
 
 def check_frequency(frequency_hz: ArrayLike | None, name: str = "frequency_hz") -> float:
-    """``frequency_hz`` as a float; errors call it ``name``.
-
-    Raises:
-        ValueError: if it is outside :data:`CARRIERS_HZ`.
-    """
+    """``frequency_hz`` as a float; errors call it ``name``."""
     value, (low, high) = float(check_array(name, frequency_hz, ())), CARRIERS_HZ
     if not low <= value <= high:
         raise ValueError(f"{name}: got {value!r}, expected hertz, {low:g} to {high:g} (28 GHz is 28e9)")

@@ -613,12 +613,7 @@ Options = TypeVar("Options", bound=Any)
 
 
 def with_settings(options: Options, settings: Mapping[str, Any]) -> Options:
-    """``options`` of a fit, a dataclass, with ``settings`` in place of the attributes that they name.
-
-    Raises:
-        TypeError: for a name that is no option.
-        ValueError: for a value out of range.
-    """
+    """``options`` of a fit, a dataclass, with ``settings`` in place of the attributes that they name."""
     names = [f.name for f in fields(options)]
     if unknown := sorted(set(settings) - set(names)):
         raise TypeError(f"fit: got unknown option {', '.join(unknown)}, expected among {', '.join(names)}")

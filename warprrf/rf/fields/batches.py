@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from warprrf.cluster import each
-from warprrf.device import Progress
+from warprrf.device import Progress, silent
 from warprrf.netcdf_files import Store, Variable
 from warprrf.rf.positions import Ends
 
@@ -51,7 +51,7 @@ class Batch:
         """Rows and answers of the parts of which some are ``missing`` (R,), all by default, as they are ready."""
         parts = [own for own in self.parts() if missing is None or missing[own].any()]
         ends, count = self.ends, len(self.ends.receivers)
-        done, tell = count - sum(map(len, parts)), self.progress or (lambda *_: None)
+        done, tell = count - sum(map(len, parts)), self.progress or silent
         tell(self.stage, done, count)
         jobs = [(ends.receivers[own], ends.transmitters[own[0]]) for own in parts]
         for k, found in each(work, jobs, self.client):

@@ -126,7 +126,7 @@ def _matrices(paths: Paths, coefficient: np.ndarray, max_paths: int | None) -> d
     order = np.argsort(-strength, axis=1, kind="stable")[:, :count]
 
     def pick(values: np.ndarray) -> np.ndarray:
-        return np.take_along_axis(values, order, axis=1)
+        return values[np.arange(len(order))[:, None], order]
 
     there = pick(paths.valid)
     gain = pick(coefficient)
@@ -137,7 +137,6 @@ def _matrices(paths: Paths, coefficient: np.ndarray, max_paths: int | None) -> d
         return np.where(there, values, np.nan).astype(np.float32)
 
     deep = max(1, int(bounces.max(initial=0)))
-    index = order[:, :, None, None]
     codes = np.zeros(bounces.shape)
     for met in np.moveaxis(paths.interactions, -1, 0):
         codes = np.where(met > 0, 10.0 * codes + np.vectorize(_DIGIT.get, otypes=[float])(met, 0), codes)
@@ -154,12 +153,11 @@ def _matrices(paths: Paths, coefficient: np.ndarray, max_paths: int | None) -> d
         "inter": np.where(there, pick(codes), np.nan).astype(
             np.float32 if codes.max() < 2**24 else np.float64
         ),
-        "inter_pos": np.take_along_axis(paths.vertices, index, axis=1)[:, :, :deep].astype(np.float32),
+        "inter_pos": pick(paths.vertices)[:, :, :deep].astype(np.float32),
     }
 
 
 def _end(name: str, identity: int, points: int, active: int) -> dict[str, Any]:
-    """Description of a set of transmitters or receivers."""
     return {
         "name": name,
         "id_orig": identity,

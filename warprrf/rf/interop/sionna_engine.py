@@ -69,11 +69,6 @@ class SionnaEngine:
 
     Args:
         scene: Scene with materials; its own transmitters and receivers play no part.
-        transmitter: Position [m], shape ``(3,)``.
-        frequency_hz: Carrier frequency [Hz].
-        shape: Rows and columns of the spectrum.
-        beam_sigma_rad: Receiver beam width [rad].
-        sampling: How Sionna looks for paths.
         gas: Absorption of the air: see :meth:`Paths.with_gas`.
         device: Where beams are spread (Sionna takes its own: CUDA where there is a GPU).
 

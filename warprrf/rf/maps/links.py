@@ -88,7 +88,6 @@ def best_beam_gain(
         diffuse: path gain per pixel, before any beam, shape ``(R, H, W)``.
         receiver, arrival, power: each sharp path's receiver ``(L,)``, unit direction ``(L, 3)`` and gain ``(L,)``.
         sigma: beam width [rad].
-        device: where diffuse power is spread.
     """
     count, shape = len(diffuse), diffuse.shape[1:]
     beam, density = beam_operator(shape, sigma, device), 4.0 * np.pi / pixel_solid_angles(shape)[:, None]

@@ -243,7 +243,6 @@ def radio_map(
     Args:
         field: a :class:`warprrf.RadioField` with a mesh.
         height: of the receivers [m]: z, or over the ground if ``options`` say so.
-        cell: width of a cell [m].
         transmitter: position (3,) [m] if another than the fitted one.
         options: bounds, ground, beam, budget and rays.
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from warprrf.device import Progress, with_progress
-from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
+from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, headings, vectors_across
 from warprrf.kernels.radio.records import EDGE, MIRROR, SLAB
 from warprrf.rf.em.diffraction import EdgeRays, Pair, boundary_fields, diffraction_matrices
 from warprrf.rf.em.fresnel import SurfaceTable
@@ -103,10 +103,8 @@ class EdgeFinder:
 
     Args:
         images: The transmitter and what mirrors.
-        wavelength_m: Wavelength [m].
         table: Radio properties of the patches' groups; None for a bare mesh: fields without polarisation, reflected
             without a sign change.
-        walls: What may be passed, if anything.
         group: Row of ``table`` of each face; it is looked at if there are walls.
     """
 
@@ -127,9 +125,7 @@ class EdgeFinder:
         """All paths to ``receivers`` (R, 3) over one edge and at most ``mirrors`` mirrors, or a slab, by receiver, then by length.
 
         Args:
-            receivers: Positions [m].
             mirrors: Most mirrors on a path, 0 or 1.
-            progress: Called with the stage ``"edges"``.
         """
         nothing = np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2), int)
         parts, waiting = list[EdgePaths](), [nothing]
@@ -235,7 +231,6 @@ class EdgeFinder:
         return replace(ways, slab=face, thickness_m=thickness, stop=stop)
 
     def _unobstructed(self, ways: _EdgeWays) -> np.ndarray:
-        """Whether both legs are free."""
         beside = self._beside(ways)
         found = np.ones(len(ways.edge), bool)
         for j in range(2):
@@ -331,27 +326,28 @@ class _EdgeWays(Rows):
         """Length of the straight line between the ends [m], shape ``(L,)``."""
         return np.linalg.norm(self.end[:, 1] - self.end[:, 0], axis=1)
 
+    @property
+    def _points(self) -> np.ndarray:
+        return np.stack([self.stop[:, 0], self.point, self.stop[:, 1]], axis=1)
+
     def distinct(self, distance_m: float) -> np.ndarray:
         """Indices of ways that no earlier one of the same receiver repeats, with mirrors on the same sides and all points within
         ``distance_m``: edges that lie so close are one."""
         side = (self.patch >= 0) @ np.array([1, 2]) + (self.slab >= 0) @ np.array([4, 8])
-        points = np.stack([self.stop[:, 0], self.point, self.stop[:, 1]], axis=1)
-        return distinct(side + 16 * self.receiver, np.nan_to_num(points), distance_m)
+        return distinct(side + 16 * self.receiver, np.nan_to_num(self._points), distance_m)
 
     def stops(self) -> tuple[np.ndarray, np.ndarray]:
         """Codes ``(L, 2)`` and points ``(L, 2, 3)`` of the interactions, from the transmitter on."""
         all_codes = np.where(self.patch >= 0, MIRROR, np.where(self.slab >= 0, SLAB, 0))
         code = np.column_stack([all_codes[:, 0], np.full(len(self.edge), EDGE), all_codes[:, 1]])
-        point = np.stack([self.stop[:, 0], self.point, self.stop[:, 1]], axis=1)
         order = np.argsort(code == 0, axis=1, kind="stable")[:, :2]
         code = np.take_along_axis(code, order, axis=1).astype(np.int8)
-        return code, np.take_along_axis(point, order[..., None], axis=1)
+        return code, np.take_along_axis(self._points, order[..., None], axis=1)
 
 
 def _edge_basis(along: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Rows (b, p) of fields fixed to the edge, shape ``(L, 2, 3)``; see :mod:`warprrf.rf.em.diffraction`."""
-    p = np.cross(along, direction)
-    p /= np.maximum(np.linalg.norm(p, axis=1, keepdims=True), 1e-300)
+    p = headings(np.cross(along, direction))[0]
     return np.stack([np.cross(direction, p), p], axis=1)
 
 

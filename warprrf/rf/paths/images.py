@@ -27,7 +27,7 @@ from warprrf.kernels.radio import mirrors as kernels
 from warprrf.kernels.radio.edges import find_over_edges
 from warprrf.kernels.radio.mirrors import IN_PLANE
 from warprrf.rf.paths.ways import Ways, stops_of
-from warprrf.rows import Rows
+from warprrf.rows import Rows, spans
 
 MOST_KEPT = 4_000_000  # pairs of a chain and a patch to try up to which all chains are found once and kept
 BLOCK = 500_000  # chains that are unfolded at once
@@ -63,14 +63,8 @@ class MirrorImages:
     """Images of one transmitter in the patches of a mesh, to any order.
 
     Args:
-        patches: What mirrors.
-        transmitter: Position [m], shape ``(3,)``.
         slack_m: Boxes of patches are widened by it [m]: their tolerance by default.
         max_chains: Searches that would try more chains are refused.
-        device: Where chains are tried.
-
-    Raises:
-        ValueError: if ``max_chains`` is not positive.
 
     Warns:
         UserWarning: of smooth surfaces that were cut into flat mirrors.
@@ -108,11 +102,6 @@ class MirrorImages:
 
         Args:
             points: Where the chains end [m], shape ``(N, 3)``.
-            order: Most reflections.
-            progress: Called with the stage ``"mirrors"``.
-
-        Raises:
-            ValueError: before anything is traced, if more than ``max_chains`` chains would be tried.
         """
         work, seconds = self._work(points, order)
         if sum(work) > self.max_chains:
@@ -322,20 +311,14 @@ class _Ends:
 
 
 class EdgeLeaves:
-    """Edges in pieces, in leaves of 32 neighbours with a ball around each.
-
-    Args:
-        edges: Which edges.
-        where: Where ways over them are sought.
-    """
+    """Edges in pieces, in leaves of 32 neighbours with a ball around each."""
 
     def __init__(self, edges: Edges, where: wp.Device) -> None:
         longest_m = 20.0  # longer edges are cut, so that balls around neighbours stay small
         count = np.maximum(1, np.ceil(edges.length / longest_m)).astype(int)
-        edge = np.repeat(np.arange(len(edges)), count)
+        edge, place = spans(0 * count, count)
         piece = edges.length[edge] / count[edge]
-        start = (np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)) * piece
-        start = edges.start[edge] + start[:, None] * edges.along[edge]
+        start = edges.start[edge] + (place * piece)[:, None] * edges.along[edge]
         middle = start + 0.5 * piece[:, None] * edges.along[edge]
         order = _along_curve(middle)
         self.edge, start, piece, middle = edge[order], start[order], piece[order], middle[order]

@@ -127,9 +127,6 @@ def exact_paths(
 
     A mirror point lies in its patch's faces. Paths through one place on two patches (faces that overlap, or the seam
     between them) count once.
-
-    Raises:
-        ValueError: before anything is traced, if more chains would be tried than ``images`` allow.
     """
     patches, parts = images.patches, list[MirrorPaths]()
     for k, ways in enumerate(images.search(receivers, order, progress)):
@@ -165,17 +162,9 @@ def zone_paths(
     Args:
         images: Its boxes say how far beside its faces a patch may still mirror, the tolerance of its patches what the position
             error of the surface is: zones are wider, and rays end that much before it [m].
-        receivers: Positions [m].
-        order: Most reflections.
-        wavelength_m: Wavelength [m].
-        progress: Called with the stage ``"mirrors"``.
-        walls: What may be passed.
 
     Returns:
         Rows by order. Those with less than a twentieth of their field, -26 dB, are left out.
-
-    Raises:
-        ValueError: before anything is traced, if more chains would be tried than ``images`` allow.
     """
     zone, parts = ZoneRays(images, wavelength_m), list[MirrorPaths]()
 
@@ -268,9 +257,7 @@ class ZoneRays:
 
     def _past(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Points so far behind b, seen from a, that a ray to them misses nothing at b, where no surface is, shape ``(N, 3)``."""
-        way = b - a
-        length = np.linalg.norm(way, axis=1, keepdims=True)
-        return np.asarray(b + 2.0 * self.position_error_m / np.maximum(length, 1e-12) * way)
+        return np.asarray(b + 2.0 * self.position_error_m * headings(b - a)[0])
 
     def _mirror_share(self, ways: Ways, beside: Walls | None) -> np.ndarray:
         """That of mirror paths; a zone cuts a patch's plane in an ellipse, longer by 1 / cos."""

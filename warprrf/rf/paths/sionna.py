@@ -174,11 +174,7 @@ def to_sionna(
 
 
 def check_shifts(paths: PathArrays, doppler_hz: ArrayLike) -> np.ndarray:
-    """Shifts [Hz] of ``paths``, shape as ``tau``, 0 where padded.
-
-    Raises:
-        ValueError: for another shape, or a path without a shift.
-    """
+    """Shifts [Hz] of ``paths``, shape as ``tau``, 0 where padded."""
     given = check_array("doppler_hz", doppler_hz, paths.tau.shape, finite=False)
     if not np.isfinite(given[paths.valid]).all():
         raise ValueError("doppler_hz: got NaN or infinite shifts, expected one for every path")

@@ -210,7 +210,6 @@ class SpecularPaths:
             raise ValueError(f"{name}: got shape {tuple(shape)}, expected {told}")
 
     def _uploaded(self, name: str, value: Any) -> wp.array:
-        """A parameter as the kernel takes it."""
         return wp.array(self._checked(name, value), dtype=TYPES[name], device=self.device)
 
     def _as_given(self, name: str, value: Any) -> wp.array:

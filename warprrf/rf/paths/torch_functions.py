@@ -19,9 +19,6 @@ def evaluate(
 ) -> list[torch.Tensor]:
     """What ``launch``, which Warp's tape records, makes of tensors ``given`` by name, as arrays of ``types``; ``vec2d`` are complex
     numbers. One vector may stand for a row of vectors.
-
-    Raises:
-        ValueError: for a tensor on another device.
     """
     tensors = []
     for name, value in given.items():

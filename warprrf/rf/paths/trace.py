@@ -13,7 +13,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_count, checked, whole
-from warprrf.device import DeviceLike, Progress
+from warprrf.device import DeviceLike, Progress, silent
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, GeometryLike, as_mesh
 from warprrf.geometry.planar_patches import planar_patches
 from warprrf.rf.em.absorption import Gas
@@ -91,7 +91,7 @@ def trace_paths(
     ends = Ends.of(receivers, transmitter)
     most = {"transmissions": transmissions, "diffractions": diffractions}
     _check_question(mesh_or_scene, ends, frequency_hz, device, **most)
-    tell: Progress = progress or (lambda stage, done, total: None)
+    tell = progress or silent
     found: dict[int, Paths] = {}
     for source, own in ends.groups():
         tell("patches", 0, 1)
@@ -267,7 +267,6 @@ class MirrorTracer:
         return self._held(self.find(points, mirror_order, progress), points)
 
     def _over(self, found: EdgePaths, k: int, point: np.ndarray) -> Paths:
-        """The paths over edges of receiver ``k``, at ``point``."""
         own = found.take(np.flatnonzero(found.receiver == k))
         jones = (self.wavelength_m / (4.0 * np.pi * own.length_m))[:, None, None] * own.matrix
         kind = np.full(len(own), "edge", "<U7")
@@ -279,12 +278,7 @@ class MirrorTracer:
     def find(
         self, receivers: ArrayLike, mirror_order: int = 1, progress: Progress | None = None
     ) -> MirrorPaths:
-        """Geometry of all paths to ``receivers`` (R, 3), sorted by receiver.
-
-        Raises:
-            ValueError: on another order or shape, NaN, a receiver at the transmitter's place, or a search that would
-                try too many chains.
-        """
+        """Geometry of all paths to ``receivers`` (R, 3), sorted by receiver."""
         order = check_count("mirror_order", mirror_order, 0)
         points = check_array("receivers", receivers, (None, 3))
         if (points == self.transmitter).all(axis=1).any():

@@ -32,9 +32,6 @@ def material_parameters(materials: Sequence[Any], frequency_hz: float) -> Parame
 
     A slab's reflection over the angle of incidence is replaced by the half-space of one permittivity, times a factor,
     that is nearest to it in the least squares.
-
-    Raises:
-        ValueError: outside the band of a material.
     """
     table = surface_table(list(materials), frequency_hz)
     scattering = table.scattering**2
@@ -117,14 +114,10 @@ class FullModel:
         receivers: positions [m], shape ``(R, 3)``.
         floor: N0; None for the default of the full model's spectra.
         gas_db_per_m: attenuation of air; None for that of standard air.
-        progress: called with the stage ``"relevance"``.
 
     Attributes:
         effects: names of all parts, in the order of the table.
         blocked: whether each receiver has no line of sight, shape ``(R,)``.
-
-    Raises:
-        ValueError: if most receivers get no power at all.
     """
 
     def __init__(

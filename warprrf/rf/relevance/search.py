@@ -18,7 +18,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from warprrf.checks import NotNegative, checked, one_line, positive
-from warprrf.device import Progress
+from warprrf.device import Progress, silent
 from warprrf.files import read_json, write_json
 from warprrf.geometry.mesh import as_mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
@@ -283,7 +283,7 @@ def relevance(
             receivers on a surface or outside the scene, or a tolerance that is not positive.
         TypeError: for a geometry without a mesh, a field of another model, or an unknown setting.
     """
-    tick: Progress = progress or (lambda stage, done, total: None)
+    tick = progress or silent
     model, source = full_model(geometry, receivers, device=device, progress=tick, **setting)
     found = choose(model, source, tolerance_db)
     tick("relevance", len(model.receivers) + 1, len(model.receivers) + 1)

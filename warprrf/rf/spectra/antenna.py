@@ -160,11 +160,7 @@ class Antenna:
 
     @cached_property
     def _probed(self) -> tuple[bool, float]:
-        """Whether the pattern is one of fields, and the largest gain found over the sphere.
-
-        Raises:
-            ValueError: if it returns something else than gains or fields.
-        """
+        """Whether the pattern is one of fields, and the largest gain found over the sphere."""
         angles = angles_from_directions(pixel_directions((45, 90)).reshape(-1, 3))
         ahead = angles_from_directions(directions_from_angles([0.5 * np.pi], [0.0]))
         zenith, azimuth = (np.concatenate(pair) for pair in zip(ahead, angles, strict=True))
@@ -272,11 +268,7 @@ of it from 0 to pi."""
 
 
 def as_antenna(pattern: Pattern, polarisation: str | None = None, name: str = "pattern") -> Antenna:
-    """What is meant by a pattern; ``polarisation`` is that of a gain.
-
-    Raises:
-        TypeError, ValueError: naming the argument by ``name``, if it is none; for a polarisation of what has one.
-    """
+    """What is meant by a pattern; ``polarisation`` is that of a gain."""
     if isinstance(pattern, Antenna):
         if polarisation is not None and pattern.polarised:
             raise ValueError(f"polarisation: got {polarisation!r} for an antenna with its own, expected None")

@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
+
+from warprrf.files import file_at
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,15 +44,8 @@ class Cuts:
 
 
 def read_cuts(path: str | os.PathLike[str]) -> Cuts:
-    """The cuts of a file; see the module.
-
-    Raises:
-        OSError: naming the file, if it cannot be read.
-        ValueError: naming file and line, if it is no such file, or damaged.
-    """
-    file = Path(path)
-    if not file.is_file():
-        raise FileNotFoundError(f"path: there is no file {file}")
+    """The cuts of a file; see the module."""
+    file = file_at(path)
     if file.suffix.lower() not in (".msi", ".pln"):
         raise ValueError(f"path: {file}: got a file {file.suffix or 'without suffix'}, expected .msi or .pln")
     most_bytes = 4_000_000  # a file of 720 angles a cut has 20 thousand
@@ -135,6 +129,5 @@ def _cut(key: str, rest: list[str], lines: list[str], line: int) -> np.ndarray:
 
 
 def _rising(angle: np.ndarray, loss: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each angle once, rising, with its first loss."""
     once, first = np.unique(angle, return_index=True)
     return once, loss[first]

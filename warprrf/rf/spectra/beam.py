@@ -18,9 +18,7 @@ class BeamOperator:
     the rows for each frequency. Sums are kept.
 
     Args:
-        shape: rows and columns of the images.
         sigma: width of the beam [rad].
-        device: where it is computed.
     """
 
     def __init__(self, shape: tuple[int, int], sigma: float, *, device: DeviceLike = None) -> None:

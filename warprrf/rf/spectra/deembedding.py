@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import Count, NotNegative, Positive, check_array, check_number, check_positive, checked
-from warprrf.device import DeviceLike, Progress
+from warprrf.device import DeviceLike, Progress, silent
 from warprrf.rf.spectra.antenna import Antenna, Pattern, as_antenna
 from warprrf.rf.spectra.spectrum import (
     check_shape,
@@ -181,8 +181,7 @@ def _deembed_scanned(
                 path_gain[k], source[k] = spread_paths(
                     directions, kept.reshape(-1), shape, beam_sigma_rad, device=scan.device
                 )
-            if progress is not None:
-                progress("deembed", k + 1, count)
+            (progress or silent)("deembed", k + 1, count)
     return Deembedded(path_gain, source, steps, misfit, 1.0, SCANNED)
 
 

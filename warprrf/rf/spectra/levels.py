@@ -32,7 +32,6 @@ def question_levels(
     """Question received over transmitted powers (N,) [linear], NaN where not measured.
 
     Args:
-        name: of the argument.
         free_space: what line of sight gives at most, antennas' gains included, shape ``(N,)``.
         margin_db: by how much all paths may exceed it.
         hint: what else may have raised them.

@@ -31,6 +31,7 @@ from warprrf.checks import (
     warn,
     within,
 )
+from warprrf.files import file_at
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import NEPER, Hertz
 from warprrf.rf.spectra.antenna import Antenna, Pattern, as_antenna, main_lobe, turned_gain
@@ -279,9 +280,7 @@ class Readings(PowerTable):
         Warns:
             UserWarning: as :meth:`from_table`.
         """
-        file = Path(path)
-        if not file.is_file():
-            raise FileNotFoundError(f"path: there is no file {file}")
+        file = file_at(path)
         try:
             return cls.from_table(_read_csv(file), **settings)
         except (TypeError, ValueError, csv.Error) as error:
@@ -340,11 +339,7 @@ def _check_once(names: Sequence[str]) -> None:
 
 
 def _read_csv(file: Path) -> dict[str, np.ndarray]:
-    """Columns of a CSV file by name: numbers, and text where they are not known.
-
-    Raises:
-        ValueError: naming line and column.
-    """
+    """Columns of a CSV file by name: numbers, and text where they are not known."""
     with file.open(newline="", encoding="utf-8-sig") as text:
         rows = csv.reader(text, skipinitialspace=True, strict=True)
         header = [name.strip() or f"(column {k} without a name)" for k, name in enumerate(next(rows, []), 1)]
@@ -434,11 +429,7 @@ def path_weights(
 
 
 def check_turned(name: str, value: ArrayLike, count: int) -> np.ndarray:
-    """Zeniths and azimuths (count, 2) [rad] that antennas are turned to.
-
-    Raises:
-        ValueError: for another shape, or zeniths that are none.
-    """
+    """Zeniths and azimuths (count, 2) [rad] that antennas are turned to."""
     angles = check_array(name, value, (count, 2))
     wrong = angles[np.abs(angles[:, 0] - np.pi / 2) > np.pi / 2 + 1e-6, 0]
     if len(wrong):

@@ -44,11 +44,7 @@ DEFAULT_SHAPE = (90, 180)
 
 
 def check_shape(shape: Sequence[int]) -> tuple[int, int]:
-    """``shape`` as (rows, columns), each at least 2, at most 2^24 in all (a sixteenth of a degree each).
-
-    Raises:
-        ValueError: otherwise.
-    """
+    """``shape`` as (rows, columns), each at least 2, at most 2^24 in all (a sixteenth of a degree each)."""
     try:
         rows, columns = (check_count("shape", n, 2) for n in shape)
     except (TypeError, ValueError) as error:
@@ -61,11 +57,7 @@ def check_shape(shape: Sequence[int]) -> tuple[int, int]:
 
 
 def check_range_db(range_db: Sequence[float]) -> tuple[float, float]:
-    """``range_db`` as lowest and highest value [dB].
-
-    Raises:
-        TypeError, ValueError: if it is not two finite numbers, or the first lies above the second.
-    """
+    """``range_db`` as lowest and highest value [dB]."""
     low, high = (float(value) for value in check_array("range_db", range_db, (2,)))
     if not -1e4 <= low <= high <= 1e4:
         raise ValueError(f"range_db: got {low:g} to {high:g}, expected decibels, the lowest value first")
@@ -79,11 +71,7 @@ Floor: TypeAlias = Annotated[float, positive("linear noise floor")]
 
 
 def check_departures(aod: np.ndarray) -> None:
-    """Refuse angles of departure ``(..., 2)`` that are none; NaN is an empty one.
-
-    Raises:
-        ValueError: for angles that are out of range, or known in part.
-    """
+    """Refuse angles of departure ``(..., 2)`` that are none; NaN is an empty one."""
     check_known_whole("aod", aod)
     zenith, azimuth, rounding = aod[..., 0], aod[..., 1], 1e-3  # by as much compact files are out of range
     if ((zenith < -rounding) | (zenith > np.pi + rounding) | (np.abs(azimuth) > np.pi + rounding)).any():
@@ -194,9 +182,6 @@ def to_db(path_gain: ArrayLike, floor: float = 0.0) -> np.ndarray:
 def default_floor(path_gain: np.ndarray) -> float:
     """N0 of a data set ``(R, H, W)``: median over views of the view's maximum, less 60 dB. Empty views (blocked, where
     surfaces scatter nothing) do not count.
-
-    Raises:
-        ValueError: if all views are empty.
     """
     peak = np.nan_to_num(path_gain).reshape(len(path_gain), -1).max(axis=1)
     if not (peak > 0.0).any():
@@ -251,7 +236,6 @@ def spread_paths(
     Args:
         directions: Directions of arrival, shape ``(L, 3)``, normalised here.
         powers: Path gains, linear, not negative, shape ``(L,)``.
-        shape: Rows and columns of the grid.
         sigma: Beam width, kappa = 1 / sigma^2 [rad].
         beams: :func:`beam_sums` of the directions, where they are known: half of the work.
 
@@ -312,7 +296,6 @@ def strongest_rays(
     Args:
         directions: unit vectors on the device, pixel by pixel, equally many in each pixel's cell.
         power: of each, not negative.
-        shape: rows and columns of the grid.
         sigma: beam width [rad].
     """
     rows, columns = check_shape(shape)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from warprrf.cache import cached_property
 from warprrf.checks import LARGEST_M, Expected, check_arrays, index_to, lengths
 from warprrf.geometry.mesh import Mesh
-from warprrf.rows import distinct_rows, sums_of
+from warprrf.rows import distinct_rows, spans, sums_of
 
 ELEMENT_M = 0.5  # width of an element in a room; larger scenes have wider ones
 _ACROSS = np.array([[1, 2], [0, 2], [0, 1]])  # the two other axes
@@ -95,9 +95,6 @@ class Cells:
         squares: number of each row's squares, shape ``(R,)``.
         cell: of each square, shape ``(T,)`` int32.
         element: of each cell, shape ``(X,)`` int32.
-
-    Raises:
-        TypeError, ValueError: for arrays that do not fit each other, or values out of range.
     """
 
     axis: np.ndarray
@@ -172,9 +169,7 @@ class Cells:
 
     def tiles(self, mesh: Mesh) -> Tiles:
         """What lies of the faces of ``mesh``, whose cells they are, in each square."""
-        face = np.repeat(np.arange(len(self.rows)), self.rows)
-        strip = np.repeat(np.arange(len(self.squares)), self.squares)
-        row, square = np.arange(len(face)) - self._row[face], np.arange(len(strip)) - self._square[strip]
+        (face, row), (strip, square) = (spans(0 * count, count) for count in (self.rows, self.squares))
         wide_m = self.width_m[face]
         strips = _flattened(mesh, self.axis)[face]
         strips = _between(strips, 0, self.first_row_m[face] + wide_m * row, wide_m)[strip]
@@ -184,8 +179,9 @@ class Cells:
 
     def take(self, face: np.ndarray) -> tuple[Cells, np.ndarray]:
         """Those of some faces (N,), numbered anew, and which ones they are."""
-        row = _members(self._row, self.rows, face)
-        used, cell = np.unique(self.cell[_members(self._square, self.squares, row)], return_inverse=True)
+        row = spans(self._row[face], self.rows[face])[1]
+        square = spans(self._square[row], self.squares[row])[1]
+        used, cell = np.unique(self.cell[square], return_inverse=True)
         element = np.unique(self.element[used], return_inverse=True)[1].astype(np.int32)
         faces = {name: getattr(self, name)[face] for name in ("axis", "width_m", "first_row_m", "rows")}
         rows = {name: getattr(self, name)[row] for name in ("first_square_m", "squares")}
@@ -199,12 +195,10 @@ class Cells:
 
     @cached_property
     def _row(self) -> np.ndarray:
-        """First row of each face."""
         return np.cumsum(self.rows, dtype=np.int64) - self.rows
 
     @cached_property
     def _square(self) -> np.ndarray:
-        """First square of each row."""
         return np.cumsum(self.squares, dtype=np.int64) - self.squares
 
 
@@ -221,8 +215,7 @@ def _squares(x: np.ndarray, width_m: float) -> tuple[np.ndarray, np.ndarray, np.
     low = np.floor(x.min(axis=1) / width_m + _TOUCHING).astype(np.int64)
     high = np.ceil(x.max(axis=1) / width_m - _TOUCHING).astype(np.int64)
     count = np.maximum(high - low, 1).astype(np.int32)
-    owner = np.repeat(np.arange(len(x)), count)
-    return owner, low[owner] + np.arange(len(owner)) - (np.cumsum(count) - count)[owner], count
+    return *spans(low, count), count
 
 
 def _between(points: np.ndarray, k: int, low: np.ndarray, width: ArrayLike) -> np.ndarray:
@@ -245,9 +238,3 @@ def _below(points: np.ndarray, k: int, limit: np.ndarray, sign: float) -> np.nda
     last = np.maximum(known.sum(axis=1) - 1, 0)
     order = np.take_along_axis(order, np.minimum(np.arange(corners + 1), last[:, None]), axis=1)
     return np.take_along_axis(both, order[..., None], axis=1)
-
-
-def _members(first: np.ndarray, count: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Indices of what each of ``chosen`` (N,) has, ``count`` from ``first`` on, one after another."""
-    size = count[chosen]
-    return np.repeat(first[chosen] - (np.cumsum(size) - size), size) + np.arange(size.sum())

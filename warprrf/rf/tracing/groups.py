@@ -69,7 +69,6 @@ def colour_groups(
     than luminance, which is also shade.
 
     Args:
-        mesh: F faces.
         patch: planar patch of each, -1 for none, shape ``(F,)``.
         colours: on its faces.
 
@@ -104,7 +103,7 @@ def _sheets(mesh: Mesh, patch: np.ndarray) -> np.ndarray:
     key = np.where(crumb, patch + int(piece.max()) + 1, piece)
     sheet = np.full(len(patch), -1)
     own = patch >= 0
-    sheet[own] = np.unique(key[own], return_inverse=True)[1].reshape(-1)
+    sheet[own] = np.unique(key[own], return_inverse=True)[1]
     return sheet
 
 
@@ -137,16 +136,19 @@ def _halved(feature: np.ndarray, size: np.ndarray) -> np.ndarray:
     if side.all() or not side.any():
         return one
     label = side.astype(np.int64)
+
+    def centres() -> np.ndarray:
+        return np.stack([np.average(feature[label == k], axis=0, weights=size[label == k]) for k in (0, 1)])
+
     for _ in range(20):  # Lloyd's steps, with weights, which SciPy's do without
-        centre = np.stack([np.average(feature[label == k], axis=0, weights=size[label == k]) for k in (0, 1)])
-        nearest = cdist(feature, centre).argmin(axis=1)
+        nearest = cdist(feature, centres()).argmin(axis=1)
         if (nearest == label).all() or nearest.all() or not nearest.any():
             break
         label = nearest
     share = size[label == 1].sum() / size.sum()
     if not 0.03 < share < 0.97:
         return one
-    centre = np.stack([np.average(feature[label == k], axis=0, weights=size[label == k]) for k in (0, 1)])
+    centre = centres()
     gap = np.linalg.norm(centre[1] - centre[0])
     along = (feature - centre[label]) @ (centre[1] - centre[0]) / max(gap, 1e-12)
     apart, apart_std = 1.2, 4.0  # least distance of colours of one sheet, and in deviations within each
@@ -185,7 +187,7 @@ def _alike(colour: np.ndarray, flat: np.ndarray, area: np.ndarray) -> np.ndarray
     rest = np.flatnonzero(material < 0)
     material[rest] = len(large) + _joined(colour[rest], rest_alike)
     while True:  # too small to learn from: join what looks most like it
-        material = np.unique(material, return_inverse=True)[1].reshape(-1)
+        material = np.unique(material, return_inverse=True)[1]
         whole = np.bincount(material, area)
         tiny = int(whole.argmin())
         if len(whole) < 2 or whole[tiny] >= GROUP_M2:
@@ -200,7 +202,6 @@ def shape_groups(mesh: Mesh, patch: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     """Groups of faces by planar patch and connected part.
 
     Args:
-        mesh: F faces.
         patch: planar patch of each, -1 for none, shape ``(F,)``.
 
     Returns:
@@ -249,7 +250,7 @@ def _without_crumbs(mesh: Mesh, piece: np.ndarray, part: np.ndarray) -> np.ndarr
         place = np.column_stack([mesh.triangles.mean(axis=1), reach * part])  # parts far apart
         keep = np.flatnonzero(~crumb)
         piece[crumb] = piece[keep[cKDTree(place[keep]).query(place[crumb])[1]]]
-    return np.unique(piece, return_inverse=True)[1].reshape(-1)
+    return np.unique(piece, return_inverse=True)[1]
 
 
 def _moments(mesh: Mesh, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,7 @@ transmitter besides.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -66,13 +66,11 @@ class Light:
         strength: Omega cos(theta_i) / (4 pi d1)^2 [sr/m^2] if nothing throws a shadow; less what the air absorbs, shape ``(K,)``.
         angle: cosines of incidence, of scattering, and of the angle to the mirror direction, shape ``(K, 3)``.
         point: where the rays hit [m], known where there is light, shape ``(K, 3)``.
-        lit: rows that no shadow falls on, if shadows were cast.
     """
 
     strength: np.ndarray
     angle: np.ndarray
     point: np.ndarray
-    lit: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
 
 def quasi_random(count: int, each: int) -> np.ndarray:
@@ -95,12 +93,9 @@ class RayGrid:
     """Rays that fill the sphere around a receiver, and other rays, on one surface.
 
     Args:
-        surface: what is hit.
-        shape: rows and columns of a spectrum.
         sub_pixels: square root of the rays per pixel.
         loss_per_m: absorption by the air [neper/m].
         dtype: precision of angles and of light.
-        device: where rays are cast.
     """
 
     def __init__(
@@ -176,15 +171,15 @@ class RayGrid:
         usable = not self.device.is_cuda and mesh_rays.open3d_installed()
         return "embree" if usable and count >= mesh_rays.EMBREE_RAYS else "warp"
 
-    def light(self, hits: Hits, source: np.ndarray) -> Light:
-        """How a transmitter at ``source`` (3,) [m] illuminates what was hit, and where shadows fall."""
+    def light(self, hits: Hits, source: np.ndarray) -> tuple[Light, np.ndarray]:
+        """How a transmitter at ``source`` (3,) [m] illuminates what was hit, and rows that no shadow falls on."""
         found = self.unshadowed(hits, source)
         ray = np.flatnonzero(found.strength > 0)
         free = self.surface.mesh.visible(
             np.asarray(source, float), found.point.take(ray, axis=0), clearance=self.surface.position_error_m, device=self.device,
             backend=self._backend(len(ray)),
         )  # fmt: skip
-        return replace(found, lit=ray[free])
+        return found, ray[free]
 
     def unshadowed(self, hits: Hits, sources: np.ndarray, ray: np.ndarray | None = None) -> Light:
         """How transmitters at ``sources`` (3,) or (K, 3) [m] would illuminate what rays of index ``ray`` (K,), by default

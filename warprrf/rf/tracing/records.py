@@ -138,7 +138,6 @@ class Records(Interactions):
         It is real: half-spaces have no phase but their sign, and of slabs the sizes count; what they delay is in the path's length.
 
         Args:
-            materials: of the surfaces.
             sent, heard: fields of the antennas in the (TE, TM) of the first interaction and of the last, shape ``(N, 2)`` each.
         """
         if len(self) == 0:
@@ -232,13 +231,11 @@ class Materials:
     """Materials as kernels take them: M rows of parameters, and which of them each of G groups of faces is made of.
 
     Args:
-        parameters: of the materials.
         slabs: complex permittivity of each group, 0 where it is not known, and its thickness in wavelengths, ``(G,)`` each; see
             :attr:`~warprrf.rf.tracing.tracer.Tracer.slabs`.
         material: row of each group in the parameters, shape ``(G,)``; by default groups are rows.
         side_group: group of each element's side, shape ``(E,)``; None where no element sends.
         radiance: that each side sends [1/(m^2 sr)], in units of (4 pi / lambda)^2, shape ``(E,)``.
-        device: where powers are computed.
     """
 
     def __init__(
@@ -290,10 +287,7 @@ class SlabMaterials(Materials):
     """A scene's materials as kernels take them: slabs, and lobes of either kind beside each other.
 
     Args:
-        table: radio properties at a carrier.
-        wavelength_m: of that.
         material: of each group, shape ``(G,)``.
-        device: where powers are computed.
     """
 
     def __init__(

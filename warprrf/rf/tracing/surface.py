@@ -97,9 +97,6 @@ class Surface:
             that photos saw.
         face_object: object that each face belongs to, -1 for none, shape ``(F,)`` int32; by default none.
         object_names: what the objects are called.
-
-    Raises:
-        TypeError, ValueError: for arrays that do not fit each other, or indices and values out of range.
     """
 
     mesh: Mesh = field(repr=False)
@@ -279,10 +276,6 @@ class Surface:
         where there are no colours. A mesh with the noise of a scan is flattened where planes are found in it. Elements are
         ``element_m`` wide; by default as the whole asks for. Materials of several bands are of that which holds
         ``frequency_hz``, by default the first.
-
-        Raises:
-            TypeError: if it has no mesh.
-            ValueError: if it is so large that elements would be wider than 25 m.
         """
         if isinstance(geometry, Surface):
             return geometry

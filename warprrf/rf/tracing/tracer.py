@@ -23,6 +23,7 @@ import numpy as np
 
 from warprrf.cache import Cache, making
 from warprrf.device import DeviceLike, Progress, resolve
+from warprrf.geometry.mesh import headings
 from warprrf.kernels.radio.records import MIRROR, SCATTER, SLAB, SOURCE
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -36,6 +37,7 @@ from warprrf.rf.tracing.model import Effects
 from warprrf.rf.tracing.rays import NEAREST_M, Hits, RayGrid, quasi_random
 from warprrf.rf.tracing.records import Interactions, Records
 from warprrf.rf.tracing.surface import Surface
+from warprrf.rows import spans
 
 MIRROR_SLACK_M = 0.1
 """How far beside its faces a patch may still mirror [m]: outlines of a reconstructed mesh are torn."""
@@ -164,10 +166,6 @@ class Tracer:
     """Geometry under one transmitter.
 
     Args:
-        surface: what is hit.
-        transmitter: position (3,) [m].
-        frequency_hz: carrier.
-        grid: rays of a receiver.
         walls: what may be passed, where that is known; else the surface tells.
 
     Attributes:
@@ -328,10 +326,10 @@ class Tracer:
     def lit(self, rays: Rays, most: int) -> dict[str, Records]:
         """What rays see of surfaces that the transmitter lights, ``"S"``, and, if ``most`` is not 0, through slabs, up to that
         many, ``"TS"``."""
-        light = self.grid.light(rays.hits, self.transmitter)
-        found = {"S": self.scattered(rays, light.lit, light.strength[light.lit], light.angle[light.lit])}
+        light, lit = self.grid.light(rays.hits, self.transmitter)
+        found = {"S": self.scattered(rays, lit, light.strength[lit], light.angle[lit])}
         if most:
-            row = np.setdiff1d(np.flatnonzero(light.strength > 0), light.lit)
+            row = np.setdiff1d(np.flatnonzero(light.strength > 0), lit)
             arrived, slabs = self.walls(most).between(self.transmitter, light.point[row])
             own = np.flatnonzero(slabs.count > 0)
             row, slabs = row[arrived[own]], slabs.take(own)
@@ -362,8 +360,7 @@ class Tracer:
         k = np.flatnonzero(light.strength > 0)
         strength = light.strength[k] * self.grid.dtype.type(times)
         if before is None:
-            way = images[patch[k]] - light.point[k]
-            way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
+            way = headings(images[patch[k]] - light.point[k])[0]
             cosine = np.abs(np.einsum("ni,ni->n", way, s.plane_normal[patch[k]]))
             mirrors = Interactions.of_mirrors(s.patch_group[patch[k]], cosine)
         else:
@@ -506,7 +503,6 @@ class MirroredLight:
     is what faces one of six ways of a cell.
 
     Args:
-        tracer: of the transmitter.
         most: if not 0, the images are those whose light comes through some slabs, before or behind the mirror, up to that many.
 
     Attributes:
@@ -558,9 +554,7 @@ class MirroredLight:
         paths = tracer.specular(described(ways, 1, walls))
         self.before, self.patch = paths, patch
         self._first = np.searchsorted(piece, np.arange(len(middle) + 1))
-        way = s.images(tracer.transmitter)[patch] - centre[piece]
-        length = np.linalg.norm(way, axis=1)
-        toward = way / np.maximum(length, 1e-12)[:, None]
+        toward, length = headings(s.images(tracer.transmitter)[patch] - centre[piece])
         cos_in = self.cosine = np.maximum((toward * normal).sum(axis=1), 0.0)
         behind = s.is_behind(middle[piece], -normal).astype(int)
         ray = s.tile_side[tile[piece] + behind * len(tiles.face)]
@@ -571,7 +565,4 @@ class MirroredLight:
     def pairs(self, tile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows of ``tile`` (N,), and images that light them, one for each pair."""
         piece = self._piece[tile]
-        first, end = self._first[piece], self._first[piece + 1]
-        count = end - first
-        within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-        return np.repeat(np.arange(len(piece)), count), np.repeat(first, count) + within
+        return spans(self._first[piece], np.diff(self._first)[piece])

@@ -164,6 +164,5 @@ def _continued(values: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def _joined(a: Gaussians, b: Gaussians) -> Gaussians:
-    """All Gaussians of both, which are of one degree."""
     names = ("means", "quaternions", "scales", "opacities", "sh")
     return Gaussians(*(np.concatenate([getattr(a, name), getattr(b, name)]) for name in names))

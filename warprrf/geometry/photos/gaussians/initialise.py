@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from warprrf.device import DeviceLike, Progress
+from warprrf.device import DeviceLike, Progress, silent
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.gaussians.cells import meeting, occupancy, plane_mesh, quarters, seen_cells
 from warprrf.geometry.photos.gaussians.plain import plain_surfaces, with_plain
@@ -144,7 +144,7 @@ def initialise(
     Args:
         sparse: posed cameras and points [m], those of held-out photos among them.
     """
-    report = progress or (lambda stage, done, total: None)
+    report = progress or silent
     report("planes", 0, 6)
     if len(sparse.points) < 3:
         raise ValueError(

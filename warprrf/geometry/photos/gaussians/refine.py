@@ -17,7 +17,7 @@ import warp as wp
 
 from warprrf import tensor_files
 from warprrf.checks import check_count
-from warprrf.device import DeviceLike, Progress, launch, resolve
+from warprrf.device import DeviceLike, Progress, launch, resolve, silent
 from warprrf.geometry.photos.config import RefineConfig
 from warprrf.geometry.photos.gaussians.densify import (
     PARAMETERS,
@@ -70,7 +70,7 @@ def refine(
         run.restore(Path(checkpoint))
     else:
         run.start(gaussians)
-    report = progress or (lambda stage, done, total: None)
+    report = progress or silent
     report("refine", run.done(), PARTS)
     while run.iteration < config.iterations:
         run.step()
@@ -118,7 +118,6 @@ class _Refinement:
         return {**arrays, "plane_of": owner}
 
     def load(self, arrays: Arrays) -> None:
-        """Put the state on the device."""
         n, device = len(arrays["means"]), self.device
         self.count = n
         self.widths = {name: arrays[name].reshape(n, -1).shape[1] for name in PARAMETERS}
@@ -251,12 +250,10 @@ class _Refinement:
         return Gaussians(arrays["means"], arrays["quaternions"], scales, opacity, sh)[keep]
 
     def store(self, path: Path) -> None:
-        """Write the whole state."""
         arrays = {**self.arrays(), "log_gains": self.exposures.log_gains}
         tensor_files.write(path, arrays, {"iteration": self.iteration}, CHECKPOINT)
 
     def restore(self, path: Path) -> None:
-        """Continue from a checkpoint."""
         try:
             arrays, header = tensor_files.read(path, CHECKPOINT)
         except ValueError as error:

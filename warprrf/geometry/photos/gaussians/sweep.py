@@ -268,7 +268,6 @@ def united(planes: Sequence[Plane], others: Sequence[Plane]) -> list[Plane]:
 
 
 def _united(plane: Plane, other: Plane) -> Plane:
-    """``plane`` with the cells of ``other`` too."""
     centres = np.concatenate([plane.cells(), other.cells()])
     index = np.round((plane.to_plane(centres) - plane.corner) / plane.cell_m - 0.5).astype(int)
     low = index.min(axis=0)

@@ -256,7 +256,6 @@ def _whole(value: object) -> object:
 
 
 def _inside(folder: Path, name: object) -> Path:
-    """The file ``name`` of ``folder``."""
     check_type("depth_file_path", name, str)
     path = folder / str(name)
     if not path.resolve().is_relative_to(folder.resolve()):
@@ -311,7 +310,6 @@ def _read_frames(folder: Path) -> dict[str, KnownCamera]:
 
 
 def _numbers(path: Path, size: int, finite: bool = True) -> np.ndarray:
-    """A square matrix of numbers in a small text file."""
     # 100_000: bytes of a pose or of intrinsics
     if path.stat().st_size > 100_000:
         raise ValueError(

@@ -267,7 +267,6 @@ def _root(named: Mapping[str, Path]) -> Path:
 
 
 def _fresh(folder: Path) -> Path:
-    """``folder``, empty."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     return folder
@@ -497,7 +496,6 @@ def _calibrate(matches: Path, scratch: Path, seed: int) -> None:
 
 
 def _names(model: Any) -> set[str]:
-    """Names of the posed photos of a model."""
     return {image.name for image in model.images.values() if image.has_pose}
 
 
@@ -622,7 +620,6 @@ def lenses_of(model: Any) -> dict[str, Lens]:
 
 
 def _causes(matches: Path, sparse: SparseModel) -> dict[str, str]:
-    """Why photos have no pose, by name."""
     colmap = load_colmap()
     with colmap.Database.open(str(matches)) as database:
         names = {i.image_id: i.name for i in database.read_all_images()}

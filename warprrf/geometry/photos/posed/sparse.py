@@ -214,9 +214,6 @@ def fit_similarity(source: ArrayLike, target: ArrayLike) -> tuple[float, np.ndar
 
     Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 13(4),
     1991, eqs. (40) to (43). Float64 throughout.
-
-    Raises:
-        ValueError: for fewer than three points, or points on one line.
     """
     source = check_array("source", source, (None, 3))
     target = check_array("target", target, (len(source), 3))

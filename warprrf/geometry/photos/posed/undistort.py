@@ -160,7 +160,6 @@ def _reduced(lens: Lens, max_pixels: int) -> Lens:
 
 
 def _undistorted(lens: Lens) -> Lens:
-    """The pinhole lens of photos of ``lens``, undistorted."""
     if lens.straight:
         return lens
     colmap = load_colmap()

@@ -18,7 +18,7 @@ from warprrf.geometry.photos.gaussians.cells import quarters
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.planes import ALIGNED_DEG, Plane
 from warprrf.geometry.splats.camera import Camera
-from warprrf.rows import distinct_rows
+from warprrf.rows import distinct_rows, spans
 
 EXACT_DEG, STRONG_M2 = 0.1, 2.0
 """A plane this parallel, with a proven area above the second, keeps its own tilt (0.1 degrees are 2 cm over 12 m): it is
@@ -377,8 +377,8 @@ def votes(
     rays_at_once = 20_000
     for first in range(0, len(o), rays_at_once):
         count = counts[first : first + rays_at_once]
-        ray = np.repeat(np.arange(first, first + len(count)), count)
-        step = np.arange(len(ray)) - np.repeat(np.cumsum(count) - count, count)
+        ray, step = spans(0 * count, count)
+        ray += first
         free += grid.count(o[ray] + ((step + 0.5) * step_m)[:, None] * d[ray])
     for plane, level in proven:
         points, across = quarters(plane).reshape(-1, 3), grid.axes[level.axis]

@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from warprrf.device import DeviceLike, Progress, threads
+from warprrf.device import DeviceLike, Progress, silent, threads
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.posed.images import PosedPhotos, lens_matrix
@@ -61,7 +61,7 @@ def depth_maps(
         photos: what ``cameras`` saw, in the same order; the depth maps are mended by them.
         planes: that Gaussians were kept on: elsewhere only what photos prove is reliable.
     """
-    report = progress or (lambda stage, done, total: None)
+    report = progress or silent
     views, depths = depth_views(cameras, config.surface), []
     alpha = 0.6  # a depth counts where at least so much light is blocked,
     depth_spread = 0.05  # and where blended depth and dominant Gaussian differ by no more than this part
@@ -129,7 +129,7 @@ def fuse_maps(
         depths: ranges [m], 0 where unknown, each of one of ``views``.
         planes: known beforehand; the mesh is snapped to them.
     """
-    report = progress or (lambda stage, done, total: None)
+    report = progress or silent
     report("surface", 0, 4)
     mesh = fuse_depth(depths, views, config=_with_voxels(config.surface, views, depths))
     report("surface", 1, 4)

@@ -40,7 +40,6 @@ def mended(
 
     Args:
         depths: ranges [m], ``(height, width)`` of each of ``views``, 0 where unknown.
-        photos: one a view, in this order.
     """
     known = [depth[depth > 0] for depth in depths]
     if sum(map(len, known)) == 0:

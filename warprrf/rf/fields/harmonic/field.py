@@ -39,7 +39,7 @@ from warprrf.checks import (
     one_line,
     within,
 )
-from warprrf.device import DeviceLike, Progress, launch
+from warprrf.device import DeviceLike, Progress, launch, silent
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.splats.gaussians import Gaussians, discs_on_mesh, gaussians_of
 from warprrf.geometry.splats.rasterizer import Parameters, Rasterizer
@@ -247,7 +247,6 @@ class HarmonicField(RadioField):
         }
 
     def _on_device(self) -> Parameters:
-        """The Gaussians where they are rendered, uploaded once."""
         return self._uploaded.get("gaussians", lambda: Rasterizer(device=self.device).upload(self.gaussians))
 
     def _bounces(self, seen: Transport, transmitter: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -398,8 +397,7 @@ def _train(
 
     def each(name: str, done: int, state: Callable[[], fitting.State]) -> None:
         """What follows each step of a layer: progress, and now and then the checkpoint."""
-        if progress is not None:
-            progress("fit", before + done, sum(steps.values()))
+        (progress or silent)("fit", before + done, sum(steps.values()))
         if checkpoint is not None and (done % 50 == 0 or done == steps[name]):
             states[name] = state()
             fitting.save_states(checkpoint, identity, states)

@@ -155,11 +155,7 @@ def load_states(path: str | os.PathLike[str] | None, identity: str) -> dict[str,
     """States of layers in a checkpoint; none if there is none.
 
     Args:
-        path: of the file.
         identity: digest of all that the fit's result depends on.
-
-    Raises:
-        ValueError: if the file is corrupt or belongs to another fit.
     """
     if path is None or not Path(path).exists():
         return {}
@@ -222,7 +218,6 @@ class Layer:
         self.gradient = wp.zeros(len(p.seen), dtype=k.vec16, device=p.device)
 
     def _data(self, receivers: np.ndarray) -> _BatchTarget:
-        """The target of some receivers."""
         p, target, shape = self.problem, self.target, (len(receivers), *self.problem.transport.shape)
         image = np.asarray(target.image[receivers], p.precision)
         factor, extra, mask = (
@@ -301,13 +296,10 @@ def fit_layer(
     """Fit one layer.
 
     Args:
-        problem: weights and batches.
-        target: what to fit.
         steps: optimiser steps, one batch each.
         rates: learning rates and ridge.
         degree: of the harmonics, 0 to 3; coefficients above it stay zero.
         opacity: opacities that are trained with the layer; None leaves them as they are.
-        state: go on from here instead of starting.
         each: called after every step with the number of steps done and a function that gives the state.
 
     Returns:
@@ -382,9 +374,6 @@ def targets(
         Targets of the layers in order: ``gain`` first, then ``delay``, ``aod_x``, ``aod_y``, ``aod_z`` for ``rf3dgs``;
         the linear factor of the gain, its median over the pixels above the floor; seconds per unit of the delay
         layer, the longest delay.
-
-    Raises:
-        ValueError: if no pixel above the floor meets a Gaussian.
     """
     floor = ds.floor
     blended = factor * problem.transport.pixel_weight

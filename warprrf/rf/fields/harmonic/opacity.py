@@ -64,11 +64,9 @@ def list_responses(
     """Responses and order along the rays of the receivers of ``seen``, on its device.
 
     Args:
-        gaussians: the frozen geometry.
         seen: weights of the receivers, whose interaction points are kept; made with the ``product`` rule.
         range_db: range of the data set's dB images.
         top_k: Gaussians kept per pixel, those of largest thinned weight.
-        progress: called once a receiver with the stage ``"transport"``.
     """
     rules, device = cutoffs(range_db), seen.device
     share = 0.5  # of each opacity
@@ -95,7 +93,6 @@ class OpacityTraining:
 
     Args:
         problem: of the transport of ``listed``.
-        listed: responses.
         opacities: to start from, of all Gaussians, shape ``(N,)``.
         state: logits and Adam's moments to go on from, shape ``(3, G)``.
     """

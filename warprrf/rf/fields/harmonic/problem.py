@@ -41,7 +41,6 @@ class Problem:
         transport: weights of the training receivers, which are copied if they lie on another device.
         batch: receivers per optimiser step.
         seed: deals receivers into batches and orders them.
-        device: where to fit.
         precision: ``np.float32``, or ``np.float64`` for gradient checks.
     """
 

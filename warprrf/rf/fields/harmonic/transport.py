@@ -130,18 +130,11 @@ def transport(
     """Blending weights of ``gaussians`` for every pixel of every receiver.
 
     Args:
-        gaussians: the frozen geometry.
         receivers: positions [m], shape ``(R, 3)``.
-        shape: rows and columns of a spectrum.
         range_db: lowest and highest value of the data set's dB images: sets :func:`cutoffs`.
         rule: transmittance: ``"product"`` of (1 - alpha), or the paper's ``"exp"`` of minus the sum of alphas.
         top_k: Gaussians kept per pixel.
-        device: where blending runs.
         uploaded: the Gaussians, if they lie there already.
-        progress: called once a receiver with the stage ``"transport"``.
-
-    Raises:
-        ValueError: for positions that are not finite, or an unknown rule.
     """
     positions = check_array("receivers", receivers, (None, 3))
     if len(positions) == 0:
