@@ -66,14 +66,11 @@ def test_no_figure_is_typed(page):
 
 STALE = {
     "arrays",
-    "bare_mesh",
     "beams",
     "bistatic",
     "edited",
-    "lobby",
     "lobby_seeds",
     "locate",
-    "map",
     "measured_flat",
     "measured_hall",
     "measured_office",
