@@ -66,10 +66,6 @@ def test_no_figure_is_typed(page):
 
 STALE = {
     "arrays",
-    "beams",
-    "bistatic",
-    "edited",
-    "lobby_seeds",
     "locate",
     "measured_flat",
     "measured_hall",
