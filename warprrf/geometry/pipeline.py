@@ -180,7 +180,7 @@ def _check_world(poses: object, depth: object, known_positions: object, scale: o
             raise ValueError(f"{name}: got {value!r} without poses, expected both")
     if up is not None:
         check_choice("up", up, UP)
-    if isinstance(scale, float) and poses is None:
+    if poses is None and not isinstance(scale, tuple | None):
         raise ValueError(
             f'scale: got {scale}, expected ("a.jpg", "b.jpg", metres); a number of metres for each unit goes with poses'
         )

@@ -222,3 +222,4 @@ def test_frames_where_tracking_was_lost_are_left_out_and_bad_ones_named(rgbd, tm
 def test_arguments_that_need_one_another_are_named(options, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         wr.reconstruct(PHOTOS, workspace=tmp_path, **options)
+        ({"scale": 2}, "goes with poses"),
