@@ -121,7 +121,7 @@ def reconstruct(
     refinement = replace(config.refine, seed=seed, iterations=iterations)
     config = replace(config, refine=refinement)
     named = find_photos(photos)
-    skipped = set(match_names("held_out", held_out, list(named)))
+    skipped = set(match_names("held_out", dict.fromkeys(held_out), list(named)))
     if known_positions is not None:
         match_names("known_positions", known_positions, list(named))
     _check_world(poses, depth, known_positions, scale, up)
