@@ -63,6 +63,7 @@ def test_transforms_hold_the_cameras_that_were_written(tmp_path):
     "values, model, coefficients",
     [
         ({"k1": 0.1, "p2": 0.01}, "OPENCV", (0.1, 0.0, 0.0, 0.01)),
+        ({"camera_model": "PINHOLE", "k1": 0.1}, "OPENCV", (0.1, 0.0, 0.0, 0.0)),  # as nerfstudio has it
         ({"k1": 0.1, "k3": 0.02}, "FULL_OPENCV", (0.1, 0, 0, 0, 0.02, 0, 0, 0)),
         ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k4": 0.01}, "OPENCV_FISHEYE", (0.1, 0, 0, 0.01)),
         ({"is_fisheye": True, "k2": 0.1}, "OPENCV_FISHEYE", (0, 0.1, 0, 0)),
@@ -81,6 +82,14 @@ def test_an_angle_of_view_tells_the_focal_length(tmp_path):
     path.write_text(json.dumps({"camera_angle_x": np.pi / 2, "frames": frames()}))
     lens = next(iter(read_poses(path).values())).of_size("a", 640, 480)
     assert lens.fx == lens.fy == pytest.approx(320.0) and (lens.cx, lens.cy) == (320.0, 240.0)
+    shifted = {"camera_angle_x": np.pi / 2, "cx": 300.0, "k1": 0.1, "frames": frames()}
+    path.write_text(json.dumps(shifted | {"w": 640, "h": 480}))
+    lens = next(iter(read_poses(path).values())).of_size("a", 320, 240)
+    assert lens.fx == lens.fy == pytest.approx(160.0) and (lens.cx, lens.cy) == (150.0, 120.0)
+    assert lens.coefficients == (0.1, 0, 0, 0)
+    path.write_text(json.dumps(shifted))
+    with pytest.raises(ValueError, match="camera_angle_x without w and h tells no distortion, cx and cy"):
+        read_poses(path)
 
 
 @pytest.mark.parametrize(
