@@ -221,6 +221,14 @@ def test_frames_where_tracking_was_lost_are_left_out_and_bad_ones_named(rgbd, tm
 
 
 @pytest.mark.parametrize(
+def test_a_depth_image_is_of_one_photo(tmp_path):
+    for k in range(3):
+        (tmp_path / f"{k}.png").touch()
+    assert len(find_depth(tmp_path, ["a/0.jpg", "a/1.jpg", "b/2.jpg"])) == 3
+    with pytest.raises(ValueError, match="depth: .* one image for several photos of one file name: a/0.jpg"):
+        find_depth(tmp_path, ["a/0.jpg", "a/1.jpg", "b/0.jpg"])
+
+
     "options, message",
     [
         ({"depth": "."}, "depth: got .* without poses"),

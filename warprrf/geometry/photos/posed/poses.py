@@ -179,6 +179,10 @@ def find_depth(folder: Path, photos: Iterable[str]) -> dict[str, Path]:
     files = {p.name.removesuffix(".png").removesuffix(".depth"): p for p in sorted(folder.glob("*.png"))}
     stems = {photo: PurePosixPath(photo).stem.removesuffix(COLOUR_FILE) for photo in photos}
     found = {photo: files[stem] for photo, stem in stems.items() if stem in files}
+    if len(set(found.values())) < len(found):
+        raise ValueError(
+            f"depth: {folder} holds one image for several photos of one file name: {some_of(list(found))}"
+        )
     if len(found) < MIN_PHOTOS:
         raise ValueError(
             f"depth: {folder} holds depth of {len(found)} photos, expected at least {MIN_PHOTOS}; it has files like "
@@ -213,14 +217,14 @@ def _camera(values: Mapping[str, Any], folder: Path) -> KnownCamera:
         if name in values:
             unit = check_positive(name, values[name], "number of metres for each unit")
     angle, lens = 0.0, tuple[float, ...]()
-    if "fl_x" in values:
-        fx = check_positive("fl_x", values["fl_x"], "focal length in pixels")
-        fy = check_positive("fl_y", values.get("fl_y", fx), "focal length in pixels")
-        if not all(size) and not {"cx", "cy"} <= values.keys():
     if "camera_angle_x" in values and "fl_x" not in values:
         angle = check_number("camera_angle_x", values["camera_angle_x"], 1e-3, np.pi - 1e-3)
         if all(size) and model != "OPENCV_FISHEYE":
             values = {**values, "fl_x": size[0] / 2 / np.tan(angle / 2)}
+    if "fl_x" in values:
+        fx = check_positive("fl_x", values["fl_x"], "focal length in pixels")
+        fy = check_positive("fl_y", values.get("fl_y", fx), "focal length in pixels")
+        if not all(size) and not {"cx", "cy"} <= values.keys():
             raise ValueError("got neither w and h nor cx and cy, expected the size that fl_x is meant for")
         cx, cy = (check_number(n, values.get(n, s / 2)) for n, s in zip(("cx", "cy"), size, strict=True))
         lens = (fx, fy, cx, cy, *bends)
