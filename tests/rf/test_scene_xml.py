@@ -186,6 +186,16 @@ def test_solids_keep_their_outer_side_and_primitives_their_size(tmp_path):
         np.testing.assert_allclose(flat.face_normals, np.tile([0, 0, 1], (len(flat.faces), 1)), atol=1e-12)
 
 
+def test_properties_have_the_names_of_older_files_too(tmp_path):
+    """Mitsuba, and so Sionna RT, takes ``toWorld`` for ``to_world`` in files of a version below 2."""
+    inside = (
+        '<boolean name="flipNormals" value="true"/><transform name="toWorld"><translate z="5"/></transform>'
+    )
+    mesh = loaded(tmp_path, RECTANGLE.format(name="a", inside=f'{inside}<bsdf id="itu_wood"/>')).mesh
+    np.testing.assert_array_equal(mesh.vertices[:, 2], 5.0)
+    np.testing.assert_array_equal(mesh.face_normals, [[0, 0, -1]] * 2)
+
+
 def test_defaults_includes_and_merged_shapes_are_read(tmp_path):
     (tmp_path / "more.xml").write_text(
         '<scene version="3.0.0"><shape type="$kind" id="mesh-far"><bsdf id="itu_wood"/></shape></scene>'
