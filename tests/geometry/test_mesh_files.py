@@ -87,6 +87,18 @@ def test_colours_of_ply_vertices_are_those_of_faces(encoding, tmp_path):
     np.testing.assert_allclose(mesh.face_colours, [np.array(RED) / 255.0] * 12, atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    "kind, half", [("uchar", 51), ("int", 51), ("short", 51), ("ushort", 13107), ("float", 0.2)]
+)
+def test_colours_of_ply_files_are_shares_of_white_whatever_their_type(kind, half, tmp_path):
+    lines = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {x}" for x in "xyz")]
+    lines += [f"property {kind} {name}" for name in ("red", "green", "blue")]
+    lines += ["element face 1", "property list uchar int vertex_indices", "end_header"]
+    lines += [f"{row} {half} 0 0" for row in ("0 0 0", "1 0 0", "0 1 0")]
+    (tmp_path / "m.ply").write_text("\n".join([*lines, "3 0 1 2", ""]))
+    np.testing.assert_allclose(wr.Mesh.load(tmp_path / "m.ply").face_colours, [[0.2, 0, 0]], atol=1e-6)
+
+
 def test_colours_and_names_travel_with_a_mesh(tmp_path):
     mesh = wr.Mesh.load(room_glb(tmp_path))
     wr.Reconstruction.from_files(mesh=mesh).save(tmp_path / "kept")
