@@ -99,6 +99,16 @@ def test_colours_of_ply_files_are_shares_of_white_whatever_their_type(kind, half
     np.testing.assert_allclose(wr.Mesh.load(tmp_path / "m.ply").face_colours, [[0.2, 0, 0]], atol=1e-6)
 
 
+def test_obj_files_of_windows_are_read_whole(tmp_path):
+    """With a byte order mark, and lines that go on behind a backslash."""
+    text = "mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 \\\n3\n"
+    for name, content in (("m.obj", text), ("m.mtl", "newmtl red\nKd 1 0 0\n")):
+        (tmp_path / name).write_bytes(content.replace("\n", "\r\n").encode("utf-8-sig"))
+    mesh = wr.Mesh.load(tmp_path / "m.obj")
+    np.testing.assert_array_equal(mesh.faces, [[0, 1, 2]])
+    np.testing.assert_array_equal(mesh.face_colours, [[1, 0, 0]])
+
+
 def test_colours_and_names_travel_with_a_mesh(tmp_path):
     mesh = wr.Mesh.load(room_glb(tmp_path))
     wr.Reconstruction.from_files(mesh=mesh).save(tmp_path / "kept")

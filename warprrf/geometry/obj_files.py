@@ -125,7 +125,7 @@ def _statements(text: str) -> Iterator[tuple[int, list[str]]]:
 def _lines(folder: Folder) -> _Lines:
     data = folder.path.read_bytes()
     try:
-        text = data.decode("utf-8")
+        text = folder.path.read_text("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(f"path: {folder.path} is not a readable mesh: {error}") from error
     found = _Lines()
@@ -157,7 +157,7 @@ def _read_materials(folder: Folder, library: str) -> dict[str, _Material]:
     def picture(file: Path) -> np.ndarray:
         return read_picture(file.read_bytes(), f"path: {folder.path}, texture {file}")
 
-    for number, words in _statements(folder.find(library).read_bytes().decode("utf-8", "replace")):
+    for number, words in _statements(folder.find(library).read_text("utf-8-sig", "replace")):
         try:
             match words:
                 case ["newmtl", *parts]:
