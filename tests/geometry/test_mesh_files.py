@@ -109,6 +109,12 @@ def test_obj_files_of_windows_are_read_whole(tmp_path):
     np.testing.assert_array_equal(mesh.face_colours, [[1, 0, 0]])
 
 
+def test_colours_of_an_obj_file_that_are_no_shares_of_white_are_refused(tmp_path):
+    (tmp_path / "m.obj").write_text("v 0 0 0 255 0 9\nv 1 0 0 255 0 9\nv 0 1 0 255 0 9\nf 1 2 3\n")
+    with pytest.raises(ValueError, match=r"m\.obj holds colours outside 0 to 1"):
+        wr.Mesh.load(tmp_path / "m.obj")
+
+
 def test_colours_and_names_travel_with_a_mesh(tmp_path):
     mesh = wr.Mesh.load(room_glb(tmp_path))
     wr.Reconstruction.from_files(mesh=mesh).save(tmp_path / "kept")

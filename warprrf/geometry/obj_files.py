@@ -88,8 +88,10 @@ def read_obj(folder: Folder) -> MeshContent:
         UserWarning: if a file of materials or a texture is missing: those colours stay unknown.
     """
     lines = _lines(folder)
-    if not np.isfinite(lines.textures).all() or not np.isfinite(lines.colours).all():
-        raise ValueError(f"path: {folder.path} holds texture coordinates or colours that are not finite")
+    if not np.isfinite(lines.textures).all():
+        raise ValueError(f"path: {folder.path} holds texture coordinates that are not finite")
+    if not all(0 <= colour <= 1 for colour in lines.colours):
+        raise ValueError(f"path: {folder.path} holds colours outside 0 to 1")
     corners, sizes = np.array(lines.corners, np.int64), np.array(lines.sizes, np.int64)
     positions = np.array(lines.positions, dtype=np.float64).reshape(-1, 3)
     index, _ = triangulated(sizes, corners, positions)
@@ -123,7 +125,6 @@ def _statements(text: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def _lines(folder: Folder) -> _Lines:
-    data = folder.path.read_bytes()
     try:
         text = folder.path.read_text("utf-8-sig")
     except UnicodeDecodeError as error:
