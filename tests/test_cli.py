@@ -15,7 +15,7 @@ from small_room import small_room
 import warprrf as wr
 from warprrf import cli
 from warprrf.cli.inputs import PLACES, POINTINGS, load_geometry, read_positions, read_receivers
-from warprrf.cli.views import _look_at
+from warprrf.cli.views import _look_at, _thickness
 from warprrf.rf.fields.bistatic.options import FitOptions
 from warprrf.rf.fields.harmonic.fitting import FieldOptions
 from warprrf.rf.maps.radio_map import RadioMap
@@ -186,6 +186,13 @@ def test_a_photo_has_one_known_position(tmp_path):
     (tmp_path / "a.csv").write_text("file,x,y,z\na.jpg,1,2.5,3\na.jpg,4,5,6\n")
     with pytest.raises(ValueError, match="a file stands in it twice"):
         read_positions(tmp_path / "a.csv")
+
+
+def test_thicknesses_are_one_for_all_or_one_a_name():
+    assert _thickness(["0.1"]) == 0.1 and _thickness(["a=b=.1", "c=2"]) == {"a=b": 0.1, "c": 2.0}
+    for words in (["0.1", "0.2"], ["a=1", "a=2"], ["a=x"]):
+        with pytest.raises(ValueError, match="--thickness: got .* expected M, or NAME=M of each"):
+            _thickness(words)
 
 
 @pytest.mark.parametrize("names", ["x,z,y", "y,x,z", "x,y,z,elevation,azimuth"])

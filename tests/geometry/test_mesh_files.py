@@ -87,6 +87,34 @@ def test_colours_of_ply_vertices_are_those_of_faces(encoding, tmp_path):
     np.testing.assert_allclose(mesh.face_colours, [np.array(RED) / 255.0] * 12, atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    "kind, half", [("uchar", 51), ("int", 51), ("short", 51), ("ushort", 13107), ("float", 0.2)]
+)
+def test_colours_of_ply_files_are_shares_of_white_whatever_their_type(kind, half, tmp_path):
+    lines = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {x}" for x in "xyz")]
+    lines += [f"property {kind} {name}" for name in ("red", "green", "blue")]
+    lines += ["element face 1", "property list uchar int vertex_indices", "end_header"]
+    lines += [f"{row} {half} 0 0" for row in ("0 0 0", "1 0 0", "0 1 0")]
+    (tmp_path / "m.ply").write_text("\n".join([*lines, "3 0 1 2", ""]))
+    np.testing.assert_allclose(wr.Mesh.load(tmp_path / "m.ply").face_colours, [[0.2, 0, 0]], atol=1e-6)
+
+
+def test_obj_files_of_windows_are_read_whole(tmp_path):
+    """With a byte order mark, and lines that go on behind a backslash."""
+    text = "mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 \\\n3\n"
+    for name, content in (("m.obj", text), ("m.mtl", "newmtl red\nKd 1 0 0\n")):
+        (tmp_path / name).write_bytes(content.replace("\n", "\r\n").encode("utf-8-sig"))
+    mesh = wr.Mesh.load(tmp_path / "m.obj")
+    np.testing.assert_array_equal(mesh.faces, [[0, 1, 2]])
+    np.testing.assert_array_equal(mesh.face_colours, [[1, 0, 0]])
+
+
+def test_colours_of_an_obj_file_that_are_no_shares_of_white_are_refused(tmp_path):
+    (tmp_path / "m.obj").write_text("v 0 0 0 255 0 9\nv 1 0 0 255 0 9\nv 0 1 0 255 0 9\nf 1 2 3\n")
+    with pytest.raises(ValueError, match=r"m\.obj holds colours outside 0 to 1"):
+        wr.Mesh.load(tmp_path / "m.obj")
+
+
 def test_colours_and_names_travel_with_a_mesh(tmp_path):
     mesh = wr.Mesh.load(room_glb(tmp_path))
     wr.Reconstruction.from_files(mesh=mesh).save(tmp_path / "kept")

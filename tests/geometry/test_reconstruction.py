@@ -259,6 +259,8 @@ def test_surveyed_cameras_bring_a_reconstruction_into_their_frame(seen):
     assert back.metric and back.scale_rms_m < 1e-9 and back.guessed == ("plain",)
     with pytest.raises(ValueError, match=r"known_positions: got 2"):
         seen.aligned({"0.jpg": (0, 0, 0), "1.jpg": (1, 0, 0)})
+    with pytest.raises(ValueError, match=r"known_positions: got 0\.jpg twice"):
+        seen.aligned(known | {"day/0.jpg": (0, 0, 0)})
 
 
 def test_plane_axes_are_a_right_handed_frame():

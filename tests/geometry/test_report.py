@@ -96,5 +96,8 @@ def test_the_page_needs_nothing_else_and_shows_names_as_text(tmp_path):
 
 
 def test_a_mesh_alone_has_a_page_too(tmp_path):
+    around = {"a.jpg": wr.Camera.spherical(8, 4, position=(2, 2, 1))}
+    wr.Reconstruction(mesh=ROOM, cameras=around).report(tmp_path / "page.html")
+    assert "180°" in (tmp_path / "page.html").read_text(encoding="utf-8")
     wr.Reconstruction(mesh=ROOM).report(tmp_path / "page.html")
     assert "from four sides" in (tmp_path / "page.html").read_text(encoding="utf-8")

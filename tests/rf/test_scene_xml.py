@@ -78,6 +78,23 @@ def test_what_nobody_knows_is_named_and_can_be_given(tmp_path):
         one(tmp_path, '<bsdf type="radio-material" id="it"><float name="thickness" value="thick"/></bsdf>')
 
 
+def test_what_is_declared_otherwise_under_one_name_is_another_material(tmp_path):
+    wall = '<bsdf type="itu-radio-material"><string name="type" value="brick"/><float name="thickness" value="{}"/></bsdf>'
+    body = "".join(
+        RECTANGLE.format(name=f"{k}", inside=wall.format(thickness))
+        for k, thickness in enumerate((0.1, 0.3, 0.1))
+    )
+    body += '<bsdf type="radio-material" id="brick"><float name="relative_permittivity" value="9"/></bsdf>'
+    body += RECTANGLE.format(name="3", inside='<ref id="brick"/>')
+    scene = loaded(tmp_path, body)
+    own = [scene.materials[m] for m in scene.face_material[::2]]
+    assert [m.thickness_m for m in own] == [0.1, 0.3, 0.1, 0.1]
+    assert [m.relative_permittivity(F) for m in own] == [3.91, 3.91, 3.91, 9.0]
+    assert [m.name for m in scene.materials] == ["brick", "brick_2", "brick_3"]
+    given = {"brick": wr.em.itu_material("wood")}
+    assert loaded(tmp_path, body, materials=given).materials == [given["brick"]]
+
+
 def test_callers_go_before_tables_and_tables_before_files(tmp_path):
     from warprrf.files import write_json
     from warprrf.rf.em.materials import table_entry
@@ -167,6 +184,16 @@ def test_solids_keep_their_outer_side_and_primitives_their_size(tmp_path):
         flat = solid("", kind)
         assert flat.areas.sum() == pytest.approx(area, rel=0.01)
         np.testing.assert_allclose(flat.face_normals, np.tile([0, 0, 1], (len(flat.faces), 1)), atol=1e-12)
+
+
+def test_properties_have_the_names_of_older_files_too(tmp_path):
+    """Mitsuba, and so Sionna RT, takes ``toWorld`` for ``to_world`` in files of a version below 2."""
+    inside = (
+        '<boolean name="flipNormals" value="true"/><transform name="toWorld"><translate z="5"/></transform>'
+    )
+    mesh = loaded(tmp_path, RECTANGLE.format(name="a", inside=f'{inside}<bsdf id="itu_wood"/>')).mesh
+    np.testing.assert_array_equal(mesh.vertices[:, 2], 5.0)
+    np.testing.assert_array_equal(mesh.face_normals, [[0, 0, -1]] * 2)
 
 
 def test_defaults_includes_and_merged_shapes_are_read(tmp_path):

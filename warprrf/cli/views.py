@@ -301,7 +301,9 @@ def _thickness(words: list[str]) -> float | dict[str, float] | None:
     try:
         if len(words) == 1 and "=" not in words[0]:
             return float(words[0])
-        named = [word.rpartition("=") for word in words]
-        return {name: float(value) for name, _, value in named} or None
+        found = {name: float(value) for name, value in (word.rsplit("=", 1) for word in words)}
+        if len(found) < len(words):
+            raise ValueError("a name twice")
+        return found or None
     except ValueError as error:
         raise ValueError(f"--thickness: got {' '.join(words)}, expected M, or NAME=M of each") from error

@@ -177,9 +177,10 @@ def _ply_colours(element: Element, path: Path) -> np.ndarray | None:
     if any(column is None or isinstance(column, Lists) for column in columns):
         return None
     kind = np.asarray(columns[0]).dtype
-    found = _columns(element, ("red", "green", "blue")) / (np.iinfo(kind).max if kind.kind in "iu" else 1.0)
+    most = 65535.0 if kind == np.uint16 else 255.0 if kind.kind in "iu" else 1.0
+    found = _columns(element, ("red", "green", "blue")) / most
     if not ((found >= 0) & (found <= 1)).all():
-        raise ValueError(f"path: {path} holds colours outside 0 to 1 (whole numbers: 0 to 255)")
+        raise ValueError(f"path: {path} holds colours outside 0 to {most:g}")
     return found.astype(np.float32)
 
 

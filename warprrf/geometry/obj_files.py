@@ -87,8 +87,10 @@ def read_obj(folder: Folder) -> MeshContent:
         UserWarning: if a file of materials or a texture is missing: those colours stay unknown.
     """
     lines = _lines(folder)
-    if not np.isfinite(lines.textures).all() or not np.isfinite(lines.colours).all():
-        raise ValueError(f"path: {folder.path} holds texture coordinates or colours that are not finite")
+    if not np.isfinite(lines.textures).all():
+        raise ValueError(f"path: {folder.path} holds texture coordinates that are not finite")
+    if not all(0 <= colour <= 1 for colour in lines.colours):
+        raise ValueError(f"path: {folder.path} holds colours outside 0 to 1")
     corners, sizes = np.array(lines.corners, np.int64), np.array(lines.sizes, np.int64)
     positions = np.array(lines.positions, dtype=np.float64).reshape(-1, 3)
     index, _ = triangulated(sizes, corners, positions)
@@ -122,9 +124,8 @@ def _statements(text: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def _lines(folder: Folder) -> _Lines:
-    data = folder.path.read_bytes()
     try:
-        text = data.decode("utf-8")
+        text = folder.path.read_text("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(f"path: {folder.path} is not a readable mesh: {error}") from error
     found = _Lines()
@@ -155,7 +156,7 @@ def _read_materials(folder: Folder, library: str) -> dict[str, _Material]:
     def picture(file: Path) -> np.ndarray:
         return read_picture(file.read_bytes(), f"path: {folder.path}, texture {file}")
 
-    for number, words in _statements(folder.find(library).read_bytes().decode("utf-8", "replace")):
+    for number, words in _statements(folder.find(library).read_text("utf-8-sig", "replace")):
         try:
             match words:
                 case ["newmtl", *parts]:

@@ -121,7 +121,7 @@ def reconstruct(
     refinement = replace(config.refine, seed=seed, iterations=iterations)
     config = replace(config, refine=refinement)
     named = find_photos(photos)
-    skipped = set(match_names("held_out", held_out, list(named)))
+    skipped = set(match_names("held_out", dict.fromkeys(held_out), list(named)))
     if known_positions is not None:
         match_names("known_positions", known_positions, list(named))
     _check_world(poses, depth, known_positions, scale, up)
@@ -180,7 +180,7 @@ def _check_world(poses: object, depth: object, known_positions: object, scale: o
             raise ValueError(f"{name}: got {value!r} without poses, expected both")
     if up is not None:
         check_choice("up", up, UP)
-    if isinstance(scale, float) and poses is None:
+    if poses is None and not isinstance(scale, tuple | None):
         raise ValueError(
             f'scale: got {scale}, expected ("a.jpg", "b.jpg", metres); a number of metres for each unit goes with poses'
         )

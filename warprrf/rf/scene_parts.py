@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -63,7 +63,7 @@ class MaterialChoice:
         elif given is not None:
             self._given = load_materials(given)
         self._extrapolate = extrapolate
-        self._chosen: dict[str, Material] = {}
+        self._chosen: dict[str, list[Material]] = {}
 
     @cached_property
     def _table(self) -> dict[str, Material]:
@@ -75,12 +75,17 @@ class MaterialChoice:
         return sorted(self._table | self._given)
 
     def choose(self, name: str, declared: Callable[[], Material]) -> Material:
-        """The material of ``name``; ``declared`` is asked where neither the caller nor a table has it."""
-        if name not in self._chosen:
-            known = self._given if name in self._given else self._table
-            material = known[name] if name in known else declared()
-            self._chosen[name] = material.extrapolated() if self._extrapolate else material
-        return self._chosen[name]
+        """The material of ``name``; ``declared`` is asked where neither the caller nor a table has it. What is declared
+        otherwise under the same name is another material, and numbered."""
+        known = self._given if name in self._given else self._table
+        material = known[name] if name in known else declared()
+        material = material.extrapolated() if self._extrapolate else material
+        alike = self._chosen.setdefault(name, [])
+        for one in alike:
+            if replace(one, name=material.name) == material:
+                return one
+        alike.append(replace(material, name=f"{material.name}_{len(alike) + 1}") if alike else material)
+        return alike[-1]
 
     def check_used(self) -> None:
         """Refuse names that nothing is made of."""

@@ -93,7 +93,8 @@ class _SceneFile:
             raise type(error)(f"path: {what}: {str(error).removeprefix('path: ')}") from error
 
     def _replace_names(self) -> None:
-        """Put the values of ``default`` elements where attributes hold their ``$names``."""
+        """Put the values of ``default`` elements where attributes hold their ``$names``; ``toWorld``, as older files have it,
+        is ``to_world``, and so for all properties."""
         values: dict[str, str] = {}
 
         most_letters = 10_000  # of a value after $names are replaced
@@ -115,8 +116,9 @@ class _SceneFile:
         for element in self.top:
             for part in element.iter():
                 for key, text in part.attrib.items():
-                    if "$" in text:
-                        part.set(key, put(text))
+                    if key == "name":
+                        text = re.sub("(?<=[a-z])[A-Z]", lambda capital: f"_{capital[0].lower()}", text)
+                    part.set(key, put(text) if "$" in text else text)
 
     # materials
 

@@ -47,6 +47,13 @@ def test_a_point_is_in_frame_by_its_pixel_in_front_and_deep_enough():
     assert deep == [True, False]
 
 
+def test_a_camera_stays_where_its_caller_goes_on_with_the_pose():
+    pose = np.eye(4)
+    camera = Camera.pinhole(4, 3, fx=5, fy=5, cx=2, cy=1, world_to_camera=pose)
+    pose[0, 3] = 7.0
+    assert camera.position.tolist() == [0, 0, 0]
+
+
 def test_opencv_axes_and_position():
     assert np.allclose(ALONG_X.position, [1, 2, 3])
     assert np.array_equal(ALONG_X.rotation, [[0, -1, 0], [0, 0, -1], [1, 0, 0]])

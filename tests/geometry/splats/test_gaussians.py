@@ -23,6 +23,11 @@ def test_ply_holds_every_attribute(tmp_path, coefficients):
         assert np.allclose(getattr(back, name), getattr(g, name), rtol=1e-5, atol=1e-6), name
 
 
+def test_no_gaussians_are_kept_too(tmp_path):
+    some(coefficients=4)[:0].save_ply(tmp_path / "g.ply")
+    assert Gaussians.load_ply(tmp_path / "g.ply").sh.shape == (0, 4, 3)
+
+
 def test_ply_layout_is_the_one_that_other_viewers_read(tmp_path):
     g = some(n=2, coefficients=4)
     g.save_ply(tmp_path / "g.ply")

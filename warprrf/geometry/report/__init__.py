@@ -253,7 +253,7 @@ def _lenses(subject: Subject) -> str:
     rows = [("photos", "pixels used", "focal length [pixels]", "principal point", "field of view")]
     for (width, height, fx, fy, cx, cy), count in groups.most_common(SHOWN):
         view = " x ".join(
-            f"{np.degrees(2 * np.arctan(n / 2 / f)):.0f}°" for n, f in ((width, fx), (height, fy))
+            f"{np.degrees(2 * np.arctan2(n / 2, f)):.0f}°" for n, f in ((width, fx), (height, fy))
         )
         focal = f"{fx:.1f}" if fx == fy else f"{fx:.1f}, {fy:.1f}"
         rows.append((f"{count}", f"{width:.0f} x {height:.0f}", focal, f"{cx:.1f}, {cy:.1f}", view))

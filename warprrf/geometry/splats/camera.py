@@ -55,6 +55,8 @@ class Camera:
     cy: Number = 0.0
 
     def __post_init__(self) -> None:
+        # callers may go on with theirs
+        object.__setattr__(self, "world_to_camera", self.world_to_camera.copy())
         _check_pose(self.world_to_camera)
         if self.kind == "pinhole":
             for name in ("fx", "fy"):

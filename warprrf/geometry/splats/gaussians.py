@@ -139,7 +139,7 @@ class Gaussians:
         opacity = np.clip(self.opacities.astype(np.float64), OPACITY_MARGIN, 1 - OPACITY_MARGIN)
         values = np.concatenate(
             [
-                self.means, np.zeros((n, 3)), self.sh[:, 0], self.sh[:, 1:].transpose(0, 2, 1).reshape(n, -1),
+                self.means, np.zeros((n, 3)), self.sh[:, 0], self.sh[:, 1:].transpose(0, 2, 1).reshape(n, 3 * (k - 1)),
                 np.log(opacity / (1 - opacity))[:, None], np.log(self.scales.astype(np.float64)), self.quaternions,
             ],
             axis=1,
@@ -170,7 +170,7 @@ class Gaussians:
         if 1 + rest / 3 not in COEFFICIENTS.values():
             raise ValueError(f"{path}: got {rest} f_rest properties, expected 0, 9, 24 or 45")
         higher = columns(*(f"f_rest_{j}" for j in range(rest))) if rest else np.zeros((len(dc), 0))
-        sh = np.concatenate([dc[:, None], higher.reshape(len(dc), 3, -1).transpose(0, 2, 1)], axis=1)
+        sh = np.concatenate([dc[:, None], higher.reshape(len(dc), 3, rest // 3).transpose(0, 2, 1)], axis=1)
         logit = columns("opacity")[:, 0]
         try:
             return cls(

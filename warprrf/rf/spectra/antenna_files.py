@@ -52,7 +52,7 @@ def read_cuts(path: str | os.PathLike[str]) -> Cuts:
     if file.stat().st_size > most_bytes:
         raise ValueError(f"path: {file}: got {file.stat().st_size} bytes, expected at most {most_bytes}")
     try:
-        return _parsed(file.read_text(encoding="utf-8", errors="replace").splitlines())
+        return _parsed(file.read_text(encoding="utf-8-sig", errors="replace").splitlines())
     except ValueError as error:
         raise ValueError(f"path: {file}: {error}") from error
 

@@ -63,6 +63,7 @@ def test_transforms_hold_the_cameras_that_were_written(tmp_path):
     "values, model, coefficients",
     [
         ({"k1": 0.1, "p2": 0.01}, "OPENCV", (0.1, 0.0, 0.0, 0.01)),
+        ({"camera_model": "PINHOLE", "k1": 0.1}, "OPENCV", (0.1, 0.0, 0.0, 0.0)),  # as nerfstudio has it
         ({"k1": 0.1, "k3": 0.02}, "FULL_OPENCV", (0.1, 0, 0, 0, 0.02, 0, 0, 0)),
         ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k4": 0.01}, "OPENCV_FISHEYE", (0.1, 0, 0, 0.01)),
         ({"is_fisheye": True, "k2": 0.1}, "OPENCV_FISHEYE", (0, 0.1, 0, 0)),
@@ -81,6 +82,14 @@ def test_an_angle_of_view_tells_the_focal_length(tmp_path):
     path.write_text(json.dumps({"camera_angle_x": np.pi / 2, "frames": frames()}))
     lens = next(iter(read_poses(path).values())).of_size("a", 640, 480)
     assert lens.fx == lens.fy == pytest.approx(320.0) and (lens.cx, lens.cy) == (320.0, 240.0)
+    shifted = {"camera_angle_x": np.pi / 2, "cx": 300.0, "k1": 0.1, "frames": frames()}
+    path.write_text(json.dumps(shifted | {"w": 640, "h": 480}))
+    lens = next(iter(read_poses(path).values())).of_size("a", 320, 240)
+    assert lens.fx == lens.fy == pytest.approx(160.0) and (lens.cx, lens.cy) == (150.0, 120.0)
+    assert lens.coefficients == (0.1, 0, 0, 0)
+    path.write_text(json.dumps(shifted))
+    with pytest.raises(ValueError, match="camera_angle_x without w and h tells no distortion, cx and cy"):
+        read_poses(path)
 
 
 @pytest.mark.parametrize(
@@ -149,6 +158,24 @@ def test_points_of_a_colmap_model_are_taken_as_they_are(triangulated, tmp_path):
     np.testing.assert_allclose(pose, before, atol=1e-9)
 
 
+def test_photos_of_one_camera_of_a_colmap_model_may_differ_in_size(tmp_path):
+    names = [f"{k}.jpg" for k in range(1, 4)]
+    rows = "".join(f"{k} 1 0 0 0 {k} 0 0 1 {name}\n100 100 1\n" for k, name in enumerate(names, 1))
+    for name, text in (
+        ("cameras", "1 PINHOLE 640 480 400 400 320 240\n"), ("images", rows),
+        ("points3D", "1 0 0 5 10 20 30 0.5 1 0 2 0 3 0\n"),
+    ):  # fmt: skip
+        (tmp_path / f"{name}.txt").write_text(text)
+    cameras = sfm.read_known(tmp_path)
+    known = KnownPoses(cameras, tmp_path, {name: name for name in names})
+    for widths in ((320, 320, 320), (640, 320, 640)):
+        wanted = {n: cameras[n].of_size(n, w, w * 3 // 4) for n, w in zip(names, widths, strict=True)}
+        model = sfm._known_model(known, wanted)
+        found = {name: (lens.width, lens.fx) for name, lens in sfm.lenses_of(model).items()}
+        assert found == {name: (w, 400 * w / 640) for name, w in zip(names, widths, strict=True)}
+        assert model.num_points3D() == (widths[0] == 320)  # others are triangulated anew
+
+
 @pytest.fixture(scope="module")
 def rgbd(tmp_path_factory, truth):
     """Eight photos of the lobby with poses and the true depth, in a folder as of 7-Scenes."""
@@ -194,6 +221,14 @@ def test_depth_of_frames_that_tell_it_is_found(rgbd, tmp_path):
     np.testing.assert_allclose(read_depth(depth), 2 * read_depth(once), rtol=1e-6)
 
 
+def test_a_depth_image_is_of_one_photo(tmp_path):
+    for k in range(3):
+        (tmp_path / f"{k}.png").touch()
+    assert len(find_depth(tmp_path, ["a/0.jpg", "a/1.jpg", "b/2.jpg"])) == 3
+    with pytest.raises(ValueError, match="depth: .* one image for several photos of one file name: a/0.jpg"):
+        find_depth(tmp_path, ["a/0.jpg", "a/1.jpg", "b/0.jpg"])
+
+
 def test_frames_where_tracking_was_lost_are_left_out_and_bad_ones_named(rgbd, tmp_path):
     for file in [*rgbd.glob("*.pose.txt")][:3]:
         (tmp_path / file.name).write_bytes(file.read_bytes())
@@ -216,6 +251,7 @@ def test_frames_where_tracking_was_lost_are_left_out_and_bad_ones_named(rgbd, tm
     [
         ({"depth": "."}, "depth: got .* without poses"),
         ({"scale": 1.0}, "goes with poses"),
+        ({"scale": 2}, "goes with poses"),
         ({"up": "z", "poses": ".", "known_positions": {}}, "got both"),
     ],
 )

@@ -187,6 +187,8 @@ def match_names(argument: str, wanted: Iterable[str], names: Sequence[str]) -> l
         raise ValueError(
             f"{argument}: several photos have the file name of {some_of(shared)}; give the longer name"
         )
+    if twice := sorted({name for name in found if found.count(name) > 1}):
+        raise ValueError(f"{argument}: got {some_of(twice)} twice, expected each photo once")
     return found
 
 

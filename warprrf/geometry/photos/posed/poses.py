@@ -179,6 +179,10 @@ def find_depth(folder: Path, photos: Iterable[str]) -> dict[str, Path]:
     files = {p.name.removesuffix(".png").removesuffix(".depth"): p for p in sorted(folder.glob("*.png"))}
     stems = {photo: PurePosixPath(photo).stem.removesuffix(COLOUR_FILE) for photo in photos}
     found = {photo: files[stem] for photo, stem in stems.items() if stem in files}
+    if len(set(found.values())) < len(found):
+        raise ValueError(
+            f"depth: {folder} holds one image for several photos of one file name: {some_of(list(found))}"
+        )
     if len(found) < MIN_PHOTOS:
         raise ValueError(
             f"depth: {folder} holds depth of {len(found)} photos, expected at least {MIN_PHOTOS}; it has files like "
@@ -213,6 +217,10 @@ def _camera(values: Mapping[str, Any], folder: Path) -> KnownCamera:
         if name in values:
             unit = check_positive(name, values[name], "number of metres for each unit")
     angle, lens = 0.0, tuple[float, ...]()
+    if "camera_angle_x" in values and "fl_x" not in values:
+        angle = check_number("camera_angle_x", values["camera_angle_x"], 1e-3, np.pi - 1e-3)
+        if all(size) and model != "OPENCV_FISHEYE":
+            values = {**values, "fl_x": size[0] / 2 / np.tan(angle / 2)}
     if "fl_x" in values:
         fx = check_positive("fl_x", values["fl_x"], "focal length in pixels")
         fy = check_positive("fl_y", values.get("fl_y", fx), "focal length in pixels")
@@ -220,11 +228,9 @@ def _camera(values: Mapping[str, Any], folder: Path) -> KnownCamera:
             raise ValueError("got neither w and h nor cx and cy, expected the size that fl_x is meant for")
         cx, cy = (check_number(n, values.get(n, s / 2)) for n, s in zip(("cx", "cy"), size, strict=True))
         lens = (fx, fy, cx, cy, *bends)
-    elif "camera_angle_x" in values and model == "PINHOLE":
-        angle = check_number("camera_angle_x", values["camera_angle_x"], 1e-3, np.pi - 1e-3)
-    else:
+    elif not angle or bends or {"cx", "cy"} & values.keys():
         raise ValueError(
-            "got no fl_x, and camera_angle_x tells a lens without distortion alone; expected a focal length"
+            "got no fl_x, and camera_angle_x without w and h tells no distortion, cx and cy; expected a focal length"
         )
     pose = OPENGL_AXES @ _inverse(values.get("transform_matrix", ()))
     file = None if depth is None else DepthFile(_inside(folder, depth), unit)
@@ -245,7 +251,7 @@ def _distortion(values: Mapping[str, Any]) -> tuple[str, tuple[float, ...]]:
         return model, (k1, k2, k3, k4)
     if k4:
         raise ValueError(f"k4: got {k4:g}, which OPENCV_FISHEYE alone has; expected 0")
-    if "PINHOLE" in model or not any((k1, k2, k3, p1, p2)):
+    if not any((k1, k2, k3, p1, p2)):
         return "PINHOLE", ()
     return ("FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)) if k3 else ("OPENCV", (k1, k2, p1, p2))
 

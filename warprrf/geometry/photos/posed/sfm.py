@@ -557,12 +557,15 @@ def read_known(folder: Path) -> dict[str, KnownCamera]:
 
 
 def _known_model(poses: KnownPoses, lenses: Mapping[str, Lens]) -> Any:
-    """A COLMAP model of known poses, with its points where they come from one that has some."""
+    """A COLMAP model of known poses, with its points where they come from one that has some and no camera's photos differ in
+    size."""
     colmap = load_colmap()
     if poses.model is not None:
-        model = _open_model(poses.model)
-        if model.num_points3D():
-            _renamed(model, {name: photo for photo, name in poses.names.items()}, lenses)
+        model, photo_of = _open_model(poses.model), {name: photo for photo, name in poses.names.items()}
+        images = [i for i in model.images.values() if photo_of.get(i.name) in lenses]
+        sizes = {(i.camera_id, lenses[photo_of[i.name]]) for i in images}
+        if model.num_points3D() and len(sizes) == len({i.camera_id for i in images}):  # one for each camera
+            _renamed(model, photo_of, lenses)
             return model
     model = colmap.Reconstruction()
     for k, (lens, names) in enumerate(lenses_in_use(lenses).items()):

@@ -176,8 +176,6 @@ def check_scale(scale: Scale, names: Sequence[str]) -> Scale:
             f'scale: got {scale!r}, expected ("a.jpg", "b.jpg", metres): two photos and how far apart their cameras were'
         )
     first, second = match_names("scale", scale[:2], names)
-    if first == second:
-        raise ValueError(f"scale: got {first} twice, expected two photos")
     return first, second, check_positive("scale", scale[2], "distance in metres between two cameras")
 
 
