@@ -80,6 +80,25 @@ def test_total_is_continuous_where_paths_and_their_mirror_images_end(bare):
         assert jumps[0] > 0.5 and jumps[1] < 0.01
 
 
+@pytest.mark.parametrize("how", ["plain", "turned"])
+@pytest.mark.parametrize("material", ["metal", "wood"])
+@pytest.mark.parametrize(
+    "ends", [([-5.0, 0, 0], [8.0, 0, 0]), ([-5.0, 0, -4], [-5.0, 0, 4])], ids=["straight", "mirrored"]
+)
+def test_total_is_continuous_on_the_boundary_itself(ends, material, how):
+    """Both ends as high as a screen, or a mirror point on its border: half of the path's field is left."""
+    corners = 90 * np.array([[0.0, -1, -1], [0, 1, -1], [0, 1, 0], [0, -1, 0]])
+    screen = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    made_of = [itu_material(material, thickness_m=0.02)]
+    scene, turn = rewritten(RadioScene(screen, np.zeros(2, np.int32), made_of), how)
+    receivers = ends[1] + np.outer([0, -1, 1], [0, 0, 1e-5])
+    link = {"frequency_hz": 3e9, "transmissions": 1, "diffractions": 1}
+    p = wr.trace_paths(scene, transmitter=turn @ ends[0], receivers=receivers @ turn.T, **link)
+    ending = (p.kind != "los") | (ends[1][0] > 0)  # line of sight does not end at a mirror's border
+    power = (np.abs((p.jones * ending[..., None, None]).sum(axis=1)) ** 2).sum(axis=(1, 2))
+    np.testing.assert_allclose(power, power[1], rtol=1e-2)
+
+
 @pytest.mark.parametrize("at_once", [0, 30])
 def test_receivers_looked_at_together_get_what_each_gets_alone(monkeypatch, at_once):
     receivers = np.array([[6.0, -4, 1.5], [3, -9, 1.5], [6.0, -4, 1.5], [-25, -8, 3], [8.0, 5, 0.5]])

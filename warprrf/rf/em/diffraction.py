@@ -23,6 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import wofz
 
+ON_BOUNDARY = 1e-12
+"""Nearer than this to where a path ends it counts as there [rad]: half of its field is left, not all or nothing."""
 Pair = tuple[np.ndarray, np.ndarray]
 """Coefficients of fields across (TE) and in (TM) the plane of incidence."""
 
@@ -104,8 +106,9 @@ def boundary_fields(rays: EdgeRays) -> np.ndarray:
     terms = []
     for x in rays._boundaries:
         x = x - 2.0 * np.pi * n * np.rint(x / (2.0 * np.pi * n))
-        size, tangent = np.abs(np.sin(0.5 * x)), np.tan(0.5 * x / n)
-        slope = np.divide(size, tangent, out=np.zeros(np.broadcast(size, tangent).shape), where=tangent != 0)
+        x = np.where(np.abs(x) < ON_BOUNDARY, ON_BOUNDARY, x)
+        size = np.abs(np.sin(0.5 * x))
+        slope = size / np.tan(0.5 * x / n)
         terms.append(-0.5 / n * slope * wofz(np.exp(0.75j * np.pi) * root * size))
     return np.stack(np.broadcast_arrays(*terms))
 

@@ -15,7 +15,7 @@ import numpy as np
 from warprrf.device import Progress, with_progress
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, headings, vectors_across
 from warprrf.kernels.radio.records import EDGE, MIRROR, SLAB
-from warprrf.rf.em.diffraction import EdgeRays, Pair, boundary_fields, diffraction_matrices
+from warprrf.rf.em.diffraction import ON_BOUNDARY, EdgeRays, Pair, boundary_fields, diffraction_matrices
 from warprrf.rf.em.fresnel import SurfaceTable
 from warprrf.rf.paths.images import EdgeLeaves, MirrorImages
 from warprrf.rf.paths.mirror_paths import MirrorPaths, met_at
@@ -162,7 +162,8 @@ class EdgeFinder:
         ways = _EdgeWays.joined([ways.take(free), self._passing(ways.take(~free))])
         # Wedges before the borders of their faces.
         ways = ways.take(np.argsort(self.edges.n[ways.edge], kind="stable"))
-        paths = self._described(ways.take(ways.distinct(3.0 * self.images.patches.tolerance_m)))
+        ways = ways.take(ways.distinct(3.0 * self.images.patches.tolerance_m))
+        paths = self._described(self._decided(ways))
         return paths.take(np.lexsort((paths.length_m, paths.receiver)))
 
     def _over(self, row: np.ndarray, edge: np.ndarray, patch: np.ndarray, end: np.ndarray) -> _EdgeWays:
@@ -241,6 +242,14 @@ class EdgeFinder:
                 legs = Ways.of(self.images.patches, own, patch, stops)
                 found[own] = legs.unobstructed(self.images.device)
         return found
+
+    def _decided(self, ways: _EdgeWays) -> _EdgeWays:
+        """The same; of ends on the boundary of a shadow, those that do not see each other are in it."""
+        turn, angle, patches = ways.angle[:, 1] - ways.angle[:, 0], ways.angle.copy(), self.images.patches
+        on = np.flatnonzero((np.abs(np.abs(turn) - np.pi) < ON_BOUNDARY) & (ways.patch < 0).all(axis=1))
+        seen = Ways.of(patches, on, ways.patch[on, :0], ways.end[on]).unobstructed(self.images.device)
+        angle[on[~seen], 1] += 2.0 * ON_BOUNDARY * np.sign(turn[on[~seen]])
+        return replace(ways, angle=angle)
 
     def _rays(self, ways: _EdgeWays) -> EdgeRays:
         e = ways.edge
