@@ -102,6 +102,24 @@ def test_one_wall_lets_the_same_through_however_it_is_drawn(how):
     np.testing.assert_allclose(found.tau, expected.tau, rtol=1e-12)
 
 
+@pytest.mark.parametrize("thickness_m", [1e-4, 2.5e-4, 4e-4])
+def test_a_solid_thinner_than_a_ray_s_step_is_as_thick_as_it_is(thickness_m):
+    """What is 0.3 mm thick or less was taken for a sheet as thick as its material is said to be, 0.3 m here."""
+    vertices, faces = box_mesh([1.0, -6.0, 0.001], [1.0 + thickness_m, 6.0, 6.0])
+    turned = Rotation.from_rotvec([0.2, 0.1, 0.7]).as_matrix()
+    sheet = Mesh(pane(1.0)[0] @ turned.T, pane(1.0)[1])
+    lossy = Material.custom("film", relative_permittivity=4.0, conductivity=0.5, thickness_m=thickness_m)
+    found, expected = (
+        trace_paths(
+            Scene(mesh, [material], np.zeros(len(mesh.faces), int)), transmitter=turned @ TX, receivers=turned @ RX,
+            frequency_hz=F, mirror_order=0, transmissions=1,
+        )
+        for mesh, material in ((Mesh(vertices @ turned.T, faces), replace(lossy, thickness_m=0.3)), (sheet, lossy))
+    )  # fmt: skip
+    assert found.kind.tolist() == expected.kind.tolist() == ["slab"]
+    np.testing.assert_allclose(found.gain, expected.gain, rtol=1e-6)
+
+
 @pytest.mark.parametrize("how", ["solid", "doubled"])
 def test_a_wall_of_unknown_material_is_as_late_however_it_is_drawn(how):
     """A field assumes what such a wall absorbs; of its delay it knows nothing."""

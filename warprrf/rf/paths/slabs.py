@@ -130,6 +130,22 @@ class Walls:
         """Closed part of each face, -1 for none; copies that lie micrometres apart are one."""
         return np.append(self.mesh.parts_by_box(self.clearance_m), -1)[self.mesh.closed_part_of]
 
+    @cached_property
+    def _thin_m(self) -> np.ndarray:
+        """Of solids so thin that a ray behind one face is behind them the extent across their largest face [m], of other faces
+        NaN, shape ``(F,)``."""
+        mesh, own, found = self.mesh, np.flatnonzero(self._part >= 0), np.full(len(self._part), np.nan)
+        part, order = self._part[own], np.argsort(self.mesh.areas[own], kind="stable")
+        normal = np.zeros((part.max(initial=-1) + 1, 3))
+        normal[part[order]] = mesh.face_normals[own[order]]  # the largest comes last, and stays
+        height = _dot(mesh.triangles[own], normal[part, None])
+        lowest, highest = np.full((2, len(normal)), [[np.inf], [-np.inf]])
+        np.minimum.at(lowest, part, height.min(axis=1))
+        np.maximum.at(highest, part, height.max(axis=1))
+        thick = highest - lowest
+        found[own] = np.where(thick < 3.0 * self.clearance_m, thick, np.nan)[part]
+        return found
+
     def between(self, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, Slabs]:
         """Which of the ways from ``start`` to ``end``, (N, 3) or (3,), arrive, and the slabs that those pass."""
         start, end = (np.ascontiguousarray(a) for a in np.broadcast_arrays(start, end))
@@ -192,6 +208,7 @@ class Walls:
             on = met & ~out & self.passes[face] & (place + 1 < self.most)
             r, k = row[on], place[on] + 1
             slabs.face[r, k], slabs.cosine[r, k], slabs.range_m[r, k] = face[on], cosine[on], t[on]
+            slabs.thickness_m[r, k] = self._thin_m[face[on]]
             last[row] = np.where(on, face, -1)
             count[r] += 1
             # Sheets closer than the clearance, seen at a slant, are one.
@@ -200,7 +217,7 @@ class Walls:
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.asarray(np.einsum("ni,ni->n", a, b))
+    return np.asarray(np.einsum("...i,...i->...", a, b))
 
 
 def _joined(parts: list[tuple[np.ndarray, Slabs]]) -> tuple[np.ndarray, Slabs]:
