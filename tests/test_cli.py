@@ -137,6 +137,8 @@ BAD = {
     "result in the place of readings": (HORN.replace("f.safetensors", "horn.csv"), "which the command reads"),
     "pointings without a direction": (f"{SUGGEST} --frequency 3e11 --receive-pattern 10", "azimuth"),
     "camera looks straight up": (f"{RENDER} {{tmp}}/one.ply --position 0 0 1 --look-at 0 0 2", "--look-at"),
+    "picture of no kind": ("render {tmp}/one.ply -o {tmp}/v --position 0 0 1 --look-at 1 0 1", "v: expected .png (a picture) or"),
+    "spectrum of no kind": ("render {tmp}/bad.safetensors -o {tmp}/v.jpg --receiver 1 1 1", "expected .png (a picture) or .npz"),
     "field without receiver": (f"{RENDER} {{tmp}}/bad.safetensors", "--receiver"),
 }  # fmt: skip
 

@@ -64,8 +64,12 @@ def _render(args: argparse.Namespace, out: Output) -> None:
       warprrf render field.safetensors --receiver 7 4 1.5 -o array.png --array 4 4
       warprrf render room/geometry.ply --position 2 2 1.6 --look-at 8 6 1.2 -o view.png
     """
-    source = existing(args.source)
-    if source.suffix.lower() == ".safetensors":
+    source, path = existing(args.source), Path(args.out)
+    of_field = source.suffix.lower() == ".safetensors"
+    kinds = ".png (a picture)", ".npz (path_gain, delay_s, aod)" if of_field else ".jpg (a smaller one)"
+    if path.suffix.lower() not in (kind.split()[0] for kind in kinds):
+        raise ValueError(f"{path}: expected {' or '.join(kinds)}")
+    if of_field:
         if args.receiver is None:
             raise ValueError("--receiver: none given, expected three coordinates in metres for a radio field")
         field, place = load_field(source, args), np.array(args.receiver, dtype=np.float64)
@@ -75,7 +79,7 @@ def _render(args: argparse.Namespace, out: Output) -> None:
         else:
             spectrum = _array_spectrum(field, place, args)
             name, gain = "strongest direction", spectrum.path_gain.max()
-        _write_spectrum(spectrum, Path(args.out))
+        _write_spectrum(spectrum, path)
         db = float(to_db(gain))
         text = f"{args.out}: {name} {db:.2f} dB at {' '.join(f'{x:g}' for x in args.receiver)}"
         out.result(text, files=[args.out], **{f"{name.replace(' ', '_')}_db": db})
@@ -88,7 +92,7 @@ def _render(args: argparse.Namespace, out: Output) -> None:
     from PIL import Image
 
     pixels = np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
-    write_atomically(args.out, lambda path: Image.fromarray(pixels).save(path))
+    write_atomically(path, lambda name: Image.fromarray(pixels).save(name))
     text = f"{args.out}: {args.size[0]} x {args.size[1]} pixels, {len(gaussians.means)} Gaussians"
     out.result(text, files=[args.out], Gaussians=len(gaussians.means))
 
@@ -106,12 +110,10 @@ def _array_spectrum(field: Any, place: np.ndarray, args: argparse.Namespace) -> 
 def _write_spectrum(spectrum: wr.Spectrum, path: Path) -> None:
     if path.suffix.lower() == ".npz":
         write_arrays(path, {n: array for n, array in vars(spectrum).items() if isinstance(array, np.ndarray)})
-    elif path.suffix.lower() == ".png":
-        figure = require("matplotlib.figure", extra="plots").Figure(figsize=(8.0, 4.2), layout="constrained")
-        spectrum.plot(ax=figure.add_subplot())
-        write_atomically(path, lambda name: figure.savefig(name, dpi=130))
-    else:
-        raise ValueError(f"{path}: expected .png (a picture) or .npz (path_gain, delay_s, aod)")
+        return
+    figure = require("matplotlib.figure", extra="plots").Figure(figsize=(8.0, 4.2), layout="constrained")
+    spectrum.plot(ax=figure.add_subplot())
+    write_atomically(path, lambda name: figure.savefig(name, dpi=130))
 
 
 def _look_at(
