@@ -63,7 +63,7 @@ class MaterialChoice:
         elif given is not None:
             self._given = load_materials(given)
         self._extrapolate = extrapolate
-        self._chosen: dict[str, list[Material]] = {}
+        self._chosen: dict[str, list[tuple[Material, Material]]] = {}  # what was stated, and what is made of it
 
     @cached_property
     def _table(self) -> dict[str, Material]:
@@ -78,14 +78,14 @@ class MaterialChoice:
         """The material of ``name``; ``declared`` is asked where neither the caller nor a table has it. What is declared
         otherwise under the same name is another material, and numbered."""
         known = self._given if name in self._given else self._table
-        material = known[name] if name in known else declared()
-        material = material.extrapolated() if self._extrapolate else material
+        stated = known[name] if name in known else declared()
         alike = self._chosen.setdefault(name, [])
-        for one in alike:
-            if replace(one, name=material.name) == material:
-                return one
-        alike.append(replace(material, name=f"{material.name}_{len(alike) + 1}") if alike else material)
-        return alike[-1]
+        for before, material in alike:
+            if before == stated:
+                return material
+        material = stated.extrapolated() if self._extrapolate else stated
+        alike.append((stated, replace(material, name=f"{name}_{len(alike) + 1}") if alike else material))
+        return alike[-1][1]
 
     def check_used(self) -> None:
         """Refuse names that nothing is made of."""
