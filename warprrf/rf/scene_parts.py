@@ -63,7 +63,7 @@ class MaterialChoice:
         elif given is not None:
             self._given = load_materials(given)
         self._extrapolate = extrapolate
-        self._chosen: dict[str, list[tuple[Material, Material]]] = {}  # what was stated, and what is made of it
+        self._chosen: dict[str, list[tuple[Material, Material]]] = {}  # as stated, as made
 
     @cached_property
     def _table(self) -> dict[str, Material]:
