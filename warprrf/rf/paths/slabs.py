@@ -133,7 +133,7 @@ class Walls:
     @cached_property
     def _thin_m(self) -> np.ndarray:
         """Of solids so thin that a ray behind one face is behind them the extent across their largest face [m], of other faces
-        NaN, shape ``(F,)``."""
+        NaN, shape ``(F,)``. What is thinner than the clearance is a sheet that was drawn twice."""
         mesh, own, found = self.mesh, np.flatnonzero(self._part >= 0), np.full(len(self._part), np.nan)
         part, order = self._part[own], np.argsort(self.mesh.areas[own], kind="stable")
         normal = np.zeros((part.max(initial=-1) + 1, 3))
@@ -143,7 +143,8 @@ class Walls:
         np.minimum.at(lowest, part, height.min(axis=1))
         np.maximum.at(highest, part, height.max(axis=1))
         thick = highest - lowest
-        found[own] = np.where(thick < 3.0 * self.clearance_m, thick, np.nan)[part]
+        thin = (self.clearance_m < thick) & (thick < 3.0 * self.clearance_m)
+        found[own] = np.where(thin, thick, np.nan)[part]
         return found
 
     def between(self, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, Slabs]:
