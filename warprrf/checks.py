@@ -134,6 +134,11 @@ def check_chosen(name: str, value: ArrayLike, count: int, least: int = 0) -> np.
     return chosen.astype(np.int64)
 
 
+def check_seed(seed: object) -> int:
+    """``seed`` as a whole number from 0 to 2^63 - 1."""
+    return check_count("seed", seed, 0, 2**63 - 1)
+
+
 def check_number(name: str, value: object, least: float = -np.inf, most: float = np.inf) -> float:
     """``value`` as a finite number from ``least`` to ``most``."""
     number = _number(value)

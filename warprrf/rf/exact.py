@@ -25,7 +25,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count
+from warprrf.checks import check_array, check_count, check_seed
 from warprrf.device import DeviceLike, resolve
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE
 from warprrf.kernels.radio.records import MIRROR, SCATTER
@@ -132,7 +132,7 @@ class ExactEngine:
     ) -> None:
         check_count("sub_pixels", sub_pixels)
         self.shape, self.beam_sigma_rad = check_shape(shape), beam_sigma_rad
-        self.effects, self.seed, self.air = effects, check_count("seed", seed, 0, 2**63 - 1), air_of(gas)
+        self.effects, self.seed, self.air = effects, check_seed(seed), air_of(gas)
         self.mirrors = MirrorTracer(
             scene, transmitter=transmitter, frequency_hz=frequency_hz, transmissions=effects.transmissions,
             diffractions=effects.diffractions, device=device,

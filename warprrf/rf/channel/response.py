@@ -32,7 +32,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_choice, check_count, check_positive
+from warprrf.checks import check_array, check_choice, check_count, check_positive, check_seed
 from warprrf.rf.channel.arrays import End, PlanarArray, array_of, check_unpolarised
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.channel.sums import (
@@ -256,7 +256,7 @@ def random_turns(paths: PathArrays, seed: int) -> np.ndarray:
 
     Source: the mixing function of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014).
     """
-    state = np.full(len(paths.gain), check_count("seed", seed, 0, 2**63 - 1), dtype=np.uint64)
+    state = np.full(len(paths.gain), check_seed(seed), dtype=np.uint64)
     place = np.zeros(3) if paths.receiver is None else paths.receiver
     angles = (paths.theta_r, paths.phi_r, paths.theta_t, paths.phi_t)
     for value, step in (*((x, 1e-6) for x in (*place, *angles)), (paths.tau, 1e-12)):
@@ -288,7 +288,7 @@ def _links(
             "diffuse: got None with diffuse paths, which have no phase; expected 'random_phase' (with a seed), 'power' "
             "(left out of the sum) or 'given' (phases as they are)"
         )
-    check_count("seed", seed, 0, 2**63 - 1)
+    check_seed(seed)
     tx, rx = array_of("tx_array", tx_array), array_of("rx_array", rx_array)
     carrier = paths.carrier_hz
     places = [array.positions(SPEED_OF_LIGHT / carrier) for array in (tx, rx)]
