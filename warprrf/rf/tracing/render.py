@@ -12,7 +12,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_matrix
 
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.tracing.model import Effects, Model, Parameters
@@ -174,10 +173,10 @@ class Interreflection:
             np.pi / ELEMENT_RAYS * np.broadcast_to(grid.transmittance(hits.range_m[self._hit]), len(met))
         )
 
-    def between(self, weight: np.ndarray, sides: int) -> csr_matrix:
-        """Irradiance of ``sides`` sides (rows) by radiance of sides (columns), shape ``(E, E)``, by rays of ``weight`` (K,)."""
-        place = self.side[self._hit], self._met
-        return csr_matrix((self._left * weight[self._hit], place), shape=(sides, sides))
+    def between(self, radiance: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """Irradiance of sides by ``radiance`` (E,) of sides, shape ``(E,)``, by rays of ``weight`` (K,)."""
+        power = self._left * weight[self._hit] * radiance[self._met]
+        return np.bincount(self.side[self._hit], power, len(radiance))
 
 
 def irradiance(tracer: Tracer, p: Parameters, effects: Effects) -> np.ndarray | None:
@@ -191,15 +190,14 @@ def irradiance(tracer: Tracer, p: Parameters, effects: Effects) -> np.ndarray | 
     materials = Materials(p, tracer.slabs, device=tracer.grid.device)
     share = p.scattered_share[group] / np.pi
     over_even = p.scattered_over_even(group[light.side], light.cosine)
-    between = light.between(over_even, sides)
     tables = [table for name, table in light.lit.items() if name != "ST" or effects.scatter_mirror]
     got = sum(np.bincount(light.side[r.ray], r.powers(materials) * over_even[r.ray], sides) for r in tables)
     if effects.mirror_scatter:
         for mirrored in (tracer.mirrored(slabs) for slabs in {0, most}):
             side = mirrored.onto.ray
             power = mirrored.onto.powers(materials) * p.scattered_over_even(group[side], mirrored.cosine)
-            got = got + between @ (share * np.bincount(side, power, minlength=sides))
+            got = got + light.between(share * np.bincount(side, power, sides), over_even)
     first = got
     for _ in range(2, effects.scatterings):
-        got = first + between @ (share * got)
+        got = first + light.between(share * got, over_even)
     return np.asarray(got)

@@ -217,7 +217,7 @@ def test_light_reaches_what_is_open_and_from_there_elements_are_lit():
     assert len(partly) > 4
     # Whatever surrounds it sends the same: each place gets all of it.
     light, sides = Interreflection(tracer, 0), surface.element_sides
-    even = light.between(np.ones(len(light.side)), sides) @ np.ones(sides)
+    even = light.between(np.ones(sides), np.ones(len(light.side)))
     np.testing.assert_allclose(even[open_share > 0], np.pi, rtol=1e-6)
 
 

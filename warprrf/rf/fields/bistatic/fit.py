@@ -270,7 +270,8 @@ def cross_validate(t: Training, choice: Solution) -> ErrorModel | None:
     most_to_judge = 200  # receivers that a residual is learned from: more make it no worse
     for held in _folds(t):
         kept = evenly(np.setdiff1d(np.arange(len(places)), held), most_to_judge)
-        model = with_residual(t, choice if held is t.held else t.refined(choice, kept, SHORT_STEPS), kept)
+        own = choice if held is t.held else t.refined(choice, kept, SHORT_STEPS)
+        model = with_residual(t, own, kept, quick=True)
         for k, power in zip(held, t.predicted(model, held), strict=True):
             o = t.observations[k]
             images.append((NEPER * np.log1p(power)).reshape(o.place.shape))
@@ -291,10 +292,10 @@ def _folds(t: Training) -> list[np.ndarray]:
 def everyone(t: Training, choice: Solution) -> tuple[Solution, Model]:
     """The choice fitted to all places, and its model."""
     choice = t.refined(choice, t.telling, t.options.iterations)
-    return choice, with_residual(t, choice, list(t.observations))
+    return choice, with_residual(t, choice, list(t.observations), quick=t.options.quick)
 
 
-def with_residual(t: Training, choice: Solution, places: Sequence[int] | np.ndarray) -> Model:
+def with_residual(t: Training, choice: Solution, places: Sequence[int] | np.ndarray, *, quick: bool) -> Model:
     """The model of ``choice``, with gains of surface cells that readings at ``places`` tell if it has a residual.
 
     That is not tried on places held out: a few of them often say that a residual harms, though it helped wherever it was tried.
@@ -304,9 +305,7 @@ def with_residual(t: Training, choice: Solution, places: Sequence[int] | np.ndar
         return model
     shares = [shares_of(t.observations[k], model) for k in places]
     t.step()
-    return replace(
-        model, effects=choice.effects, residual=fit_residual(shares, t.surface, quick=t.options.quick)
-    )
+    return replace(model, effects=choice.effects, residual=fit_residual(shares, t.surface, quick=quick))
 
 
 def _offsets(t: Training, found: Model) -> dict[int, list[tuple[Place, np.ndarray]]]:

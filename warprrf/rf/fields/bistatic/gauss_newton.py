@@ -369,7 +369,8 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
         own = (batch.fit_loss(batch.gain(p, power) * power) for batch, _, power in problem.evaluated(p))
         return weight * sum(float(loss.sum()) for loss in own) + float((prior**2).sum())
 
-    longest, tolerance = 1.5, 1e-3  # change of a logarithm in a step; relative fall that ends the fit
+    longest = 1.5  # change of a logarithm in a step
+    tolerance, nothing = 1e-3, 1e-4  # relative falls that end the fit
     current = total(vector)
     for _ in range(steps):
         p = layout.unpack(vector, start)
@@ -388,14 +389,15 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
             damping *= 5.0
         if not improved:
             break
-        # Steps that were cut short, or do worse than the quadratic model says, are no sign of having arrived.
+        # Steps that were cut short, or do worse than the quadratic model says, are no sign of having arrived, unless they bring
+        # nothing: the weight of a lobe that is not there falls for ever.
         expected = -float(move @ (2.0 * gradient + hessian @ move))
         honest = current - value > 0.5 * expected
         fall = (current - value) / current
         vector, current = vector + move, value
         damping = max(damping * 0.3, 1e-6) if honest else damping * 3.0
         losses.append(current / weight / count)
-        if fall < tolerance and honest and (np.abs(move) < longest).all():
+        if fall < (tolerance if honest and (np.abs(move) < longest).all() else nothing):
             break
     found, covariance = layout.unpack(vector, start), np.linalg.inv(hessian)
     return Solution(problem.effects, problem.material, found, covariance, losses)

@@ -84,6 +84,7 @@ def fit_residual(shares: Sequence[Shares], surface: Surface, *, quick: bool = Fa
         quick: with few steps, which find three quarters of what is to be found.
     """
     rounds, conjugate = (2, 8) if quick else (4, 12)  # Gauss-Newton steps, and of conjugate gradients in each
+    enough = 0.02  # relative fall of the objective below which no step follows
     own_rows = [slice(*own) for own in pairwise(np.cumsum([0, *(len(s.rest) for s in shares)]))]
     # Receivers that are measured alike go through the measurement together, batches of them side by side.
     alike = [list(own) for _, own in groupby(shares, key=lambda s: s.observed.measured.alike)]
@@ -119,16 +120,19 @@ def fit_residual(shares: Sequence[Shares], surface: Surface, *, quick: bool = Fa
         [hstack([element * member, own * identity(len(cell))]) for element, own in deviations], format="csr"
     )
     largest, longest = 4.0, 3.0  # gain [nepers], and step of one in standard deviations
-    unknown = np.zeros(gains.shape[1])
+    unknown, before = np.zeros(gains.shape[1]), np.inf
     with ThreadPoolExecutor(threads()) as pool:
         for _ in range(rounds):
             gain = np.exp(np.clip(gains @ unknown, -largest, largest))
-            pull, weight = spread(gain, quick=False), np.empty(counts[-1])
+            pull, weight, now = spread(gain, quick=False), np.empty(counts[-1]), float(unknown @ unknown)
             for s, own in zip(shares, own_rows, strict=True):
                 total = np.maximum(pull[own], 0.0) + s.rest
                 error, slope = s.observed.target.error(total), s.observed.target.slope(total)
-                robust = huber(error, s.observed.huber_db)[1] / NOISE_DB**2
-                pull[own], weight[own] = slope * robust * error, slope**2 * robust
+                loss, robust = (x / NOISE_DB**2 for x in huber(error, s.observed.huber_db))
+                pull[own], weight[own], now = slope * robust * error, slope**2 * robust, now + loss.sum()
+            if now > (1.0 - enough) * before:
+                break
+            before = now
 
             def curvature(v: np.ndarray, gain: np.ndarray = gain, weight: np.ndarray = weight) -> np.ndarray:
                 readings = spread(gain * (gains @ v))
