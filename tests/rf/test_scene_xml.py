@@ -237,6 +237,11 @@ HOSTILE = {
     "itself": ('<include filename="scene.xml"/>', "deep"),
     "a file above": ('<include filename="../scene.xml"/>', "outside"),
     "a name twice": (2 * CUBE.replace("cube", 'cube" id="a').format(""), "alike"),
+    "a material twice": ('<bsdf id="itu_wood"/><bsdf id="itu_wood"/>' + CUBE.format(""), "two bsdfs alike"),
+    "half an exponent": (
+        CUBE.replace("/>", '><float name="alpha_r" value="7.5"/></bsdf>', 1).format(""),
+        "alpha_r.*7.5.*whole number",
+    ),
     "a perspective": (
         CUBE.format(
             '<transform name="to_world"><matrix value="1 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0"/></transform>'

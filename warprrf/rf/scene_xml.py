@@ -43,7 +43,10 @@ class _SceneFile:
         self.path, self.choice, self.allow_outside = path, choice, allow_outside
         self.top = list(self._included(path, 0))
         self._replace_names()
-        self.bsdfs = {e.get("id"): e for e in self.top if e.tag == "bsdf" and e.get("id") is not None}
+        named = [e for e in self.top if e.tag == "bsdf" and e.get("id") is not None]
+        self.bsdfs = {e.get("id"): e for e in named}
+        if len(self.bsdfs) < len(named):
+            raise ValueError(f"path: {path} names two bsdfs alike, expected an id of its own for each")
         for element in self.top:
             if element.tag == "alias" and element.get("id") in self.bsdfs:
                 self.bsdfs[element.get("as")] = self.bsdfs[element.get("id")]
@@ -265,12 +268,15 @@ def _radio_material(element: Element, label: str) -> Material | None:
     Sionna RT takes every ``bsdf`` whose id begins with ``itu_`` for that material of P.2040, whatever its type.
     """
     kind, identifier = element.get("type"), element.get("id") or ""
+    exponent = _value(element, "alpha_r", 4)
+    if exponent % 1:
+        raise ValueError(f"has 'alpha_r' {exponent:g}, expected a whole number")
     common: dict[str, Any] = {
         "thickness_m": _value(element, "thickness", Material.thickness_m),
         "scattering": _value(element, "scattering_coefficient", 0.0),
         "xpd": _value(element, "xpd_coefficient", 0.0),
         "pattern": _text(element, "scattering_pattern") or "lambertian",
-        "alpha_r": int(_value(element, "alpha_r", 4)),
+        "alpha_r": int(exponent),
     }
     prefixed = identifier.removeprefix("mat-").startswith(("itu_", "itu-"))
     if kind == "itu-radio-material" or prefixed:
