@@ -114,6 +114,18 @@ def test_the_noise_of_readings_is_estimated(scene, turned):
     assert found == pytest.approx(np.hypot(3.0, clean), rel=0.2)
 
 
+def test_a_gain_errs_as_much_as_it_is_said_to(scene, turned):
+    """Readings of line of sight alone count for more, but their noise is that of all."""
+    rng, missed = np.random.default_rng(0), []
+    for _ in range(8):
+        noise = 10.0 ** (0.3 * rng.normal(size=len(turned)))  # 3 dB
+        power = np.maximum(np.where(turned.power > turned.floor, turned.power * noise, 0.0), turned.floor)
+        noisy = replace(turned, power=power, std_db=3.0)
+        found = RadioField.fit(scene, noisy, quick=True, effects="single").report["chains"]["horn"]
+        missed.append((found["gain_db"] - CHAIN_DB) / found["std_db"])
+    assert np.sqrt(np.mean(np.square(missed))) < 1.6
+
+
 def test_fading_is_as_deep_as_paths_make_it(scene):
     """Waves of random phases: in line of sight power fades less than Rayleigh's does, and no chain's gain is moved."""
     effects, rng = replace(SETS["single"], residual=False), np.random.default_rng(0)
