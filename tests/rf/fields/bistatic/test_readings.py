@@ -415,6 +415,14 @@ def test_a_column_of_another_length_is_named():
         Readings.from_table(table | {"rx_y": [1.0, 2.0, 3.0]}, frequency_hz=F, floor=1e-12)
 
 
+def test_a_chain_of_which_nothing_was_heard_has_no_gain(scene, turned):
+    """It was said to be known to 1.4 dB, by the floor."""
+    dark = replace(turned, chain=["other"] * 36 + ["horn"] * 180)
+    power = np.where(dark.chain == "other", dark.floor, dark.power)
+    with pytest.raises(ValueError, match=r"chain: got no reading of \['other'\] above its floor"):
+        RadioField.fit(scene, replace(dark, power=power), quick=True)
+
+
 def test_the_only_place_of_a_chain_is_not_held_out(scene, turned, monkeypatch):
     """Its gain would be known from nothing: a horn at one place beside spectra at seven, whichever place it is."""
     several = spectra(scene, RECEIVERS[1:8])
