@@ -1,6 +1,7 @@
 """Line of sight and mirror paths against float64 geometry and the Fresnel limits."""
 
 import itertools
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -82,6 +83,9 @@ def test_paths_of_several_receivers_do_not_become_those_of_one():
         with pytest.raises(ValueError, match=f"parts: got (paths )?{said}"):
             join(parts)
     np.testing.assert_array_equal(Paths.concatenate([paths[0], paths[0]]).receiver, paths[0].receiver)
+    here, there, anywhere = (replace(paths[0], transmitter=at) for at in (TX, TX + 1.0, None))
+    assert Paths.stack([here, there, anywhere]).transmitter is None  # it was said to be the first one's
+    np.testing.assert_array_equal(Paths.stack([here, anywhere]).transmitter, TX)
 
 
 def test_swapping_the_ends_keeps_gain_and_delay():

@@ -306,8 +306,9 @@ class PathArrays:
         sources = [p.transmitter for p in parts if p.transmitter is not None]
         common = _common([replace(p, transmitter=None) for p in parts])
         if sources:
-            alike = len(sources) < len(parts) or all(np.array_equal(s, sources[0]) for s in sources)
-            common["transmitter"] = sources[0] if alike else np.stack(sources)
+            alike = all(np.array_equal(s, sources[0]) for s in sources)
+            if alike or len(sources) == len(parts):
+                common["transmitter"] = sources[0] if alike else np.stack(sources)
         return cls(**stacked, **common, receiver=receiver)
 
 

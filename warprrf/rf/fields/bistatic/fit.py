@@ -42,6 +42,7 @@ from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
 from warprrf.rf.positions import warn_of_unmodelled
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import angle_deg, strongest_direction
+from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.tracing.model import SETS, Effects, Model
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rows import distinct_rows
@@ -67,6 +68,12 @@ def fit(
         if isinstance(one, SpectrumDataset) and len(one) and not (one.path_gain > one.floor).any():
             raise ValueError("ds: got no pixel above the floor, expected spectra with power to fit to")
     places = places_of(data, mesh, device)
+    tables = [one for one in data if isinstance(one, Readings)]
+    heard = [np.asarray(one.chain)[one.power > one.floor] for one in tables]
+    if dark := {place.chain for place in places} - {""}.union(*heard):
+        raise ValueError(
+            f"chain: got no reading of {sorted(dark)} above its floor, so that nothing tells the gain; leave it out"
+        )
     for one in data:
         if isinstance(one, SpectrumDataset):
             _question_directions(one, mesh, device)

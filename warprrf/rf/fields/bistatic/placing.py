@@ -69,17 +69,17 @@ def _zero(one: Readings, seen: Sequence[Seen]) -> float:
     tried = np.linspace(-np.pi, np.pi, 360, endpoint=False)  # a degree apart
     if one.azimuth_known:
         tried = _clocks(one, paths)
-    alike = np.zeros(len(tried))
-    for k, by in enumerate(tried):
-        turned = from_zero(one, by)
+
+    def alike(by: float) -> float:
+        turned, total = from_zero(one, by), 0.0
         for rows, power, *ends in paths:
             expected = path_weights(turned, rows, *ends) @ power
             size = float(np.linalg.norm(expected) * np.linalg.norm(one.power[rows]))
-            alike[k] += float(expected @ one.power[rows]) / max(size, 1e-300)
-    best = int(alike.argmax())
-    low, mid, high = alike[[best - 1, best, (best + 1) % len(tried)]]
-    bend = low - 2.0 * mid + high  # of the parabola through the three
-    return float(tried[best] + (0.5 * (low - high) / bend if bend < 0 else 0.0) * (tried[1] - tried[0]))
+            total += float(expected @ one.power[rows]) / max(size, 1e-300)
+        return total
+
+    between = (tried[1] - tried[0]) * np.linspace(-1.0, 1.0, 41)  # where it is no parabola
+    return float(max(max(tried, key=alike) + between, key=alike))
 
 
 def _clocks(one: Readings, paths: Sequence[tuple[np.ndarray, ...]]) -> np.ndarray:

@@ -28,6 +28,7 @@ from warprrf.rf.fields.bistatic.gauss_newton import (
 from warprrf.rf.fields.bistatic.measured import WeighedPaths
 from warprrf.rf.fields.bistatic.observations import (
     NOISE_DB,
+    READING_ERROR_DB,
     Observation,
     Place,
     Seen,
@@ -226,7 +227,7 @@ class Training:
     def _part(self, o: Observation) -> Observation:
         """Readings of a place that parameters are fitted to, and what they count."""
         readings, least = 12_000, 200  # of all places, and of each at least
-        # Line of sight alone holds no material: it tells a chain's gain.
+        # Line of sight alone holds no material: it tells a chain's gain. Its noise is as large as any reading's.
         known_better = 2.0
         # Of what comes through slabs more is left out (light between surfaces that passes them on its way), and what a
         # material must make up for there it lacks in the open.
@@ -234,7 +235,9 @@ class Training:
         known = np.flatnonzero(o.target.trust)
         size = min(len(known), max(least, readings // len(self.places)))
         part = o.part(known[np.sort(self.rng.choice(len(known), size, replace=False))])
-        target = part.target.trusted(1.0 + known_better * part.target.sight)
+        explained = 1.0 - (1.0 + known_better * part.target.sight) ** -2
+        share = (READING_ERROR_DB / NOISE_DB * part.target.trust) ** 2  # of its variance that is no noise
+        target = part.target.trusted(1.0 / np.sqrt(1.0 - share * explained))
         straight = o.view.paths.order == 0
         if not self.totals and (straight & (o.view.paths.slabs > 0)).any():
             target = target.trusted(behind_walls)
