@@ -1,5 +1,6 @@
 """Mesh files of other software: units, axes, instances, colours, names; what they may name; damage."""
 
+import base64
 import pickle
 from pathlib import Path
 
@@ -199,6 +200,26 @@ def test_a_gltf_header_that_does_not_fit_its_data_is_refused(change, told, tmp_p
     path = changed_glb(room_glb(tmp_path), change)
     with pytest.raises(ValueError, match=rf"room\.glb.*({told})"):
         wr.Mesh.load(path)
+
+
+@pytest.mark.parametrize(("kind", "code"), [("u1", 5121), ("<u2", 5123)])
+def test_texture_coordinates_of_gltf_bytes_and_shorts_are_shares(kind, code, tmp_path):
+    """As the core of the format has them: the upper half of the picture, which is red."""
+    most = np.iinfo(kind).max
+    data = (np.array([[0.0, 0.05], [1.0, 0.05], [1.0, 0.45], [0.0, 0.45]]) * most).astype(kind).tobytes()
+
+    def change(h):
+        uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+        h["buffers"].append({"uri": uri, "byteLength": len(data)})
+        h["bufferViews"].append({"buffer": len(h["buffers"]) - 1, "byteLength": len(data)})
+        view = {"bufferView": len(h["bufferViews"]) - 1, "componentType": code, "type": "VEC2", "count": 4}
+        h["accessors"].append(view | {"normalized": True})
+        table = next(m for m in h["meshes"] if m["name"] == "table")
+        table["primitives"][0]["attributes"]["TEXCOORD_0"] = len(h["accessors"]) - 1
+
+    mesh = wr.Mesh.load(changed_glb(room_glb(tmp_path), change))
+    wood = mesh.face_label == mesh.labels.index("Wood_01")
+    np.testing.assert_allclose(mesh.face_colours[wood], [np.array(RED) / 255.0] * 4, atol=1e-3)
 
 
 def test_lines_of_a_gltf_file_are_no_triangles(tmp_path):

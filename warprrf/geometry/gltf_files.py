@@ -163,15 +163,14 @@ class _File:
         uv, own = of_vertices.get(f"TEXCOORD_{channel}"), of_vertices.get("COLOR_0")
         colours = np.tile(material.factor, (len(corners), 1))
         if uv is not None and material.picture is not None:
-            if uv.dtype.kind != "f" or not np.isfinite(uv).all():
-                raise ValueError("texture coordinates are compressed, or not finite")
-            upward = np.column_stack([uv[:, 0], 1.0 - uv[:, 1]]).astype(np.float64)
-            colours *= sampled(material.picture, upward[corners])
+            if not np.isfinite(uv).all():
+                raise ValueError("texture coordinates are not finite")
+            u, v = _shares(uv).T
+            colours *= sampled(material.picture, np.column_stack([u, 1.0 - v])[corners])
         elif own is None and material.name is None and (material.factor == 1.0).all():
             colours[:] = np.nan  # white is what a file says that says nothing
         if own is not None:
-            most = np.iinfo(own.dtype).max if own.dtype.kind in "iu" else 1
-            colours *= (own[:, :3].astype(np.float64) / most)[corners].mean(axis=1).clip(0.0, 1.0)
+            colours *= _shares(own[:, :3])[corners].mean(axis=1).clip(0.0, 1.0)
         self.triangles = _counted(self.triangles, corners, positions)
         return material.name, positions.astype(np.float64), corners, colours
 
@@ -264,6 +263,11 @@ def _corners(index: np.ndarray, mode: int) -> np.ndarray:
     strip = np.stack([index[:-2], index[1:-1], index[2:]], axis=1)
     strip[1::2, :2] = strip[1::2, 1::-1]
     return strip[(strip != np.roll(strip, 1, axis=1)).all(axis=1)]
+
+
+def _shares(values: np.ndarray) -> np.ndarray:
+    """Numbers as they are, whole ones as shares of the largest."""
+    return values / np.float64(1 if values.dtype.kind == "f" else np.iinfo(values.dtype).max)
 
 
 def _texture(material: Mapping[str, Any]) -> dict[str, Any]:
