@@ -194,6 +194,8 @@ def test_files_outside_the_folder_are_read_only_if_that_is_asked_for(make, names
             "EXT_mesh_gpu_instancing; export it without",
         ),
         (lambda h: h["meshes"][0]["primitives"][0].update(mode=6), "fans"),
+        (lambda h: [n.update(skin=0) for n in h["nodes"]], "skin or morph weights; export"),
+        (lambda h: h["meshes"][1].update(weights=[0.0, 0.5]), "skin or morph weights; export"),
     ],
 )
 def test_a_gltf_header_that_does_not_fit_its_data_is_refused(change, told, tmp_path):
@@ -220,6 +222,11 @@ def test_texture_coordinates_of_gltf_bytes_and_shorts_are_shares(kind, code, tmp
     mesh = wr.Mesh.load(changed_glb(room_glb(tmp_path), change))
     wood = mesh.face_label == mesh.labels.index("Wood_01")
     np.testing.assert_allclose(mesh.face_colours[wood], [np.array(RED) / 255.0] * 4, atol=1e-3)
+
+
+def test_a_gltf_node_without_a_name_is_called_as_its_mesh(tmp_path):
+    path = changed_glb(room_glb(tmp_path), lambda h: [n.pop("name") for n in h["nodes"]])
+    assert set(read_mesh(path).object_names) == {"room", "table"}
 
 
 def test_lines_of_a_gltf_file_are_no_triangles(tmp_path):

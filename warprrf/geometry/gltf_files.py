@@ -1,7 +1,7 @@
 """glTF 2.0 files, text or binary (GLB): the triangles of the default scene in their places, with names and colours.
 
 What a file's tables state is held against what is there before it is read; what is not read is an error: compressed or
-sparse data, fans, nodes in circles. Files that it names are found by us: they don't leave the folder.
+sparse data, fans, skins, morphed shapes, nodes in circles. Files that it names are found by us: they don't leave the folder.
 """
 
 from __future__ import annotations
@@ -215,8 +215,12 @@ class _File:
             place = above @ _transform(node)
             todo += [(child, place) for child in reversed(node.get("children", []))]
             if "mesh" in node:
-                self.row("meshes", node["mesh"])
-                yield str(node.get("name", "node")), place, self.parts(node["mesh"])
+                mesh = self.row("meshes", node["mesh"])
+                if "skin" in node or any(node.get("weights", mesh.get("weights", ()))):
+                    raise ValueError(
+                        f"node {index} is moved by a skin or morph weights; export it with these applied"
+                    )
+                yield str(node.get("name", mesh.get("name", "node"))), place, self.parts(node["mesh"])
 
 
 def _split(path: Path) -> tuple[dict[str, Any], bytes | None]:
