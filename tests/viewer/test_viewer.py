@@ -10,6 +10,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+import trimesh
 from golden import make
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -109,6 +110,26 @@ def test_moving_the_receiver_answers_for_where_it_is(viewer):
     found = viewer.wait()
     np.testing.assert_array_equal(found.receiver, RECEIVER)
     assert "path gain" in viewer.message and found.spectrum.total_path_gain > 0
+
+
+def test_a_scene_far_from_zero_is_drawn_as_one_at_zero():
+    """Browsers draw in single precision, whose steps are half a metre in a country's coordinates."""
+    drawn, (mesh, _), ds = [], make.room_mesh(), make.spectra()
+    for off in np.zeros(3), np.array([5e5, 5e6, 0.0]):
+        places = make.TRANSMITTER + off, ds.receivers + off
+        readings = wr.Readings(*places, np.full(len(ds), 1e-9), make.CARRIER_HZ, 1e-20)
+        viewer = wr.view(wr.Mesh(mesh.vertices + off, mesh.faces), readings, port=8190)
+        try:
+            viewer.receiver = RECEIVER + off
+            np.testing.assert_allclose(viewer.wait().receiver, RECEIVER + off, rtol=0, atol=1e-8)
+            named = viewer._page.scene.get_handle_by_name
+            room = trimesh.load(io.BytesIO(named("/mesh").glb_data), file_type="glb").bounds
+            at = named("/receiver").position, named("/paths/chosen/figures").position
+            drawn.append([named("/paths").points, named("/measured").batched_positions, room, *at])
+        finally:
+            viewer.close()
+    for near, far in zip(*drawn, strict=True):
+        np.testing.assert_allclose(far, near, atol=1e-4)
 
 
 def test_where_nothing_arrives_no_gain_is_made_up(tmp_path, capsys):

@@ -50,6 +50,7 @@ class Page:
         server, gui, scene: viser's.
         tabs: that panels put their elements in.
         url: where it is.
+        origin: what is taken off all that is drawn [m], shape ``(3,)``: whole kilometres, for browsers draw in single precision.
         message: what its first line says.
         hidden: names of what is not shown.
     """
@@ -75,6 +76,8 @@ class Page:
         self._closed = False
         self._background: threading.Thread | None = None
         middle, size = bounds.mean(axis=0), float(np.linalg.norm(bounds[1] - bounds[0]))
+        self.origin = 1e3 * np.round(1e-3 * middle)
+        middle -= self.origin
         self.scene.set_up_direction("+z")
         # Its share button would send the scene through somebody else's machine.
         self.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
