@@ -5,6 +5,7 @@ import io
 import re
 import resource
 import shutil
+import socket
 import time
 from contextlib import contextmanager
 
@@ -167,6 +168,25 @@ def test_an_address_that_is_none_is_refused():
     for name, value in (("host", "192.0.2.1"), ("host", ""), ("port", 0), ("port", 2.5)):
         with pytest.raises((ValueError, TypeError), match=f"{name}: got {value!r}"):
             wr.view(make.room_mesh()[0], **{name: value})
+
+
+def test_a_port_that_is_taken_without_a_free_one_above_it_is_refused():
+    with (
+        socket.create_server(("127.0.0.1", 65535)),
+        pytest.raises(ValueError, match="port: got 65535, which"),
+    ):
+        wr.view(make.room_mesh()[0], port=65535)
+
+
+def test_spherical_cameras_are_drawn():
+    camera = wr.Camera.spherical(8, 4, position=RECEIVER)
+    viewer = wr.view(wr.Reconstruction(None, make.room_mesh()[0], {"a.jpg": camera}), port=8193)
+    try:
+        drawn = viewer._page.scene.get_handle_by_name("/cameras/a.jpg")
+        np.testing.assert_allclose(drawn.position, RECEIVER)
+        assert 0.5 < drawn.fov < 2.0
+    finally:
+        viewer.close()
 
 
 def test_errors_at_measured_places_are_listed_worst_first(viewer):

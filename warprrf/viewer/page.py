@@ -65,11 +65,14 @@ class Page:
                 pass
         except OSError as error:
             raise ValueError(f"host: got {host!r}, expected an address of this machine ({error})") from error
+        free = next((p for p in range(port, 65536) if _is_free(host, p)), None)
+        if free is None:  # for which viser would wait for ever
+            raise ValueError(f"port: got {port}, which is taken as are all above it; expected a lower one")
         require("viser", extra="view")
         from warprrf.viewer.connections import open_server
 
         dropped = "**A message of a page was dropped: {}**"
-        self.server, self.url = open_server(host, port, lambda wrong: self.say(dropped.format(wrong)))
+        self.server, self.url = open_server(host, free, lambda wrong: self.say(dropped.format(wrong)))
         self.gui, self.scene = self.server.gui, self.server.scene
         self.message = ""
         self.hidden = {"cameras"}
@@ -146,3 +149,11 @@ class Page:
         self.wait()
         with redirect_stdout(io.StringIO()):
             self.server.stop()
+
+
+def _is_free(host: str, port: int) -> bool:
+    try:
+        with socket.create_server((host, port)):
+            return True
+    except OSError:
+        return False

@@ -169,7 +169,7 @@ class Room:
         for name, camera in subject.cameras.items():
             to_world = np.linalg.inv(camera.world_to_camera)
             scene.add_camera_frustum(
-                f"/cameras/{name}", fov=2.0 * float(np.arctan(0.5 * camera.height / camera.fy)),
+                f"/cameras/{name}", fov=2.0 * float(np.arctan(0.5 * camera.height / (camera.fy or camera.height))),
                 aspect=camera.width / camera.height, scale=0.15, image=_thumbnail(subject, name, camera),
                 color=(60, 90, 160), wxyz=quaternions_of(to_world[None, :3, :3])[0], position=to_world[:3, 3] - self._page.origin,
             )  # fmt: skip
