@@ -44,6 +44,16 @@ def add_out(parser: argparse.ArgumentParser, text: str, required: bool = True) -
     parser.add_argument("-o", "--out", required=required, type=name, help=text)
 
 
+def beside(out: str, suffix: str) -> Path:
+    """The file that a command writes beside ``out``; what stands there without ``out`` is no earlier run's, and stays."""
+    path = Path(out).with_suffix(suffix)
+    if path.exists() and not os.path.exists(out):
+        raise ValueError(
+            f"--out: got {out!r}, beside which {path} would be written over; expected another name"
+        )
+    return path
+
+
 def existing(path: str | os.PathLike[str]) -> Path:
     """``path``, which must exist."""
     path = Path(path)

@@ -22,6 +22,7 @@ from warprrf.cli.inputs import (
     add_out,
     add_pattern,
     add_point,
+    beside,
     existing,
     load_field,
     load_geometry,
@@ -548,6 +549,7 @@ def _relevance(args: argparse.Namespace, out: Output) -> None:
     source = existing(args.source)
     if args.out and Path(args.out).suffix == ".md":
         raise ValueError(f"--out: got {args.out!r}, expected JSON's name: the table goes beside it as .md")
+    files = [Path(args.out), beside(args.out, ".md")] if args.out else []
     given = {"transmitter": args.transmitter, "frequency_hz": args.frequency}
     receivers = None if args.receivers is None else read_receivers(args.receivers)
     if args.spectra is not None:
@@ -573,7 +575,6 @@ def _relevance(args: argparse.Namespace, out: Output) -> None:
         device=args.device,
         **given,
     )
-    files = [Path(args.out), Path(args.out).with_suffix(".md")] if args.out else []
     if files:
         found.save(files[0])
         write_text(files[1], found.table() + "\n")
