@@ -119,6 +119,8 @@ SUGGEST = "suggest {scene} 2,2,1 --transmitter 13.6 11.2 2.5"
 BAD = {
     "no scene": (SIMULATE.replace("{scene}", "none.xml") + " 2,2,1", "none.xml"),
     "a folder in the place of the result": (SIMULATE.replace("{tmp}/x.nc", "{tmp}") + " 7,4,1.5", "expected the name of a file"),
+    "a result below a file": (SIMULATE.replace("x.nc", "one.ply/a/x.nc") + " 7,4,1.5", "one.ply is no folder that may be"),
+    "a result where none may be written": (SIMULATE.replace("{tmp}/x", "/proc/self/x") + " 7,4,1.5", "/proc/self is no folder"),
     "empty name of the result": (SIMULATE.replace("-o {tmp}/x.nc", "--out=") + " 7,4,1.5", "-o/--out: got ''"),
     "materials of a reconstruction": ("relevance {tmp} --receivers 2,2,1 --materials {tmp}/materials.json", "--materials"),
     "scale that is no number": ("reconstruct {tmp} -o {tmp}/out --scale a.jpg b.jpg far", "--scale"),
