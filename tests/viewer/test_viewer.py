@@ -196,6 +196,14 @@ def test_errors_at_measured_places_are_listed_worst_first(viewer):
     np.testing.assert_allclose(listed, np.sort(wanted)[: len(listed)], atol=0.06)
 
 
+def test_what_was_not_read_is_no_error_to_list(viewer):
+    field, ds = viewer.subject.field, viewer.subject.spectra
+    power = np.array([1e-10, np.nan, 1e-12])
+    readings = wr.Readings(field.transmitter, ds.receivers[:3], power, field.frequency_hz, 1e-20)
+    viewer._survey._reading_errors(readings, field, None)
+    assert [button.label.split(" dB at")[0][-1].isdigit() for button in viewer._survey.listed] == [True, True]
+
+
 def test_at_another_carrier_fields_are_carried_over_and_not_compared_with_what_was_measured(viewer):
     viewer.receiver = viewer.subject.spectra.receivers[0]
     viewer.wait()

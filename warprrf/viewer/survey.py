@@ -221,7 +221,7 @@ class Survey:
         places, own = np.unique(readings.receivers, axis=0, return_inverse=True)
         each = [error[own.reshape(-1) == k] for k in range(len(places))]
         rms = np.array([_rms(e) for e in each])
-        worst = np.argsort(-np.abs(np.nan_to_num(error)))[:WORST]
+        worst = np.argsort(-np.abs(error))[: min(WORST, np.isfinite(error).sum())]  # NaN come last
         labels = [f"{error[k]:+.1f} dB" for k in worst]
         if readings.arrival is not None:
             turned = np.degrees(readings.arrival[worst])
