@@ -137,6 +137,7 @@ BAD = {
     "table in the place of JSON": ("relevance {scene} --spectra {spectra} -o {tmp}/r.md", "--out: got"),
     "picture of others where a map's goes": ("map {tmp}/bad.safetensors -o {tmp}/mine.nc", "mine.png would be written over"),
     "text of others where a table goes": ("relevance {scene} --spectra {spectra} -o {tmp}/mine.json", "mine.md would be written"),
+    "what is not ours in the place of unfinished work": (SIMULATE.replace("x.nc", "mine.nc") + " 7,4,1.5", "is no earlier run's"),
     "result in the place of a mesh": ("sample {tmp}/one.ply -o {tmp}/../{tmp.name}/one.ply", "which the command reads"),
     "result in the place of readings": (HORN.replace("f.safetensors", "horn.csv"), "which the command reads"),
     "pointings without a direction": (f"{SUGGEST} --frequency 3e11 --receive-pattern 10", "azimuth"),
@@ -156,8 +157,9 @@ def test_bad_input_is_one_line_and_status_2(case, tmp_path, capsys):
     (tmp_path / "bad.safetensors").write_bytes(b"\x08\0\0\0\0\0\0\0notjson!")
     (tmp_path / "bad.nc").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
     gaussians().save_ply(tmp_path / "one.ply")
-    for kind in ("png", "md"):
-        (tmp_path / f"mine.{kind}").write_text("mine")
+    (tmp_path / "mine.nc.receivers").mkdir()
+    for name in ("mine.png", "mine.md", "mine.nc.receivers/mine.csv"):
+        (tmp_path / name).write_text("mine")
     words, expected = BAD[case]
     before = sorted(path.name for path in tmp_path.iterdir())
     run(words, tmp_path, status=2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
@@ -41,6 +42,7 @@ from warprrf.cli.output import Output, table
 from warprrf.files import plain, write_json, write_text
 from warprrf.geometry.photos.config import LENSES, ReconstructionConfig
 from warprrf.rf.tracing.model import SETS
+from warprrf.steps import RECORDS
 
 
 def add_reconstruct(add: Add) -> None:
@@ -216,6 +218,11 @@ def _simulate(args: argparse.Namespace, out: Output) -> None:
         effects = read_effects(args.effects)
         how["effects"] = SETS.get(effects, effects)
     unfinished = Path(f"{args.out}.receivers")
+    there = os.listdir(unfinished) if unfinished.is_dir() else []
+    if there and RECORDS not in there:  # it is removed in the end
+        raise ValueError(
+            f"--out: got {args.out!r}, but {unfinished} is no earlier run's; expected another name"
+        )
     out.resumes(unfinished)
     dataset = wr.simulate(
         load_scene(args.scene, args),
