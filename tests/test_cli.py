@@ -168,6 +168,16 @@ def test_bad_input_is_one_line_and_status_2(case, tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir() if path.name != "run") == before
 
 
+def test_an_interrupted_fit_says_where_its_checkpoint_is(tmp_path, monkeypatch, capsys):
+    def fit(*_, checkpoint, **__):
+        (tmp_path / checkpoint).write_text("half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(wr.RadioField, "fit", fit)
+    run(f"{FIT} {{spectra}} --model rf3dgs --option checkpoint={{tmp}}/half", tmp_path, status=130)
+    assert f"finished work is kept in {tmp_path / 'half'}, the same command" in capsys.readouterr().err
+
+
 def test_debug_shows_the_traceback():
     with pytest.raises(ValueError, match="no such file"):
         cli.main("simulate none.xml -o x.nc --transmitter 1 1 1 --receivers 1,1,1 --debug".split())

@@ -327,6 +327,8 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
             raise ValueError(f"--{option}: only the bistatic model takes it, got --model {args.model}")
     if args.iterations is not None:
         options["iterations"] = args.iterations
+    if "checkpoint" in options:
+        out.resumes(str(options["checkpoint"]))
     field = wr.RadioField.fit(
         geometry,
         data[0] if len(data) == 1 else data,
