@@ -224,6 +224,20 @@ def test_texture_coordinates_of_gltf_bytes_and_shorts_are_shares(kind, code, tmp
     np.testing.assert_allclose(mesh.face_colours[wood], [np.array(RED) / 255.0] * 4, atol=1e-3)
 
 
+def test_colours_of_glossy_gltf_materials_are_those_of_usual_ones(tmp_path):
+    def change(h):
+        for material in h["materials"]:
+            usual = material.pop("pbrMetallicRoughness")
+            names = {"baseColorFactor": "diffuseFactor", "baseColorTexture": "diffuseTexture"}
+            glossy = {names[k]: value for k, value in usual.items() if k in names}
+            material["extensions"] = {"KHR_materials_pbrSpecularGlossiness": glossy}
+
+    wanted = read_mesh(room_glb(tmp_path))
+    found = read_mesh(changed_glb(room_glb(tmp_path), change))
+    np.testing.assert_array_equal(found.face_colours, wanted.face_colours)
+    assert found.material_names == wanted.material_names
+
+
 def test_a_gltf_node_without_a_name_is_called_as_its_mesh(tmp_path):
     path = changed_glb(room_glb(tmp_path), lambda h: [n.pop("name") for n in h["nodes"]])
     assert set(read_mesh(path).object_names) == {"room", "table"}

@@ -159,7 +159,7 @@ class _File:
         material, channel = _Material(None, np.ones(3)), 0
         if "material" in primitive:
             material = self.material(primitive["material"])
-            channel = _texture(self.row("materials", primitive["material"])).get("texCoord", 0)
+            channel = _colour(self.row("materials", primitive["material"]))[1].get("texCoord", 0)
         uv, own = of_vertices.get(f"TEXCOORD_{channel}"), of_vertices.get("COLOR_0")
         colours = np.tile(material.factor, (len(corners), 1))
         if uv is not None and material.picture is not None:
@@ -180,12 +180,11 @@ class _File:
 
     def _material(self, index: int) -> _Material:
         material, path = self.row("materials", index), self.folder.path
-        factor = np.array(
-            material.get("pbrMetallicRoughness", {}).get("baseColorFactor", [1.0] * 4), dtype=np.float64
-        )
+        stated, entry = _colour(material)
+        factor = np.array(stated, dtype=np.float64)
         if factor.shape != (4,) or not np.isfinite(factor).all():
             raise ValueError(f"material {index} has the colour {factor}, expected four numbers")
-        name, entry, picture = material.get("name"), _texture(material), None
+        name, picture = material.get("name"), None
         if entry and self.folder.colours:
             texture = self.row("textures", entry["index"])
             webp = texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source")
@@ -274,8 +273,12 @@ def _shares(values: np.ndarray) -> np.ndarray:
     return values / np.float64(1 if values.dtype.kind == "f" else np.iinfo(values.dtype).max)
 
 
-def _texture(material: Mapping[str, Any]) -> dict[str, Any]:
-    return dict(material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {}))
+def _colour(material: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
+    """The factor and the texture of a material's colour; those of glossy materials stand in an extension."""
+    usual = material.get("pbrMetallicRoughness", {})
+    glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
+    texture = usual.get("baseColorTexture", glossy.get("diffuseTexture", {}))
+    return usual.get("baseColorFactor", glossy.get("diffuseFactor", [1.0] * 4)), dict(texture)
 
 
 def _transform(node: Mapping[str, Any]) -> np.ndarray:
