@@ -119,6 +119,8 @@ SUGGEST = "suggest {scene} 2,2,1 --transmitter 13.6 11.2 2.5"
 BAD = {
     "no scene": (SIMULATE.replace("{scene}", "none.xml") + " 2,2,1", "none.xml"),
     "a folder in the place of the result": (SIMULATE.replace("{tmp}/x.nc", "{tmp}") + " 7,4,1.5", "expected the name of a file"),
+    "a result below a file": (SIMULATE.replace("x.nc", "one.ply/a/x.nc") + " 7,4,1.5", "one.ply is no folder that may be"),
+    "a result where none may be written": (SIMULATE.replace("{tmp}/x", "/proc/self/x") + " 7,4,1.5", "/proc/self is no folder"),
     "empty name of the result": (SIMULATE.replace("-o {tmp}/x.nc", "--out=") + " 7,4,1.5", "-o/--out: got ''"),
     "materials of a reconstruction": ("relevance {tmp} --receivers 2,2,1 --materials {tmp}/materials.json", "--materials"),
     "scale that is no number": ("reconstruct {tmp} -o {tmp}/out --scale a.jpg b.jpg far", "--scale"),
@@ -133,6 +135,9 @@ BAD = {
     "effects of Sionna": (f"{SIMULATE} 7,4,1.5 --engine sionna --effects room", "--effects: got 'room'"),
     "walls of Sionna": (f"{SIMULATE} 7,4,1.5 --refraction", "--refraction: got True, but engine exact has --effects"),
     "table in the place of JSON": ("relevance {scene} --spectra {spectra} -o {tmp}/r.md", "--out: got"),
+    "picture of others where a map's goes": ("map {tmp}/bad.safetensors -o {tmp}/mine.nc", "mine.png would be written over"),
+    "text of others where a table goes": ("relevance {scene} --spectra {spectra} -o {tmp}/mine.json", "mine.md would be written"),
+    "what is not ours in the place of unfinished work": (SIMULATE.replace("x.nc", "mine.nc") + " 7,4,1.5", "is no earlier run's"),
     "result in the place of a mesh": ("sample {tmp}/one.ply -o {tmp}/../{tmp.name}/one.ply", "which the command reads"),
     "result in the place of readings": (HORN.replace("f.safetensors", "horn.csv"), "which the command reads"),
     "pointings without a direction": (f"{SUGGEST} --frequency 3e11 --receive-pattern 10", "azimuth"),
@@ -152,12 +157,25 @@ def test_bad_input_is_one_line_and_status_2(case, tmp_path, capsys):
     (tmp_path / "bad.safetensors").write_bytes(b"\x08\0\0\0\0\0\0\0notjson!")
     (tmp_path / "bad.nc").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
     gaussians().save_ply(tmp_path / "one.ply")
+    (tmp_path / "mine.nc.receivers").mkdir()
+    for name in ("mine.png", "mine.md", "mine.nc.receivers/mine.csv"):
+        (tmp_path / name).write_text("mine")
     words, expected = BAD[case]
     before = sorted(path.name for path in tmp_path.iterdir())
     run(words, tmp_path, status=2)
     said = capsys.readouterr().err.strip()
     assert said.startswith("warprrf: error: ") and expected in said and said.count("\n") == 0
     assert sorted(path.name for path in tmp_path.iterdir() if path.name != "run") == before
+
+
+def test_an_interrupted_fit_says_where_its_checkpoint_is(tmp_path, monkeypatch, capsys):
+    def fit(*_, checkpoint, **__):
+        (tmp_path / checkpoint).write_text("half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(wr.RadioField, "fit", fit)
+    run(f"{FIT} {{spectra}} --model rf3dgs --option checkpoint={{tmp}}/half", tmp_path, status=130)
+    assert f"finished work is kept in {tmp_path / 'half'}, the same command" in capsys.readouterr().err
 
 
 def test_debug_shows_the_traceback():

@@ -1,5 +1,6 @@
 """Mesh files of other software: units, axes, instances, colours, names; what they may name; damage."""
 
+import base64
 import pickle
 from pathlib import Path
 
@@ -193,12 +194,53 @@ def test_files_outside_the_folder_are_read_only_if_that_is_asked_for(make, names
             "EXT_mesh_gpu_instancing; export it without",
         ),
         (lambda h: h["meshes"][0]["primitives"][0].update(mode=6), "fans"),
+        (lambda h: [n.update(skin=0) for n in h["nodes"]], "skin or morph weights; export"),
+        (lambda h: h["meshes"][1].update(weights=[0.0, 0.5]), "skin or morph weights; export"),
     ],
 )
 def test_a_gltf_header_that_does_not_fit_its_data_is_refused(change, told, tmp_path):
     path = changed_glb(room_glb(tmp_path), change)
     with pytest.raises(ValueError, match=rf"room\.glb.*({told})"):
         wr.Mesh.load(path)
+
+
+@pytest.mark.parametrize(("kind", "code"), [("u1", 5121), ("<u2", 5123)])
+def test_texture_coordinates_of_gltf_bytes_and_shorts_are_shares(kind, code, tmp_path):
+    """As the core of the format has them: the upper half of the picture, which is red."""
+    most = np.iinfo(kind).max
+    data = (np.array([[0.0, 0.05], [1.0, 0.05], [1.0, 0.45], [0.0, 0.45]]) * most).astype(kind).tobytes()
+
+    def change(h):
+        uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+        h["buffers"].append({"uri": uri, "byteLength": len(data)})
+        h["bufferViews"].append({"buffer": len(h["buffers"]) - 1, "byteLength": len(data)})
+        view = {"bufferView": len(h["bufferViews"]) - 1, "componentType": code, "type": "VEC2", "count": 4}
+        h["accessors"].append(view | {"normalized": True})
+        table = next(m for m in h["meshes"] if m["name"] == "table")
+        table["primitives"][0]["attributes"]["TEXCOORD_0"] = len(h["accessors"]) - 1
+
+    mesh = wr.Mesh.load(changed_glb(room_glb(tmp_path), change))
+    wood = mesh.face_label == mesh.labels.index("Wood_01")
+    np.testing.assert_allclose(mesh.face_colours[wood], [np.array(RED) / 255.0] * 4, atol=1e-3)
+
+
+def test_colours_of_glossy_gltf_materials_are_those_of_usual_ones(tmp_path):
+    def change(h):
+        for material in h["materials"]:
+            usual = material.pop("pbrMetallicRoughness")
+            names = {"baseColorFactor": "diffuseFactor", "baseColorTexture": "diffuseTexture"}
+            glossy = {names[k]: value for k, value in usual.items() if k in names}
+            material["extensions"] = {"KHR_materials_pbrSpecularGlossiness": glossy}
+
+    wanted = read_mesh(room_glb(tmp_path))
+    found = read_mesh(changed_glb(room_glb(tmp_path), change))
+    np.testing.assert_array_equal(found.face_colours, wanted.face_colours)
+    assert found.material_names == wanted.material_names
+
+
+def test_a_gltf_node_without_a_name_is_called_as_its_mesh(tmp_path):
+    path = changed_glb(room_glb(tmp_path), lambda h: [n.pop("name") for n in h["nodes"]])
+    assert set(read_mesh(path).object_names) == {"room", "table"}
 
 
 def test_lines_of_a_gltf_file_are_no_triangles(tmp_path):

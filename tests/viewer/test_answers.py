@@ -150,6 +150,12 @@ def test_things_are_sorted_by_what_they_are(tmp_path, field):
     assert finer.shape == ds.path_gain.shape[1:]
 
 
+def test_a_field_of_gaussians_alone_says_where_it_is():
+    ds, gaussians = make.spectra().subset([0, 3]), make.gaussians()
+    field = wr.RadioField.fit(wr.Reconstruction(gaussians), ds, model="rf3dgs", iterations=1)
+    np.testing.assert_array_equal(Subject.of([field]).bounds, Subject.of([gaussians]).bounds)
+
+
 @pytest.mark.parametrize(
     ("things", "error", "said"),
     [

@@ -5,11 +5,13 @@ import io
 import re
 import resource
 import shutil
+import socket
 import time
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
+import trimesh
 from golden import make
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -111,6 +113,26 @@ def test_moving_the_receiver_answers_for_where_it_is(viewer):
     assert "path gain" in viewer.message and found.spectrum.total_path_gain > 0
 
 
+def test_a_scene_far_from_zero_is_drawn_as_one_at_zero():
+    """Browsers draw in single precision, whose steps are half a metre in a country's coordinates."""
+    drawn, (mesh, _), ds = [], make.room_mesh(), make.spectra()
+    for off in np.zeros(3), np.array([5e5, 5e6, 0.0]):
+        places = make.TRANSMITTER + off, ds.receivers + off
+        readings = wr.Readings(*places, np.full(len(ds), 1e-9), make.CARRIER_HZ, 1e-20)
+        viewer = wr.view(wr.Mesh(mesh.vertices + off, mesh.faces), readings, port=8190)
+        try:
+            viewer.receiver = RECEIVER + off
+            np.testing.assert_allclose(viewer.wait().receiver, RECEIVER + off, rtol=0, atol=1e-8)
+            named = viewer._page.scene.get_handle_by_name
+            room = trimesh.load(io.BytesIO(named("/mesh").glb_data), file_type="glb").bounds
+            at = named("/receiver").position, named("/paths/chosen/figures").position
+            drawn.append([named("/paths").points, named("/measured").batched_positions, room, *at])
+        finally:
+            viewer.close()
+    for near, far in zip(*drawn, strict=True):
+        np.testing.assert_allclose(far, near, atol=1e-4)
+
+
 def test_where_nothing_arrives_no_gain_is_made_up(tmp_path, capsys):
     dark = dataclasses.replace(
         make.bistatic(),
@@ -148,11 +170,38 @@ def test_an_address_that_is_none_is_refused():
             wr.view(make.room_mesh()[0], **{name: value})
 
 
+def test_a_port_that_is_taken_without_a_free_one_above_it_is_refused():
+    with (
+        socket.create_server(("127.0.0.1", 65535)),
+        pytest.raises(ValueError, match="port: got 65535, which"),
+    ):
+        wr.view(make.room_mesh()[0], port=65535)
+
+
+def test_spherical_cameras_are_drawn():
+    camera = wr.Camera.spherical(8, 4, position=RECEIVER)
+    viewer = wr.view(wr.Reconstruction(None, make.room_mesh()[0], {"a.jpg": camera}), port=8193)
+    try:
+        drawn = viewer._page.scene.get_handle_by_name("/cameras/a.jpg")
+        np.testing.assert_allclose(drawn.position, RECEIVER)
+        assert 0.5 < drawn.fov < 2.0
+    finally:
+        viewer.close()
+
+
 def test_errors_at_measured_places_are_listed_worst_first(viewer):
     ds, field = viewer.subject.spectra, viewer.subject.field
     wanted = [answers.errors(field.spectrum(r), ds[k])["psnr_db"] for k, r in enumerate(ds.receivers)]
     listed = [float(button.label.split()[0]) for button in _survey(viewer, "errors").listed]
     np.testing.assert_allclose(listed, np.sort(wanted)[: len(listed)], atol=0.06)
+
+
+def test_what_was_not_read_is_no_error_to_list(viewer):
+    field, ds = viewer.subject.field, viewer.subject.spectra
+    power = np.array([1e-10, np.nan, 1e-12])
+    readings = wr.Readings(field.transmitter, ds.receivers[:3], power, field.frequency_hz, 1e-20)
+    viewer._survey._reading_errors(readings, field, None)
+    assert [button.label.split(" dB at")[0][-1].isdigit() for button in viewer._survey.listed] == [True, True]
 
 
 def test_at_another_carrier_fields_are_carried_over_and_not_compared_with_what_was_measured(viewer):

@@ -42,7 +42,7 @@ a walk through:
 Metres, seconds, hertz, world z up. `warprrf COMMAND --help` explains each with examples. With --json, standard output
 holds one JSON object a line and nothing else: {"event": "progress", "stage", "done", "total", "seconds_left"}, one
 {"event": "result", "files", figures ...} or {"event": "error", "message", "status"}. Ctrl-C ends a command at once
-with status 130; what reconstruct, simulate and fit have finished is kept, and the same command goes on from there.
+with status 130; what reconstruct and simulate have finished is kept, and the same command goes on from there.
 """
 
 _NEGATIVE = re.compile(r"-[.\d][-+.,\deE]*")  # numbers such as -1, -1e-3 and -1,4,1.5

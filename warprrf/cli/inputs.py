@@ -39,9 +39,24 @@ def add_out(parser: argparse.ArgumentParser, text: str, required: bool = True) -
     def name(given: str) -> str:
         if not given.strip() or (kind == "file" and os.path.isdir(given)):
             raise argparse.ArgumentTypeError(f"got {given!r}, expected the name of a {kind}")
+        above = next(p for p in Path(given).absolute().parents if os.path.exists(p))  # the rest is made
+        if not (above.is_dir() and os.access(above, os.W_OK)):
+            raise argparse.ArgumentTypeError(
+                f"got {given!r}, but {above} is no folder that may be written to"
+            )
         return given
 
     parser.add_argument("-o", "--out", required=required, type=name, help=text)
+
+
+def beside(out: str, suffix: str) -> Path:
+    """The file that a command writes beside ``out``; what stands there without ``out`` is no earlier run's, and stays."""
+    path = Path(out).with_suffix(suffix)
+    if path.exists() and not os.path.exists(out):
+        raise ValueError(
+            f"--out: got {out!r}, beside which {path} would be written over; expected another name"
+        )
+    return path
 
 
 def existing(path: str | os.PathLike[str]) -> Path:

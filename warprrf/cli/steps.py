@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
@@ -22,6 +23,7 @@ from warprrf.cli.inputs import (
     add_out,
     add_pattern,
     add_point,
+    beside,
     existing,
     load_field,
     load_geometry,
@@ -40,6 +42,7 @@ from warprrf.cli.output import Output, table
 from warprrf.files import plain, write_json, write_text
 from warprrf.geometry.photos.config import LENSES, ReconstructionConfig
 from warprrf.rf.tracing.model import SETS
+from warprrf.steps import RECORDS
 
 
 def add_reconstruct(add: Add) -> None:
@@ -215,6 +218,11 @@ def _simulate(args: argparse.Namespace, out: Output) -> None:
         effects = read_effects(args.effects)
         how["effects"] = SETS.get(effects, effects)
     unfinished = Path(f"{args.out}.receivers")
+    there = os.listdir(unfinished) if unfinished.is_dir() else []
+    if there and RECORDS not in there:  # it is removed in the end
+        raise ValueError(
+            f"--out: got {args.out!r}, but {unfinished} is no earlier run's; expected another name"
+        )
     out.resumes(unfinished)
     dataset = wr.simulate(
         load_scene(args.scene, args),
@@ -319,6 +327,8 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
             raise ValueError(f"--{option}: only the bistatic model takes it, got --model {args.model}")
     if args.iterations is not None:
         options["iterations"] = args.iterations
+    if "checkpoint" in options:
+        out.resumes(str(options["checkpoint"]))
     field = wr.RadioField.fit(
         geometry,
         data[0] if len(data) == 1 else data,
@@ -548,6 +558,7 @@ def _relevance(args: argparse.Namespace, out: Output) -> None:
     source = existing(args.source)
     if args.out and Path(args.out).suffix == ".md":
         raise ValueError(f"--out: got {args.out!r}, expected JSON's name: the table goes beside it as .md")
+    files = [Path(args.out), beside(args.out, ".md")] if args.out else []
     given = {"transmitter": args.transmitter, "frequency_hz": args.frequency}
     receivers = None if args.receivers is None else read_receivers(args.receivers)
     if args.spectra is not None:
@@ -573,7 +584,6 @@ def _relevance(args: argparse.Namespace, out: Output) -> None:
         device=args.device,
         **given,
     )
-    files = [Path(args.out), Path(args.out).with_suffix(".md")] if args.out else []
     if files:
         found.save(files[0])
         write_text(files[1], found.table() + "\n")

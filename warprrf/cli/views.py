@@ -17,6 +17,7 @@ from warprrf.cli.inputs import (
     add_measured_options,
     add_out,
     add_point,
+    beside,
     existing,
     load_field,
     read_measured,
@@ -216,6 +217,7 @@ def _map(args: argparse.Namespace, out: Output) -> None:
     path = Path(args.out)
     if path.suffix.lower() not in (".nc", ".png"):
         raise ValueError(f"{path}: expected .nc (NetCDF, a picture beside it) or .png (the picture alone)")
+    files = [path] if path.suffix.lower() == ".png" else [path, beside(args.out, ".png")]
     field = load_field(args.field, args)
     found = field.radio_map(
         args.height,
@@ -230,7 +232,6 @@ def _map(args: argparse.Namespace, out: Output) -> None:
         mirror_order=args.mirror_order,
         progress=out,
     )
-    files = [path] if path.suffix.lower() == ".png" else [path, path.with_suffix(".png")]
     if path.suffix.lower() == ".nc":
         found.save(path)
     found.picture(files[-1])

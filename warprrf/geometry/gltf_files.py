@@ -1,7 +1,7 @@
 """glTF 2.0 files, text or binary (GLB): the triangles of the default scene in their places, with names and colours.
 
 What a file's tables state is held against what is there before it is read; what is not read is an error: compressed or
-sparse data, fans, nodes in circles. Files that it names are found by us: they don't leave the folder.
+sparse data, fans, skins, morphed shapes, nodes in circles. Files that it names are found by us: they don't leave the folder.
 """
 
 from __future__ import annotations
@@ -159,19 +159,18 @@ class _File:
         material, channel = _Material(None, np.ones(3)), 0
         if "material" in primitive:
             material = self.material(primitive["material"])
-            channel = _texture(self.row("materials", primitive["material"])).get("texCoord", 0)
+            channel = _colour(self.row("materials", primitive["material"]))[1].get("texCoord", 0)
         uv, own = of_vertices.get(f"TEXCOORD_{channel}"), of_vertices.get("COLOR_0")
         colours = np.tile(material.factor, (len(corners), 1))
         if uv is not None and material.picture is not None:
-            if uv.dtype.kind != "f" or not np.isfinite(uv).all():
-                raise ValueError("texture coordinates are compressed, or not finite")
-            upward = np.column_stack([uv[:, 0], 1.0 - uv[:, 1]]).astype(np.float64)
-            colours *= sampled(material.picture, upward[corners])
+            if not np.isfinite(uv).all():
+                raise ValueError("texture coordinates are not finite")
+            u, v = _shares(uv).T
+            colours *= sampled(material.picture, np.column_stack([u, 1.0 - v])[corners])
         elif own is None and material.name is None and (material.factor == 1.0).all():
             colours[:] = np.nan  # white is what a file says that says nothing
         if own is not None:
-            most = np.iinfo(own.dtype).max if own.dtype.kind in "iu" else 1
-            colours *= (own[:, :3].astype(np.float64) / most)[corners].mean(axis=1).clip(0.0, 1.0)
+            colours *= _shares(own[:, :3])[corners].mean(axis=1).clip(0.0, 1.0)
         self.triangles = _counted(self.triangles, corners, positions)
         return material.name, positions.astype(np.float64), corners, colours
 
@@ -181,12 +180,11 @@ class _File:
 
     def _material(self, index: int) -> _Material:
         material, path = self.row("materials", index), self.folder.path
-        factor = np.array(
-            material.get("pbrMetallicRoughness", {}).get("baseColorFactor", [1.0] * 4), dtype=np.float64
-        )
+        stated, entry = _colour(material)
+        factor = np.array(stated, dtype=np.float64)
         if factor.shape != (4,) or not np.isfinite(factor).all():
             raise ValueError(f"material {index} has the colour {factor}, expected four numbers")
-        name, entry, picture = material.get("name"), _texture(material), None
+        name, picture = material.get("name"), None
         if entry and self.folder.colours:
             texture = self.row("textures", entry["index"])
             webp = texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source")
@@ -216,8 +214,12 @@ class _File:
             place = above @ _transform(node)
             todo += [(child, place) for child in reversed(node.get("children", []))]
             if "mesh" in node:
-                self.row("meshes", node["mesh"])
-                yield str(node.get("name", "node")), place, self.parts(node["mesh"])
+                mesh = self.row("meshes", node["mesh"])
+                if "skin" in node or any(node.get("weights", mesh.get("weights", ()))):
+                    raise ValueError(
+                        f"node {index} is moved by a skin or morph weights; export it with these applied"
+                    )
+                yield str(node.get("name", mesh.get("name", "node"))), place, self.parts(node["mesh"])
 
 
 def _split(path: Path) -> tuple[dict[str, Any], bytes | None]:
@@ -266,8 +268,17 @@ def _corners(index: np.ndarray, mode: int) -> np.ndarray:
     return strip[(strip != np.roll(strip, 1, axis=1)).all(axis=1)]
 
 
-def _texture(material: Mapping[str, Any]) -> dict[str, Any]:
-    return dict(material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {}))
+def _shares(values: np.ndarray) -> np.ndarray:
+    """Numbers as they are, whole ones as shares of the largest."""
+    return values / np.float64(1 if values.dtype.kind == "f" else np.iinfo(values.dtype).max)
+
+
+def _colour(material: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
+    """The factor and the texture of a material's colour; those of glossy materials stand in an extension."""
+    usual = material.get("pbrMetallicRoughness", {})
+    glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
+    texture = usual.get("baseColorTexture", glossy.get("diffuseTexture", {}))
+    return usual.get("baseColorFactor", glossy.get("diffuseFactor", [1.0] * 4)), dict(texture)
 
 
 def _transform(node: Mapping[str, Any]) -> np.ndarray:

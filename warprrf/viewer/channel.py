@@ -156,7 +156,7 @@ class Rays:
     def show(self, found: Answer, range_db: float) -> None:
         """Draw an answer, gains over ``range_db``; its strongest path is the chosen one."""
         listed, scene = answers.strongest(found.paths, DRAWN), self._page.scene
-        self._legs = [answers.legs(*path) for path in listed]
+        self._legs = [answers.legs(*path) - self._page.origin for path in listed]
         self._rows = [answers.described(*path) for path in listed]
         beam = self._show_beam(found)
         if not listed:
@@ -199,7 +199,7 @@ class Rays:
         gain_db, lobe, directions = answers.best_beam(
             found.paths, size, float(np.deg2rad(self._facing.value))
         )
-        vertices, faces = pictures.lobe_mesh(found.receiver, directions, lobe)
+        vertices, faces = pictures.lobe_mesh(found.receiver - self._page.origin, directions, lobe)
         self._page.scene.add_mesh_simple(
             "/beam", vertices, faces, color=(60, 170, 90), opacity=0.6, side="double"
         )

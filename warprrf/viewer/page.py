@@ -50,6 +50,7 @@ class Page:
         server, gui, scene: viser's.
         tabs: that panels put their elements in.
         url: where it is.
+        origin: what is taken off all that is drawn [m], shape ``(3,)``: whole kilometres, for browsers draw in single precision.
         message: what its first line says.
         hidden: names of what is not shown.
     """
@@ -64,17 +65,22 @@ class Page:
                 pass
         except OSError as error:
             raise ValueError(f"host: got {host!r}, expected an address of this machine ({error})") from error
+        free = next((p for p in range(port, 65536) if _is_free(host, p)), None)
+        if free is None:  # for which viser would wait for ever
+            raise ValueError(f"port: got {port}, which is taken as are all above it; expected a lower one")
         require("viser", extra="view")
         from warprrf.viewer.connections import open_server
 
         dropped = "**A message of a page was dropped: {}**"
-        self.server, self.url = open_server(host, port, lambda wrong: self.say(dropped.format(wrong)))
+        self.server, self.url = open_server(host, free, lambda wrong: self.say(dropped.format(wrong)))
         self.gui, self.scene = self.server.gui, self.server.scene
         self.message = ""
         self.hidden = {"cameras"}
         self._closed = False
         self._background: threading.Thread | None = None
         middle, size = bounds.mean(axis=0), float(np.linalg.norm(bounds[1] - bounds[0]))
+        self.origin = 1e3 * np.round(1e-3 * middle)
+        middle -= self.origin
         self.scene.set_up_direction("+z")
         # Its share button would send the scene through somebody else's machine.
         self.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
@@ -143,3 +149,11 @@ class Page:
         self.wait()
         with redirect_stdout(io.StringIO()):
             self.server.stop()
+
+
+def _is_free(host: str, port: int) -> bool:
+    try:
+        with socket.create_server((host, port)):
+            return True
+    except OSError:
+        return False

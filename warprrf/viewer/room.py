@@ -148,7 +148,7 @@ class Room:
 
                 mesh, colours = self._faces
                 kept = mesh.triangles.mean(axis=1)[:, 2] <= cut
-                corners = mesh.triangles[kept].reshape(-1, 3)
+                corners = mesh.triangles[kept].reshape(-1, 3) - self._page.origin
                 shown = trimesh.Trimesh(
                     corners, np.arange(len(corners)).reshape(-1, 3), process=False,
                     vertex_colors=np.repeat(colours[kept], 3, axis=0),
@@ -157,6 +157,7 @@ class Room:
             if self._subject.gaussians is not None and "splats" not in self._page.hidden:
                 arrays = pictures.splats(self._subject.gaussians)
                 low = arrays["centers"][:, 2] <= cut
+                arrays["centers"] = arrays["centers"] - self._page.origin
                 scene.add_gaussian_splats("/splats", **{name: array[low] for name, array in arrays.items()})
 
     def _draw_cameras(self) -> None:
@@ -168,9 +169,9 @@ class Room:
         for name, camera in subject.cameras.items():
             to_world = np.linalg.inv(camera.world_to_camera)
             scene.add_camera_frustum(
-                f"/cameras/{name}", fov=2.0 * float(np.arctan(0.5 * camera.height / camera.fy)),
+                f"/cameras/{name}", fov=2.0 * float(np.arctan(0.5 * camera.height / (camera.fy or camera.height))),
                 aspect=camera.width / camera.height, scale=0.15, image=_thumbnail(subject, name, camera),
-                color=(60, 90, 160), wxyz=quaternions_of(to_world[None, :3, :3])[0], position=to_world[:3, 3],
+                color=(60, 90, 160), wxyz=quaternions_of(to_world[None, :3, :3])[0], position=to_world[:3, 3] - self._page.origin,
             )  # fmt: skip
 
 

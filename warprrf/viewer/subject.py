@@ -65,6 +65,8 @@ class Subject:
         if found.mesh is None:
             whole = found.scene or found.field
             found.mesh = whole.mesh if whole is not None else None
+        if found.mesh is None and found.gaussians is None:
+            found.gaussians = getattr(found.field, "gaussians", None)
         if found.field is not None and found.spectra is not None:  # to compare them
             found.field = found.field.on_grid(found.spectra.path_gain.shape[1:])
         return found

@@ -105,7 +105,7 @@ class Survey:
         shades = np.broadcast_to(np.asarray(colours, dtype=np.uint8), places.shape)
         turns = np.broadcast_to(np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32), (len(places), 4))
         handle = self._page.scene.add_batched_meshes_simple(
-            f"/{name}", size_m * _OCTAHEDRON, _OCTAHEDRON_FACES, turns, places.astype(np.float32),
+            f"/{name}", size_m * _OCTAHEDRON, _OCTAHEDRON_FACES, turns, (places - self._page.origin).astype(np.float32),
             batched_colors=shades, visible=name not in self._page.hidden,
         )  # fmt: skip
 
@@ -148,7 +148,7 @@ class Survey:
             floor = 0.03 + float(np.nanmedian(below))
         self._page.scene.add_image(
             "/map", np.dstack([picture, seen]), width, height,
-            position=(float(found.x.mean()), float(found.y.mean()), floor), wxyz=(0.0, 1.0, 0.0, 0.0),
+            position=np.array([found.x.mean(), found.y.mean(), floor]) - self._page.origin, wxyz=(0.0, 1.0, 0.0, 0.0),
             visible="map" not in self._page.hidden,
         )  # fmt: skip
         several = ", of the first transmitter" if len(self._transmitters()) > 1 else ""
@@ -171,7 +171,9 @@ class Survey:
         chosen = places[field.suggest(places, count, progress=progress)]
         self._mark("suggested", chosen, SUGGESTED, 0.2)
         for k, place in enumerate(chosen):
-            self._page.scene.add_label(f"/suggested/{k}", f"measure {k + 1}", position=place)
+            self._page.scene.add_label(
+                f"/suggested/{k}", f"measure {k + 1}", position=place - self._page.origin
+            )
         self._explain("to measure next, best first", "")
         self._list(chosen, [str(k + 1) for k in range(count)])
 
@@ -219,7 +221,7 @@ class Survey:
         places, own = np.unique(readings.receivers, axis=0, return_inverse=True)
         each = [error[own.reshape(-1) == k] for k in range(len(places))]
         rms = np.array([_rms(e) for e in each])
-        worst = np.argsort(-np.abs(np.nan_to_num(error)))[:WORST]
+        worst = np.argsort(-np.abs(error))[: min(WORST, np.isfinite(error).sum())]  # NaN come last
         labels = [f"{error[k]:+.1f} dB" for k in worst]
         if readings.arrival is not None:
             turned = np.degrees(readings.arrival[worst])

@@ -81,17 +81,17 @@ class Viewer:
     @property
     def receiver(self) -> np.ndarray:
         """Where the receiver stands (3,) [m]; may be set."""
-        return np.asarray(self._receiver.position, dtype=np.float64)
+        return self._receiver.position + self._page.origin
 
     @receiver.setter
     def receiver(self, position: ArrayLike) -> None:
-        self._receiver.position = check_array("receiver", position, (3,))
+        self._receiver.position = check_array("receiver", position, (3,)) - self._page.origin
         self.refresh()
 
     @property
     def transmitters(self) -> list[np.ndarray]:
         """Where the transmitters stand, each (3,) [m]; their powers are added."""
-        return [np.asarray(t.position, dtype=np.float64) for t in self._transmitters]
+        return [t.position + self._page.origin for t in self._transmitters]
 
     def add_transmitter(self, position: ArrayLike) -> None:
         """Put one more transmitter at ``position`` (3,) [m]."""
@@ -160,7 +160,7 @@ class Viewer:
         low, high = self.subject.bounds
         scene, size = self._page.scene, min(1.0, 0.05 * float(np.linalg.norm(high - low)))
         handle = scene.add_transform_controls(
-            name, scale=size, disable_rotations=True, depth_test=False, position=position
+            name, scale=size, disable_rotations=True, depth_test=False, position=position - self._page.origin
         )
         scene.add_icosphere(f"{name}/ball", radius=0.12 * size, color=colour)
         scene.add_label(f"{name}/name", name.strip("/"))
@@ -181,7 +181,7 @@ class Viewer:
             self._rays.click(origin, direction)
             return
         self._hanging = False
-        hit = self.subject.mesh.cast(origin[None], direction[None])
+        hit = self.subject.mesh.cast(origin[None] + self._page.origin, direction[None])
         if np.isfinite(hit.t[0]):
             self.add_transmitter(hit.point[0] - 0.2 * direction)
 

@@ -1,6 +1,7 @@
 """Poses and depth that are known already: read, matched with photos, triangulated from, fused."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from views import lobby_cameras
 import warprrf as wr
 from warprrf.geometry.photos.config import ReconstructionConfig, RefineConfig
 from warprrf.geometry.photos.posed import sfm
-from warprrf.geometry.photos.posed.photo_files import find_photos
+from warprrf.geometry.photos.posed.photo_files import find_photos, mask_beside, mask_name
 from warprrf.geometry.photos.posed.poses import KnownPoses, find_depth, match_photos, read_depth, read_poses
 from warprrf.geometry.scans import SurfaceConfig
 
@@ -156,6 +157,20 @@ def test_points_of_a_colmap_model_are_taken_as_they_are(triangulated, tmp_path):
     assert 0.3 * len(sparse.points) < len(again.points) <= len(sparse.points)
     pose, before = (found.cameras[NAMES[1]].world_to_camera for found in (again, sparse))
     np.testing.assert_allclose(pose, before, atol=1e-9)
+
+
+def test_a_mask_that_came_later_is_noticed_where_poses_and_points_are_known(triangulated, tmp_path):
+    model = triangulated[0] / "w" / "sfm" / "model"
+    cameras = {name: camera for name, camera in sfm.read_known(model).items() if name in NAMES[:3]}
+    for name in cameras:
+        shutil.copy(LOBBY / "photos" / name, tmp_path)
+    known = KnownPoses(cameras, model, {name: name for name in cameras})
+    mask = np.full((480, 640), 255, np.uint8)
+    mask[:20] = 0
+    for k in range(2):
+        found = sfm.structure_from_motion(tmp_path, workspace=tmp_path / "w", poses=known)
+        assert (mask_beside(found.photos[NAMES[0]]) is not None) == (k == 1)
+        image.fromarray(mask).save(mask_name(tmp_path / NAMES[0]))
 
 
 def test_photos_of_one_camera_of_a_colmap_model_may_differ_in_size(tmp_path):

@@ -121,8 +121,14 @@ def structure_from_motion(
         colmap.set_random_seed(seed)
         inputs: list[Any] = []
         if match:
-            masks = {name: mask for name, path in named.items() if (mask := mask_beside(path))}
-            inputs = [list(named), list(named.values()), masks, max_features, first_lens, colmap.__version__]
+            inputs = [
+                list(named),
+                list(named.values()),
+                _masks(named),
+                max_features,
+                first_lens,
+                colmap.__version__,
+            ]
             find = partial(_extract, folder, named, max_features, first_lens)
             steps.run("features", find, version=VERSIONS["features"], inputs=inputs, outputs=["features.db"])
             inputs, compare = [steps.key("features"), seed], partial(_match, folder, list(named), seed)
@@ -152,6 +158,10 @@ def structure_from_motion(
         return result
 
 
+def _masks(named: Mapping[str, Path]) -> dict[str, Path]:
+    return {name: mask for name, path in named.items() if (mask := mask_beside(path))}
+
+
 def _straightened(steps: Steps, named: Mapping[str, Path], max_pixels: int) -> SparseModel:
     """The model in the folder of ``steps``, with undistorted photos beside it."""
     model, kept = load_colmap().Reconstruction(str(steps.folder / "model")), steps.folder / "photos"
@@ -165,7 +175,7 @@ def _straightened(steps: Steps, named: Mapping[str, Path], max_pixels: int) -> S
         attempt.progress("undistorting", len(lenses), len(lenses))
 
     outputs = [f"photos/{name}" for name in lenses]
-    inputs = [steps.key("model"), max_pixels]
+    inputs = [steps.key("model"), max_pixels, _masks(named)]
     steps.run("photos", straight, version=VERSIONS["photos"], inputs=inputs, outputs=outputs)
     turns = {name: photo_facts(named[name]).turns for name in lenses}
     result = _sparse_model(model, list(named), turns, max_pixels)
