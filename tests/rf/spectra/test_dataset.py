@@ -16,7 +16,8 @@ from warprrf.rf.spectra.dataset_files import (
     COMPACT_DELAY_STEP_S,
     export_exr,
 )
-from warprrf.rf.spectra.spectrum import Spectrum
+from warprrf.rf.spectra.levels import free_space_gain
+from warprrf.rf.spectra.spectrum import Spectrum, pixel_directions
 
 
 def dataset(count=40, shape=(12, 24), seed=0):
@@ -324,3 +325,26 @@ def test_spectra_of_paths_are_those_of_the_engine_that_finds_the_same_paths():
         SpectrumDataset.from_paths(replace(paths, receiver=None))
     with pytest.raises(ValueError, match="several transmitters"):
         SpectrumDataset.from_paths(replace(paths, transmitter=receivers + 0.1))
+
+
+@pytest.mark.parametrize("shape", [(90, 180), (90, 8), (10, 40)])
+def test_line_of_sight_is_found_whatever_pixels_are_shaped_like(shape):
+    """Columns of 45 degrees: the transmitter's is up to 22 degrees off, which is more than two rows."""
+    receivers, transmitter = np.random.default_rng(0).uniform(1.0, 3.0, (6, 3)), np.zeros(3)
+    way = transmitter - receivers
+    toward = np.einsum(
+        "hwc,rc->rhw", pixel_directions(shape), way / np.linalg.norm(way, axis=1, keepdims=True)
+    )
+    gain = np.zeros((6, *shape))
+    for own, cosine, direct in zip(gain, toward, free_space_gain(transmitter, receivers, 60e9), strict=True):
+        own[np.unravel_index(cosine.argmax(), shape)] = direct
+    gain[3:] = np.roll(gain[3:], shape[1] // 2, axis=2)  # it comes from elsewhere
+    ds = SpectrumDataset.from_spectra(
+        receivers=receivers,
+        transmitter=transmitter,
+        frequency_hz=60e9,
+        path_gain=gain,
+        beam_sigma_rad=0.01,
+        floor=1e-15,
+    )
+    assert ds.line_of_sight.tolist() == 3 * [True] + 3 * [False]

@@ -489,7 +489,7 @@ def _sees(
     way = transmitter - receivers
     length = np.maximum(np.linalg.norm(way, axis=1), 1e-9)
     cosine = np.einsum("hwc,rc->rhw", pixel_directions(gain.shape[1:]), way / length[:, None])
-    near = cosine > np.cos(max(3.0 * sigma_rad, 2.0 * np.pi / gain.shape[1]))
+    near = cosine > np.cos(max(3.0 * sigma_rad, 2.0 * np.pi / min(gain.shape[1:])))
     received = np.where(near, np.nan_to_num(gain), 0.0).sum(axis=(1, 2))
     return received >= 0.5 * free_space_gain(transmitter, receivers, frequency_hz)
 
