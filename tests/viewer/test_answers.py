@@ -83,8 +83,9 @@ def test_legs_of_a_path_are_as_long_as_its_delay_says(field):
 
 def test_a_delay_profile_holds_all_power_and_the_best_beam_gains_what_select_beams_promises(field):
     paths = asked(field).paths
-    _, power_db = answers.delay_profile(paths, 2e9)
-    assert (10 ** (power_db / 10)).sum() == pytest.approx(paths[0].power.sum(), rel=1e-6)
+    for bandwidth_hz in (2e9, 40e9):  # 40: as many taps as a hall has at 2 GHz
+        _, power_db = answers.delay_profile(paths, bandwidth_hz)
+        assert (10 ** (power_db / 10)).sum() == pytest.approx(paths[0].power.sum(), rel=1e-6)
     beam, *_ = answers.best_beam(paths, 4, 0.3)
     choice = wr.channel.select_beams(paths[0], rx_array=wr.PlanarArray(4, 4, orientation=(0.3, 0.0, 0.0)))
     assert beam == pytest.approx(10 * np.log10(choice.gain[0] / paths[0].power.sum()), abs=1e-6)

@@ -210,12 +210,13 @@ def reading_errors(field: RadioField, readings: Readings, progress: Progress | N
 
 
 def delay_profile(paths: Sequence[Paths], bandwidth_hz: float) -> tuple[np.ndarray, np.ndarray]:
-    """Power of each tap [dB] over delay [ns], shapes ``(256,)``: those of ``bandwidth_hz``, from the first path on."""
-    taps = 256
+    """Power of each tap [dB] over delay [ns], shapes ``(T,)``: those of ``bandwidth_hz``, from the first path to the last one."""
+    least, most = 256, 8192
     tau = np.concatenate([p.tau for p in paths])
     power = np.concatenate([p.power for p in paths])
     first = tau.min() - 4.0 / bandwidth_hz if len(tau) else 0.0
     index = np.round((tau - first) * bandwidth_hz).astype(int)
+    taps = int(np.clip(index.max(initial=0) + 1, least, most))
     inside = index < taps
     total = np.bincount(index[inside], power[inside], minlength=taps)
     return (first + np.arange(taps) / bandwidth_hz) * 1e9, to_db(total, 1e-300)
