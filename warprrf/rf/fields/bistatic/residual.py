@@ -130,7 +130,7 @@ def fit_residual(shares: Sequence[Shares], surface: Surface, *, quick: bool = Fa
                 error, slope = s.observed.target.error(total), s.observed.target.slope(total)
                 loss, robust = (x / NOISE_DB**2 for x in huber(error, s.observed.huber_db))
                 pull[own], weight[own], now = slope * robust * error, slope**2 * robust, now + loss.sum()
-            if now > (1.0 - enough) * before:
+            if before > now > (1.0 - enough) * before:
                 break
             before = now
 
