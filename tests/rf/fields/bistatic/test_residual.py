@@ -14,6 +14,7 @@ from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.bistatic import residual
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
+from warprrf.rf.fields.bistatic.observations import huber
 from warprrf.rf.fields.bistatic.residual import fit_residual, shares_of
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.tracing.model import Effects
@@ -77,6 +78,19 @@ def test_receivers_in_several_batches_teach_what_they_do_in_one(field, monkeypat
     monkeypatch.setattr(residual, "AT_ONCE", 2)
     assert np.abs(expected).max() > 0.3
     np.testing.assert_allclose(fit_residual(shares, field.surface), expected, atol=1e-3)
+
+
+def test_it_ends_where_a_step_brings_nothing_and_not_where_one_went_too_far(field, monkeypatch):
+    shares, asked = planted_shares(field, np.full_like(field.residual, np.log(1.2))), []
+    monkeypatch.setattr(residual, "huber", lambda *own: asked.append(own) or huber(*own))
+    fit_residual(shares, field.surface)
+    assert len(asked) < 4 * len(shares)
+    steps = iter(np.repeat([1.0, 2.0, 1.9, 1.0], len(shares)))  # an objective that rises, then falls
+    monkeypatch.setattr(
+        residual, "huber", lambda error, most: (1e6 * next(steps) + 0.0 * error, huber(error, most)[1])
+    )
+    fit_residual(shares, field.surface)
+    assert list(steps) == []
 
 
 def test_nothing_seen_is_nothing_learned(field):
