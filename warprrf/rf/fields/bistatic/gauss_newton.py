@@ -390,7 +390,7 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
         if not improved:
             break
         # Steps that were cut short, or do worse than the quadratic model says, are no sign of having arrived, unless they bring
-        # nothing: the weight of a lobe that is not there falls for ever.
+        # nothing: a parameter that hardly counts may swing about its best value for long.
         expected = -float(move @ (2.0 * gradient + hessian @ move))
         honest = current - value > 0.5 * expected
         fall = (current - value) / current
