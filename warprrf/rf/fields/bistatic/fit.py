@@ -50,8 +50,6 @@ from warprrf.rows import distinct_rows
 SHORT_STEPS = 10  # of a fit that only decides about something
 BETTER = 0.995
 """Share to which further effects must lower the mean square error of receivers held out."""
-HOPELESS = 2.0
-"""Times the least such error from which on effects are given up before parameters are fitted to them."""
 
 
 def fit(
@@ -196,13 +194,9 @@ def choose(t: Training) -> Solution:
     for trial in trials:  # each holds the one before it: what is no better with some is not tried with more
         if best is None:
             trial = t.refined(trial, t.few(1), 2 * SHORT_STEPS, rounds=2)
-            loss = t.held_loss(trial)
         else:
-            trial = replace(best, effects=trial.effects)
-            loss = t.held_loss(trial)
-            if loss < HOPELESS * least:
-                trial = t.refined(trial, t.few(1), SHORT_STEPS)
-                loss = t.held_loss(trial)
+            trial = t.refined(replace(best, effects=trial.effects), t.few(1), SHORT_STEPS)
+        loss = t.held_loss(trial)
         kept = loss < BETTER * least
         t.note(_name(trial.effects), kept, loss)
         if not kept:
