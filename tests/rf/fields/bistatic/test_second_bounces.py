@@ -271,3 +271,18 @@ def test_what_groups_scatter_at_an_angle_is_told_from_what_they_do_of_even_light
         np.testing.assert_allclose(found, scattered / even, rtol=0.06)  # of a table in steps of 1 / 256
         assert 2.0 * (cosine * weight) @ found == pytest.approx(1.0, rel=2e-3)
         np.testing.assert_allclose(0.5 * even, p.scattered_share[group], rtol=2e-3)
+
+
+def test_light_between_bright_surfaces_is_wanted_where_there_is_some():
+    """Fitted from what single bounces alone found, too bright by far, it was given up."""
+    mesh, part = joined(box_mesh([0, 0, 0], [7, 5, 3], inward=True), box_mesh([2, 1.5, 0], [3.2, 2.6, 0.8]))
+    bright = wr.Material.custom("bright", relative_permittivity=5.0, scattering=0.9, thickness_m=0.3)
+    scene = wr.Scene(mesh, [bright, bright], part)
+    places = np.random.default_rng(0).uniform([3.7, 0.5, 0.5], [6.5, 4.5, 2.5], (16, 3))
+    ds = wr.simulate(
+        scene, transmitter=[6.2, 4.3, 2.6], receivers=places, frequency_hz=140e9, shape=(12, 24),
+        effects=replace(SETS["room"], residual=False),
+    )  # fmt: skip
+    field = wr.RadioField.fit(scene, ds, model="bistatic", sub_pixels=1)
+    kept = {choice["term"]: choice["kept"] for choice in field.report["choices"]}
+    assert kept["room"] and field.effects.scatterings > 1
