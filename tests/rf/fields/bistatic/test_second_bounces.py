@@ -219,6 +219,10 @@ def test_light_reaches_what_is_open_and_from_there_elements_are_lit():
     light, sides = Interreflection(tracer, 0), surface.element_sides
     even = light.between(np.ones(sides), np.ones(len(light.side)))
     np.testing.assert_allclose(even[open_share > 0], np.pi, rtol=1e-6)
+    # What one flat element sends comes to others, not to itself.
+    for sender in np.flatnonzero(even)[::50]:
+        got = light.between(np.eye(1, sides, sender)[0], np.ones(len(light.side)))
+        assert got[sender] == 0.0 and got.sum() > 0.0
 
 
 def test_no_light_gets_behind_a_wall_of_metal_wherever_it_stands():

@@ -121,14 +121,8 @@ def structure_from_motion(
         colmap.set_random_seed(seed)
         inputs: list[Any] = []
         if match:
-            inputs = [
-                list(named),
-                list(named.values()),
-                _masks(named),
-                max_features,
-                first_lens,
-                colmap.__version__,
-            ]
+            masks = _masks(named)
+            inputs = [list(named), list(named.values()), masks, max_features, first_lens, colmap.__version__]
             find = partial(_extract, folder, named, max_features, first_lens)
             steps.run("features", find, version=VERSIONS["features"], inputs=inputs, outputs=["features.db"])
             inputs, compare = [steps.key("features"), seed], partial(_match, folder, list(named), seed)
