@@ -192,8 +192,10 @@ def choose(t: Training) -> Solution:
         return _choose_of_few(t, trials)
     best, least = None, np.inf
     for trial in trials:  # each holds the one before it: what is no better with some is not tried with more
-        # Not from what the one before it found: its surfaces are too bright where light between them counts.
-        trial = t.refined(trial, t.few(1), 2 * SHORT_STEPS, rounds=2)
+        if best is not None and best.effects.scatterings > 1:
+            trial = t.refined(replace(best, effects=trial.effects), t.few(1), SHORT_STEPS)
+        else:  # not from what single bounces found: their surfaces are too bright where light between them counts
+            trial = t.refined(trial, t.few(1), 2 * SHORT_STEPS, rounds=2)
         loss = t.held_loss(trial)
         kept = loss < BETTER * least
         t.note(_name(trial.effects), kept, loss)
