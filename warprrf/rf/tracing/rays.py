@@ -6,14 +6,14 @@ transmitter besides.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf.cache import cached_property
+from warprrf.cache import Cache, cached_property
 from warprrf.device import DeviceLike, launch, resolve
 from warprrf.geometry import rays as mesh_rays
 from warprrf.geometry.mesh import vectors_across
@@ -43,6 +43,7 @@ class Hits:
     solid_angle: np.ndarray
     face: np.ndarray
     range_m: np.ndarray
+    kept: Cache = field(init=False, repr=False, default_factory=lambda: Cache(1))
 
     def rays(self, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of the rays of index ``ray`` (N,) where they start [m] and their unit vectors, shape ``(N, 3)``, and solid angles
@@ -159,12 +160,21 @@ class RayGrid:
         start, directions = point + s.position_error_m * normal, by_cosine(normal, u, v)
         return self.hit_along(start, directions, np.ones(len(tile)))
 
+    def tile(self, hits: Hits) -> np.ndarray:
+        """Tile that each ray hits, shape ``(O K,)`` int32, -1 for none; ``hits`` keeps it."""
+
+        def make() -> np.ndarray:
+            hit, found = np.flatnonzero(hits.face >= 0), np.full(len(hits.face), -1, np.int32)
+            found[hit] = self.surface.tile_at(hits.face[hit], hits.points(hit), hits.rays(hit)[1])
+            return found
+
+        return hits.kept.get("tile", make)
+
     def tiles_met(self, hits: Hits) -> tuple[np.ndarray, np.ndarray]:
         """Which rays hit something, and the sides of tiles that they do."""
         s, ray = self.surface, np.flatnonzero(hits.face >= 0)
-        face, direction = hits.face[ray], hits.rays(ray)[1]
-        tile = s.tile_at(face, hits.points(ray), direction)
-        return ray, tile + s.is_behind(face, direction) * len(s.tiles.face)
+        behind = s.is_behind(hits.face[ray], hits.rays(ray)[1])
+        return ray, self.tile(hits)[ray] + behind * len(s.tiles.face)
 
     def _backend(self, count: int) -> str:
         """Embree is worth being loaded for a grid of rays, whether it is in use yet or not."""

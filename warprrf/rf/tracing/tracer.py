@@ -98,12 +98,8 @@ class View:
 
     def cell(self, ray: np.ndarray) -> np.ndarray:
         """Surface cell that each ray of index ``ray`` (N,) meets, shape ``(N,)``; all must meet something."""
-        return (self._kept.get("cells", self._cells) if self.keeps else self._cells())[ray]
-
-    def _cells(self) -> np.ndarray:
-        hit, found = np.flatnonzero(self.hits.face >= 0), np.full(len(self.hits.face), -1, np.int32)
-        found[hit] = self.tracer.surface.cells.cell[self.tracer.tile(self.hits, hit)]
-        return found
+        hits = self.hits if self.keeps else replace(self.hits)
+        return self.tracer.surface.cells.cell[self.tracer.grid.tile(hits)[ray]]
 
     @property
     def outward(self) -> np.ndarray:
@@ -141,7 +137,8 @@ class View:
 
     def without_records(self) -> View:
         """The same that keeps no records but those of line of sight and mirrors."""
-        return replace(self, records={SPECULAR: self.records[SPECULAR]}, keeps=False)
+        hits = replace(self.hits)
+        return replace(self, hits=hits, records={SPECULAR: self.records[SPECULAR]}, keeps=False)
 
     def kept_paths(self, effects: Effects) -> np.ndarray:
         """Which line of sight and mirror paths count, shape ``(L,)`` bool."""
@@ -293,7 +290,7 @@ class Tracer:
 
     def trace(self, view: View, wanted: dict[str, tuple[str, str]], most: int) -> dict[str, Records]:
         """Tables of the sequences ``wanted`` of what a receiver sees, with up to ``most`` slabs, by name; see :func:`sequences`."""
-        first = Rays(view.hits, np.arange(len(view.hits.face)))
+        first = Rays(view.hits if view.keeps else replace(view.hits), np.arange(len(view.hits.face)))
         seen, lit, made = {"": first}, dict[str, dict[str, Records]](), dict[str, Records]()
         for name, (light, sight) in wanted.items():
             if sight not in seen:
@@ -346,7 +343,7 @@ class Tracer:
         times = self.grid.per_pixel / len(places)
         chosen = np.flatnonzero((rays.hits.face >= 0) & np.isin(rays.ray % self.grid.per_pixel, places))
         m = self.mirrored(most)
-        row, image = m.pairs(self.tile(rays.hits, chosen))
+        row, image = m.pairs(self.grid.tile(rays.hits)[chosen])
         before = m.before.take(image) if most else None
         return self.lit_by_images(rays, chosen[row], m.patch[image], before, times)[1]
 
@@ -475,10 +472,6 @@ class Tracer:
         start, left = hits.points(ray) + s.position_error_m * normal, grid.transmittance(hits.range_m[ray])
         found = grid.hit_along(start, onward, solid_angle * left)
         return Rays(found, rays.ray[ray], Interactions.of_mirrors(s.group[face], cosine))
-
-    def tile(self, hits: Hits, ray: np.ndarray) -> np.ndarray:
-        """Tile of the surface that rays of index ``ray`` (N,) hit, shape ``(N,)``."""
-        return self.surface.tile_at(hits.face[ray], hits.points(ray), hits.rays(ray)[1])
 
     def adopted(self, view: View) -> View:
         """What :func:`view_of` found, as a view of this tracer."""

@@ -218,9 +218,10 @@ def _spared(t: Training, chosen: Solution) -> Solution:
         off: dict[str, Any] = dict.fromkeys(on, 0)
         fewer = replace(chosen.effects, **off)
         if fewer != chosen.effects:
+            before = t.part_loss(chosen, places)
             trial = t.refined(replace(chosen, effects=fewer), t.few(1), SHORT_STEPS)
             loss = t.part_loss(trial, places)
-            kept = loss < BETTER * t.part_loss(chosen, places)
+            kept = loss < BETTER * before
             t.note(f"no {name}", kept, loss)
             chosen = trial if kept else chosen
     return chosen

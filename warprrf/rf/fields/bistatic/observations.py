@@ -43,7 +43,7 @@ from warprrf.rf.spectra.spectrum import to_db
 from warprrf.rf.tracing.model import SETS, Effects, Layout, Model, Parameters
 from warprrf.rf.tracing.records import Bins, Materials
 from warprrf.rf.tracing.render import PathGains, materials_of, path_gains
-from warprrf.rf.tracing.tracer import SPECULAR, View
+from warprrf.rf.tracing.tracer import SPECULAR, View, sequences
 from warprrf.rows import Rows
 
 OWN_GAIN = -2
@@ -260,7 +260,8 @@ class Observation:
     def further(self, effects: Effects, materials: Materials) -> tuple[np.ndarray, np.ndarray]:
         """What comes over more than one surface or through slabs, by the group that scatters it last or sends it on: groups
         ``(C,)``, and readings in units of the floor, shape ``(C, N)``."""
-        return self._kept.get((effects, materials), lambda: self._further(effects, materials))
+        key = tuple(sequences(effects)), materials.parameters.values
+        return self._kept.get(key, lambda: self._further(effects, materials))
 
     def _further(self, effects: Effects, materials: Materials) -> tuple[np.ndarray, np.ndarray]:
         own, count = self.ray_bins
