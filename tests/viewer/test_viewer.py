@@ -133,7 +133,8 @@ def test_a_scene_far_from_zero_is_drawn_as_one_at_zero():
         np.testing.assert_allclose(far, near, atol=1e-4)
 
 
-def test_where_nothing_arrives_no_gain_is_made_up(tmp_path, capsys):
+@browsed
+def test_where_nothing_arrives_no_gain_is_made_up(page, tmp_path, capsys):
     dark = dataclasses.replace(
         make.bistatic(),
         effects=wr.Effects(mirrors=0, scatterings=0, transmissions=0, diffractions=0, residual=False),
@@ -141,6 +142,17 @@ def test_where_nothing_arrives_no_gain_is_made_up(tmp_path, capsys):
     place = next(p for p in make.places(40) if dark.links(p).total_path_gain == 0.0)
     asked = answers.Asked(dark.frequency_hz, 0, 0, 0)
     assert answers.answer(dark, place, [dark.transmitter], asked).total_db == -np.inf
+    viewer = wr.view(make.room_mesh()[0], dark, port=8194)
+    try:
+        with _beside(page, viewer.url):
+            _until(lambda: viewer.clients, 60)
+            viewer.receiver = place
+            viewer.wait()
+            assert "nothing arrives" in viewer.message.replace("*", "")
+            assert np.isnan(viewer._channel._profile.data[1]).all()
+            time.sleep(2.0)  # the page draws it, and says what it cannot draw
+    finally:
+        viewer.close()
     dark.save(tmp_path / "dark.safetensors")
     words = [
         "render",

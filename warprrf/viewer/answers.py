@@ -210,7 +210,8 @@ def reading_errors(field: RadioField, readings: Readings, progress: Progress | N
 
 
 def delay_profile(paths: Sequence[Paths], bandwidth_hz: float) -> tuple[np.ndarray, np.ndarray]:
-    """Power of each tap [dB] over delay [ns], shapes ``(T,)``: those of ``bandwidth_hz``, from the first path to the last one."""
+    """Power of each tap [dB] over delay [ns], shapes ``(T,)``: those of ``bandwidth_hz``, from the first path to the last one;
+    NaN where nothing arrives at all."""
     least, most = 256, 8192
     tau = np.concatenate([p.tau for p in paths])
     power = np.concatenate([p.power for p in paths])
@@ -219,7 +220,8 @@ def delay_profile(paths: Sequence[Paths], bandwidth_hz: float) -> tuple[np.ndarr
     taps = int(np.clip(index.max(initial=0) + 1, least, most))
     inside = index < taps
     total = np.bincount(index[inside], power[inside], minlength=taps)
-    return (first + np.arange(taps) / bandwidth_hz) * 1e9, to_db(total, 1e-300)
+    total_db = to_db(total, 1e-300) if total.any() else np.full(taps, np.nan)
+    return (first + np.arange(taps) / bandwidth_hz) * 1e9, total_db
 
 
 def best_beam(paths: Sequence[Paths], size: int, azimuth_rad: float) -> tuple[float, np.ndarray, np.ndarray]:
