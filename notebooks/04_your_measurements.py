@@ -58,6 +58,9 @@ bare = wr.Scene.load(DATA / "scene.xml").mesh
 room = wr.Mesh(bare.vertices, bare.faces)
 
 HORN = wr.horn(np.radians(10))
+# The spectra have a beam of their own: a horn that is so much narrower sees in them what HORN sees in the room.
+BEAM_DEG = np.degrees(truth.beam_sigma_rad) * np.sqrt(8 * np.log(2))
+REST = wr.horn(np.radians(np.sqrt(10**2 - BEAM_DEG**2)))
 AZIMUTH, ELEVATION = (angle.ravel() for angle in np.meshgrid(np.arange(-180, 180, 10.0), [-30.0, 0.0, 30.0]))
 GAIN_DB = -23.7  # of the sounder's chain: to be found
 
@@ -74,7 +77,7 @@ def measure(chosen, seed=0):
     up = 90 - (np.arange(rows) + 0.5) * 180 / rows
     around = -180 + (np.arange(columns) + 0.5) * 360 / columns
     pixels = unit(around[None, :], up[:, None]).reshape(-1, 3)
-    weight = HORN.gain_off_boresight(np.arccos(np.clip(unit(AZIMUTH, ELEVATION) @ pixels.T, -1, 1)))
+    weight = REST.gain_off_boresight(np.arccos(np.clip(unit(AZIMUTH, ELEVATION) @ pixels.T, -1, 1)))
     tables = []
     for k in chosen:
         power = 10 * np.log10(weight @ places.path_gain[k].ravel().astype(float))
