@@ -214,9 +214,22 @@ def _open_model(root: Path) -> Any:
         for name, walk in _RECORDS.items():
             if (root / name).is_file():
                 _check_whole(root / name, walk)
-        return load_colmap().Reconstruction(str(root))
+        model = load_colmap().Reconstruction(str(root))
+        if not all((root / f"{name}.bin").is_file() for name in ("cameras", "images", "points3D")):
+            _name_whole(model, root / "images.txt")
+        return model
     except Exception as error:  # pycolmap raises RuntimeError, ValueError or IndexError on a damaged file
         raise ValueError(f"colmap: {root} does not read as a COLMAP model: {error}") from error
+
+
+def _name_whole(model: Any, path: Path) -> None:
+    """Give images the names that a text file has for them, of which COLMAP reads one word."""
+    lines = iter(path.read_text("utf-8").split("\n"))
+    for line in lines:
+        words = line.split(maxsplit=9)
+        if words and not words[0].startswith("#"):
+            model.images[int(words[0])].name = words[9].rstrip()
+            next(lines, None)  # its points, or an empty line
 
 
 def is_colmap(folder: Path) -> bool:
@@ -343,7 +356,8 @@ def _match(folder: Path, names: list[str], seed: int, attempt: Attempt) -> None:
     working = shutil.copyfile(folder / "features.db", _fresh(attempt.folder) / "matches.db")
     listing = attempt.folder / "pairs.txt"
     with colmap.Database.open(str(working)) as database:
-        counts = {i.name: database.num_keypoints_for_image(i.image_id) for i in database.read_all_images()}
+        number = {i.name: i.image_id for i in database.read_all_images()}
+        counts = {name: database.num_keypoints_for_image(k) for name, k in number.items()}
         blank = [n for n in names if counts[n] < FEWEST_FEATURES]
         if len(names) - len(blank) < MIN_PHOTOS:
             raise ValueError(
@@ -359,9 +373,12 @@ def _match(folder: Path, names: list[str], seed: int, attempt: Attempt) -> None:
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     match_batch = 400
+    # COLMAP's list of pairs divides names at their blanks: photos go by numbers meanwhile.
+    _rename(working, {k: str(k) for k in number.values()})
     for start in range(0, len(chosen), match_batch):
         attempt.progress("matching", start, len(chosen))
-        listing.write_text("".join(f"{a} {b}\n" for a, b in chosen[start : start + match_batch]))
+        pairs = chosen[start : start + match_batch]
+        listing.write_text("".join(f"{number[a]} {number[b]}\n" for a, b in pairs))
         colmap.match_image_pairs(
             working,
             matching_options=matching,
@@ -370,7 +387,15 @@ def _match(folder: Path, names: list[str], seed: int, attempt: Attempt) -> None:
             device=colmap.Device.cpu,
         )
     attempt.progress("matching", len(chosen), len(chosen))
+    _rename(working, {k: name for name, k in number.items()})
     _settled(working, folder / "matches.db")
+
+
+def _rename(working: Path, names: Mapping[int, str]) -> None:
+    """Give images of a database other names, by their numbers."""
+    with closing(sqlite3.connect(working)) as connection, connection:
+        rows = [(name, k) for k, name in names.items()]
+        connection.executemany("UPDATE images SET name = ? WHERE image_id = ?", rows)
 
 
 def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[tuple[str, str]]:
