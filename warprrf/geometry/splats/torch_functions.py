@@ -262,7 +262,9 @@ class _Colors(torch.autograd.Function):
     @in_stream
     def backward(ctx: Any, incoming: torch.Tensor) -> Any:
         _ = ctx.saved_tensors  # raises if an input was changed in place since forward
-        _seed((ctx.out,), (incoming.clone(),))  # Warp's own adjoint zeroes what it has read
+        open_ones = wp.to_torch(ctx.out, requires_grad=False) > 0  # the others are cut off at zero
+        left = torch.where(open_ones, incoming, 0.0)  # a copy: Warp's own adjoint zeroes what it has read
+        _seed((ctx.out,), (left,))
         return None, *_gradients(ctx.inputs, ctx.needs_input_grad[1:], ctx.adjoint)
 
 
