@@ -51,6 +51,16 @@ def test_the_image_is_that_of_render():
         np.testing.assert_allclose(a.detach().numpy(), b, atol=1e-6)
 
 
+def test_without_gaussians_the_background_is_seen():
+    values = [v.detach()[:0] for v in tensors(1)[:5]]
+    background = torch.tensor([0.2, 0.3], dtype=torch.float64, requires_grad=True)
+    image, alpha, _ = images([*values[:4], torch.zeros((0, 2), dtype=torch.float64), background])
+    assert torch.equal(image, background.detach().expand(image.shape)) and not alpha.any()
+    image.sum().backward()
+    assert (background.grad == CAMERA.width * CAMERA.height).all()
+    assert (passed(values) == 1).all()
+
+
 @pytest.mark.parametrize(("function", "inputs"), [(images, 6), (passed, 4), (hits, 4)])
 def test_gradcheck_passes(function, inputs):
     values = tensors(3, n=4, channels=1, finest=-1.0)
