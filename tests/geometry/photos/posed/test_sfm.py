@@ -1,6 +1,8 @@
 """Structure from motion on real image files, and the similarity to metres."""
 
+import resource
 import shutil
+import signal
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
@@ -287,6 +289,19 @@ def test_colmap_models_are_read_in_both_formats(posed, tmp_path):
     row = next(line for line in whole.splitlines() if not line.startswith("#"))
     points.write_text(whole.replace(row, " ".join(row.split()[:8])))  # a point that no photo shows
     assert len(sfm.read_colmap(tmp_path / "text").points) == len(posed[1].points) - 1
+
+
+def test_a_model_that_a_full_disk_cuts_short_is_an_error_and_no_finished_step(posed, tmp_path):
+    model = pycolmap.Reconstruction(str(posed[0] / "sfm" / "model"))
+    handler, limit = signal.signal(signal.SIGXFSZ, signal.SIG_IGN), resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limit[1]))
+        with pytest.raises(OSError, match=r"images\.bin was not written whole in .*: is the disk full"):
+            sfm._keep_known(tmp_path, {}, model, False, 0, None)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert not any(tmp_path.iterdir())
 
 
 def test_names_of_a_colmap_text_model_may_have_blanks(tmp_path):

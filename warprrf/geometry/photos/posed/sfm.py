@@ -158,7 +158,7 @@ def _masks(named: Mapping[str, Path]) -> dict[str, Path]:
 
 def _straightened(steps: Steps, named: Mapping[str, Path], max_pixels: int) -> SparseModel:
     """The model in the folder of ``steps``, with undistorted photos beside it."""
-    model, kept = load_colmap().Reconstruction(str(steps.folder / "model")), steps.folder / "photos"
+    model, kept = _open_model(steps.folder / "model"), steps.folder / "photos"
     lenses = lenses_of(model)
 
     def straight(attempt: Attempt) -> None:
@@ -275,6 +275,16 @@ def _quiet() -> Iterator[Any]:
         yield colmap
     finally:
         colmap.logging.minloglevel = before
+
+
+def _write_model(model: Any, folder: Path) -> None:
+    """Write a COLMAP model; COLMAP itself says nothing of a full disk."""
+    model.write_binary(str(folder))
+    for name, walk in _RECORDS.items():
+        try:
+            _check_whole(folder / name, walk)
+        except ValueError as error:
+            raise OSError(f"{name} was not written whole in {folder.parent}: is the disk full?") from error
 
 
 def _root(named: Mapping[str, Path]) -> Path:
@@ -502,9 +512,9 @@ def _map(folder: Path, named: Mapping[str, Path], lens: str, seed: int, attempt:
             continue
         pieces.append(names)
         with folder_in_place(folder / ("model" if len(pieces) == 1 else f"model-{len(pieces)}")) as whole:
-            model.write_binary(str(whole))
+            _write_model(model, whole)
             if len(pieces) == 1:
-                choose_lens(whole, lens).write_binary(str(whole))
+                _write_model(choose_lens(whole, lens), whole)
     report("mapping", len(named), len(named))
     return {"pieces": pieces}
 
@@ -640,7 +650,7 @@ def _keep_known(
             model = colmap.triangulate_points(model, working, root, whole, options=options)
             model.extract_colors_for_all_images(str(root))
             attempt.progress("triangulating", 1, 1)
-        model.write_binary(str(whole))
+        _write_model(model, whole)
     return {"pieces": []}
 
 
