@@ -173,6 +173,20 @@ def test_masks_that_fit_no_photo_are_named(tmp_path):
         photo_files.find_photos(tmp_path)
 
 
+@pytest.mark.parametrize("name", ["a.png", "a.mask.png"])
+def test_transparent_pixels_are_refused_opaque_ones_read(name, tmp_path):
+    layers = np.full((30, 40, 4), 255, np.uint8)
+    for file in ("a.png", name):
+        Image.fromarray(layers).save(tmp_path / file)
+    photo_files.check_photos({"a.png": tmp_path / "a.png"})
+    layers[:5, :, 3] = 0  # as where a program took the background away
+    Image.fromarray(layers).save(tmp_path / name)
+    with pytest.raises(
+        ValueError, match=rf"{name} does not read as an image: some of its pixels are transparent"
+    ):
+        photo_files.check_photos({"a.png": tmp_path / "a.png"})
+
+
 @pytest.mark.parametrize(("keep", "told"), [(1, "is 1 where"), (254, "is 254 where"), (255, ""), (0, "")])
 def test_masks_without_white_are_refused_unless_all_is_ignored(keep, told, tmp_path):
     mask = np.zeros_like(GREY)

@@ -199,6 +199,12 @@ def open_photo(path: str | os.PathLike[str], mode: str) -> Any:
     with opened(path) as photo:
         if photo.mode[0] in "IF":
             raise ValueError(f"its pixels have more than 8 bits ({photo.mode}); save it with 8")
+        shows_through = "A" in photo.getbands() or "transparency" in photo.info
+        if shows_through and photo.convert("RGBA").getchannel("A").getextrema()[0] < 255:
+            raise ValueError(
+                f"some of its pixels are transparent; save it without, and with a mask (NAME{MASK_SUFFIX}) where a photo is "
+                "to be ignored"
+            )
         return photo.convert(mode)
 
 
