@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 import pytest
 
-from warprrf.checks import NotNegative, Shaped, check_items, checked, one_of, warn, whole
+from warprrf.checks import NotNegative, Shaped, check_array, check_items, checked, one_of, warn, whole
 
 
 @checked
@@ -42,6 +42,14 @@ def test_what_an_annotation_allows_comes_as_it_says():
 def test_what_it_does_not_allow_is_refused_by_name(told, given):
     with pytest.raises((TypeError, ValueError), match=told):
         Measured(**({"places": [[1, 2, 3]]} | given))
+
+
+def test_values_under_a_mask_are_not_taken_for_measured_ones():
+    read = np.ma.masked_equal([[1.0, 2.0, -999.0]], -999.0)  # as netCDF4 gives them
+    for take in (Measured, lambda values: check_array("places", values)):
+        with pytest.raises(ValueError, match="^places: got a masked array with 1 masked values"):
+            take(read)
+        take(np.ma.masked_equal([[1.0, 2.0, 3.0]], -999.0))
 
 
 def test_arrays_of_one_call_share_sizes_in_whatever_order_they_come():

@@ -44,6 +44,7 @@ def check_array(
         TypeError: if it cannot be read as numbers of that kind.
         ValueError: naming the argument, what came and what was expected.
     """
+    _check_unmasked(name, value)
     if isinstance(value, wp.array):
         value = value.numpy()
     elif hasattr(value, "detach"):
@@ -81,6 +82,16 @@ def check_array(
         linear = " (powers and gains are linear: of decibels, 10 ** (x / 10))" if least == 0 else ""
         raise ValueError(f"{name}: got {array[bad][0]:g}, expected numbers of at least {least:g}{linear}")
     return array
+
+
+def _check_unmasked(name: str, value: object) -> None:
+    """Raise ValueError for a masked array, as of netCDF4, with masked values: NumPy hands out what lies under the mask."""
+    hidden = int(np.ma.count_masked(value)) if isinstance(value, np.ma.MaskedArray) else 0
+    if hidden:
+        raise ValueError(
+            f"{name}: got a masked array with {hidden} masked values, expected plain numbers; .filled(np.nan) makes "
+            "them NaN where that may stand for what is unknown"
+        )
 
 
 def check_each(name: str, value: ArrayLike, count: int, *shape: int) -> np.ndarray:
@@ -473,7 +484,9 @@ def _converter(kind: Any, name: str) -> Callable[[Any], object]:
     if kind in _NUMBERS:
         return functools.partial(_as_number, kind)
     if _is_of_numpy(kind):
-        return functools.partial(_as_array, "U" if "str_" in repr(inside) else "biufc", origin is np.ndarray)
+        return functools.partial(
+            _as_array, name, "U" if "str_" in repr(inside) else "biufc", origin is np.ndarray
+        )
     if origin is tuple:
         length = None if Ellipsis in inside else len(inside)
         return functools.partial(_as_row, length)
@@ -521,10 +534,11 @@ def _as_number(kind: type, value: object) -> object:
     return number if not isinstance(number, int) or abs(number) < 2**63 else _OTHER
 
 
-def _as_array(letters: str, of_axes: bool, value: Any) -> object:
+def _as_array(name: str, letters: str, of_axes: bool, value: Any) -> object:
     """An array of one of the kinds ``letters``, a Python number where that is enough, or :data:`_OTHER`."""
     if type(value) is np.ndarray and value.dtype.kind in letters and value.dtype.isnative:
         return value  # in a hurry
+    _check_unmasked(name, value)
     if isinstance(value, wp.array):
         value = value.numpy()
     try:

@@ -194,6 +194,7 @@ def test_files_outside_the_folder_are_read_only_if_that_is_asked_for(make, names
             "EXT_mesh_gpu_instancing; export it without",
         ),
         (lambda h: h["meshes"][0]["primitives"][0].update(mode=6), "fans"),
+        (lambda h: h.pop("scenes"), "without a scene.*export it with one"),
         (lambda h: [n.update(skin=0) for n in h["nodes"]], "skin or morph weights; export"),
         (lambda h: h["meshes"][1].update(weights=[0.0, 0.5]), "skin or morph weights; export"),
     ],

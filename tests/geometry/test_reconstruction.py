@@ -158,13 +158,19 @@ def test_a_changed_setting_is_not_served_from_the_old_run(whole, made, lobby_sce
     assert other.held_out == tuple(VIEWS[4:6])
 
 
-def test_bad_names_are_refused_before_any_work(made, tmp_path):
+def test_bad_names_and_surveys_are_refused_before_any_work(made, tmp_path):
     for told, wrong in (
+        ("known_positions: got 2, expected at least 3", {"known_positions": surveyed(VIEWS[:2])}),
+        (
+            r"known_positions\['view_000\.jpg'\]: got shape \(2,\)",
+            {"known_positions": surveyed(VIEWS[:3]) | {"view_000.jpg": [1.0, 2.0]}},
+        ),
         (r"held_out: no such photo: nobody\.jpg", {"held_out": ["nobody.jpg"]}),
         ("got both", {"scale": (VIEWS[0], VIEWS[1], 1.0)}),
     ):
         with pytest.raises(ValueError, match=told):
-            made(tmp_path, VIEWS[:4], known_positions=surveyed(VIEWS[:3]), **{"held_out": ()} | wrong)
+            made(tmp_path, VIEWS[:4], **{"held_out": (), "known_positions": surveyed(VIEWS[:3])} | wrong)
+        assert not any(tmp_path.iterdir())
 
 
 def test_a_saved_reconstruction_is_the_same(whole, tmp_path):

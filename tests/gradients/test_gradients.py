@@ -457,6 +457,17 @@ def test_gradients_do_not_depend_on_the_number_of_threads(kind, monkeypatch):
         assert np.array_equal(gradient, both[1][name]), name
 
 
+def test_a_colour_that_is_cut_off_at_zero_has_no_gradient():
+    means = wp.array([[1.0, 2.0, 3.0]], dtype=wp.vec3d, requires_grad=True)
+    sh = wp.array([[[1.0, -4.0]]], dtype=wp.float64, requires_grad=True)
+    with wp.Tape() as tape:
+        colors = Rasterizer(real=wp.float64).colors(means, sh, Camera.spherical(4, 2, position=(0, 0, 0)))
+    assert (colors.numpy() > 0).tolist() == [[True, False]]
+    for times in (1, 2):
+        tape.backward(grads={colors: wp.ones_like(colors)})
+        np.testing.assert_allclose(sh.grad.numpy(), [[[times * 0.28209479177387814, 0.0]]], atol=1e-15)
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_a_step_over_a_cutoff_moves_a_pixel_by_one_faint_layer_at_most(seed):
     """Pixels at a threshold: the image jumps there, by no more than alpha_min times the pair's contrast, or than the

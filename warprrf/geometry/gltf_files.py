@@ -203,6 +203,10 @@ class _File:
 
     def instances(self) -> Iterator[tuple[str, np.ndarray, list[_Part]]]:
         """Name, place (4, 4) and parts of every node of the default scene that has a mesh."""
+        if not self.header.get("scenes"):
+            raise ValueError(
+                "it is a library of parts without a scene, which says where they stand; export it with one"
+            )
         roots = self.row("scenes", self.header.get("scene", 0)).get("nodes", [])
         todo, met = [(index, np.eye(4)) for index in reversed(roots)], set[int]()
         while todo:

@@ -41,6 +41,7 @@ from warprrf.geometry.photos.posed.sparse import (
     SparseModel,
     align_to_known,
     assume_scale,
+    check_known,
     check_scale,
     scaled,
 )
@@ -122,9 +123,9 @@ def reconstruct(
     config = replace(config, refine=refinement)
     named = find_photos(photos)
     skipped = set(match_names("held_out", dict.fromkeys(held_out), list(named)))
-    if known_positions is not None:
-        match_names("known_positions", known_positions, list(named))
     _check_world(poses, depth, known_positions, scale, up)
+    if known_positions is not None:
+        match_names("known_positions", check_known(known_positions), list(named))
     if scale is not None:
         check_scale(scale, list(named))
     known = None

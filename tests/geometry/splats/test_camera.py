@@ -47,6 +47,13 @@ def test_a_point_is_in_frame_by_its_pixel_in_front_and_deep_enough():
     assert deep == [True, False]
 
 
+def test_a_panorama_has_a_pixel_for_every_direction():
+    c = Camera.spherical(40, 20, position=(1, 2, 3))
+    inside, pixel = c.in_frame(c.position + [[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0, 0, 0]])
+    assert inside.tolist() == [True, True, True, False]
+    assert pixel[:3].tolist() == [[10, 39], [19, 20], [0, 20]]
+
+
 def test_a_camera_stays_where_its_caller_goes_on_with_the_pose():
     pose = np.eye(4)
     camera = Camera.pinhole(4, 3, fx=5, fy=5, cx=2, cy=1, world_to_camera=pose)

@@ -23,6 +23,16 @@ def test_ply_holds_every_attribute(tmp_path, coefficients):
         assert np.allclose(getattr(back, name), getattr(g, name), rtol=1e-5, atol=1e-6), name
 
 
+def test_gaussians_stay_as_they_are_where_their_caller_goes_on_with_the_arrays():
+    arrays = {name: getattr(some(), name) for name in ("means", "quaternions", "scales", "opacities", "sh")}
+    g = Gaussians(**arrays)
+    for array in arrays.values():
+        array[:] = 7.0
+    assert g.opacities.max() <= 1
+    for name in arrays:
+        assert np.array_equal(getattr(g, name), getattr(some(), name))
+
+
 def test_no_gaussians_are_kept_too(tmp_path):
     some(coefficients=4)[:0].save_ply(tmp_path / "g.ply")
     assert Gaussians.load_ply(tmp_path / "g.ply").sh.shape == (0, 4, 3)

@@ -51,6 +51,16 @@ def test_the_image_is_that_of_render():
         np.testing.assert_allclose(a.detach().numpy(), b, atol=1e-6)
 
 
+def test_without_gaussians_the_background_is_seen():
+    values = [v.detach()[:0] for v in tensors(1)[:5]]
+    background = torch.tensor([0.2, 0.3], dtype=torch.float64, requires_grad=True)
+    image, alpha, _ = images([*values[:4], torch.zeros((0, 2), dtype=torch.float64), background])
+    assert torch.equal(image, background.detach().expand(image.shape)) and not alpha.any()
+    image.sum().backward()
+    assert (background.grad == CAMERA.width * CAMERA.height).all()
+    assert (passed(values) == 1).all()
+
+
 @pytest.mark.parametrize(("function", "inputs"), [(images, 6), (passed, 4), (hits, 4)])
 def test_gradcheck_passes(function, inputs):
     values = tensors(3, n=4, channels=1, finest=-1.0)
@@ -62,11 +72,13 @@ def test_gradcheck_passes(function, inputs):
     assert torch.autograd.gradcheck(of, values[:inputs], eps=1e-6, atol=1e-6, rtol=1e-6)
 
 
-def test_colours_of_harmonics_pass_gradcheck():
+@pytest.mark.parametrize("size", [0.1, 1.0])  # of the larger ones some are cut off at zero
+def test_colours_of_harmonics_pass_gradcheck(size):
     generator = torch.Generator().manual_seed(5)
     means = torch.randn((4, 3), generator=generator, dtype=torch.float64, requires_grad=True)
-    sh = (0.1 * torch.randn((4, 16, 2), generator=generator, dtype=torch.float64)).requires_grad_()
+    sh = (size * torch.randn((4, 16, 2), generator=generator, dtype=torch.float64)).requires_grad_()
     cam = Camera.spherical(8, 4, position=(3.0, 0.2, 0.1))
+    assert bool((interop.colors(means, sh, cam) == 0).any()) == (size == 1.0)
     assert torch.autograd.gradcheck(lambda m, s: interop.colors(m, s, cam), (means, sh), atol=1e-7, rtol=1e-6)
 
 

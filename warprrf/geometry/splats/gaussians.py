@@ -59,6 +59,8 @@ class Gaussians:
     sh: Annotated[np.ndarray, Shaped("N K C", np.float32)]
 
     def __post_init__(self) -> None:
+        for one in fields(self):  # callers may go on with theirs
+            object.__setattr__(self, one.name, getattr(self, one.name).copy())
         scales, opacities = self.scales, self.opacities
         if self.sh.shape[1] not in COEFFICIENTS.values():
             raise ValueError(

@@ -196,8 +196,16 @@ class Rasterizer:
         shape = (len(means), sh.shape[2])
         out = wp.zeros(shape, dtype=self.real, device=self.device, requires_grad=tape is not None)
         origin = self.colors_into(means, sh, cam, out)
+
+        def adjoint() -> None:
+            whole, out.grad = out.grad, wp.zeros_like(out, requires_grad=False)
+            kernel = harmonics.build(self.real).uncut
+            launch(kernel, len(means), [out, whole, out.grad], device=self.device)
+            self.colors_adjoint(means, sh, origin, out)
+            out.grad = whole
+
         if tape is not None:
-            record(tape, lambda: self.colors_adjoint(means, sh, origin, out), (means, sh), (out,))
+            record(tape, adjoint, (means, sh), (out,))
         return out
 
     def colors_into(self, means: wp.array, sh: wp.array, cam: Camera, out: wp.array) -> wp.array:
@@ -208,7 +216,8 @@ class Rasterizer:
         return origin
 
     def colors_adjoint(self, means: wp.array, sh: wp.array, origin: wp.array, out: wp.array) -> None:
-        """Add the gradients of ``means`` and ``sh`` for ``out.grad``."""
+        """Add the gradients of ``means`` and ``sh`` for ``out.grad``, also of colours that are cut off at zero: so black
+        ones can become brighter again while they are fitted."""
         self._check_colors(means, sh, out)
         self._fits("origin", origin, self._vector(3), (1,))
         kernel = harmonics.build(self.real).colors

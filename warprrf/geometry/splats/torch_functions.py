@@ -148,7 +148,7 @@ def _check_gaussians(
 def _check(
     name: str, tensor: object, shape: tuple[int | None, ...], like: torch.Tensor | None
 ) -> tuple[float, float]:
-    """Refuse what is not a tensor of such numbers; returns the lowest and the highest (0 and 1 if it is empty)."""
+    """Refuse what is not a tensor of such numbers; returns the lowest and the highest (ones if it is empty)."""
     if not isinstance(tensor, torch.Tensor):
         raise TypeError(f"{name}: got {type(tensor).__name__}, expected a torch.Tensor")
     if tensor.dtype not in (torch.float32, torch.float64):
@@ -163,7 +163,7 @@ def _check(
         wanted = ", ".join("any" if s is None else str(s) for s in shape)
         raise ValueError(f"{name}: got shape {tuple(tensor.shape)}, expected ({wanted})")
     if tensor.numel() == 0:
-        return 0.0, 1.0
+        return 1.0, 1.0
     low, high = (
         float(bound) for bound in torch.aminmax(tensor.detach())
     )  # NaN if any is: one pass tells all
@@ -262,7 +262,9 @@ class _Colors(torch.autograd.Function):
     @in_stream
     def backward(ctx: Any, incoming: torch.Tensor) -> Any:
         _ = ctx.saved_tensors  # raises if an input was changed in place since forward
-        _seed((ctx.out,), (incoming.clone(),))  # Warp's own adjoint zeroes what it has read
+        open_ones = wp.to_torch(ctx.out, requires_grad=False) > 0  # the others are cut off at zero
+        left = torch.where(open_ones, incoming, 0.0)  # a copy: Warp's own adjoint zeroes what it has read
+        _seed((ctx.out,), (left,))
         return None, *_gradients(ctx.inputs, ctx.needs_input_grad[1:], ctx.adjoint)
 
 

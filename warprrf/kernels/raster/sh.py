@@ -62,6 +62,20 @@ def build(real: type) -> SimpleNamespace:
             value = real(0.5)
             for k in range(sh.shape[1]):
                 value += sh[i, k, c] * b[k]
+            # Its adjoint, which does not repeat the loop above, takes every colour for one above zero.
             out[i, c] = wp.max(value, real(0.0))
 
-    return SimpleNamespace(basis=basis, colors=colors)
+    @wp.kernel(module="unique", enable_backward=False)
+    def uncut(
+        offset: int,
+        colors: wp.array(dtype=real, ndim=2),
+        gradient: wp.array(dtype=real, ndim=2),
+        left: wp.array(dtype=real, ndim=2),
+    ):
+        """What is left of colours' gradients: none where a colour is cut off at zero."""
+        i = offset + wp.tid()
+        for c in range(colors.shape[1]):
+            if colors[i, c] > real(0.0):
+                left[i, c] = gradient[i, c]
+
+    return SimpleNamespace(basis=basis, colors=colors, uncut=uncut)

@@ -173,6 +173,42 @@ def test_masks_that_fit_no_photo_are_named(tmp_path):
         photo_files.find_photos(tmp_path)
 
 
+@pytest.mark.parametrize("name", ["a.png", "a.mask.png"])
+def test_transparent_pixels_are_refused_opaque_ones_read(name, tmp_path):
+    layers = np.full((30, 40, 4), 255, np.uint8)
+    for file in ("a.png", name):
+        Image.fromarray(layers).save(tmp_path / file)
+    photo_files.check_photos({"a.png": tmp_path / "a.png"})
+    layers[:5, :, 3] = 0  # as where a program took the background away
+    Image.fromarray(layers).save(tmp_path / name)
+    with pytest.raises(
+        ValueError, match=rf"{name} does not read as an image: some of its pixels are transparent"
+    ):
+        photo_files.check_photos({"a.png": tmp_path / "a.png"})
+
+
+@pytest.mark.parametrize(("keep", "told"), [(1, "is 1 where"), (254, "is 254 where"), (255, ""), (0, "")])
+def test_masks_without_white_are_refused_unless_all_is_ignored(keep, told, tmp_path):
+    mask = np.zeros_like(GREY)
+    mask[:, :20] = keep
+    save(tmp_path / "a.png", GREY)
+    save(tmp_path / "a.mask.png", mask)
+    lens = Lens("PINHOLE", 40, 30, 30, 30, 20, 15)
+
+    def check():
+        photo_files.check_photos({"a.png": tmp_path / "a.png"})
+
+    def write():
+        write_undistorted(tmp_path / "a.png", tmp_path / "out" / "a.png", lens, 10**6)
+
+    for use in (check, write):
+        if told:
+            with pytest.raises(ValueError, match=rf"a\.mask\.png {told} it is brightest, expected 255"):
+                use()
+        else:
+            use()
+
+
 def test_photos_in_their_own_workspace_are_not_overwritten(through_a_lens):
     work = through_a_lens[1]
     with pytest.raises(ValueError, match="workspace: .* holds the photos and would be overwritten"):

@@ -1,6 +1,8 @@
 """Structure from motion on real image files, and the similarity to metres."""
 
+import resource
 import shutil
+import signal
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
@@ -172,13 +174,11 @@ def test_comparing_promising_pairs_alone_poses_every_photo(tmp_path, monkeypatch
     assert set(made(tmp_path, PHOTOS)[0].cameras) == set(VIEWS)
 
 
-def test_matches_repeat_themselves_to_the_bit(tmp_path, monkeypatch):
-    # Small photos in many pairs: on two threads or more about every second run gives two pairs, or four, other matches, as
-    # OpenBLAS lends one buffer twice. That may miss four runs, so the number of threads is looked at too.
+def features_of(folder, names):
+    """A database of features that all photos share, up to noise."""
     rng = np.random.default_rng(0)
-    names = [f"{k:03d}.jpg" for k in range(90)]
     features = rng.exponential(1.0, (128, 128))
-    with pycolmap.Database.open(str(tmp_path / "features.db")) as database:
+    with pycolmap.Database.open(str(folder / "features.db")) as database:
         camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=640, height=480, params=[500, 320, 240])
         camera_id = database.write_camera(camera)
         for name in names:
@@ -188,6 +188,15 @@ def test_matches_repeat_themselves_to_the_bit(tmp_path, monkeypatch):
             order, sift = rng.permutation(128), pycolmap.FeatureExtractorType.SIFT
             database.write_keypoints(image, rng.uniform(1, 400, (128, 4)).astype(np.float32))
             database.write_descriptors(image, pycolmap.FeatureDescriptors(type=sift, data=seen[order]))
+    (folder / "scratch").mkdir()
+    return Attempt(lambda *_: None, folder / "scratch")
+
+
+def test_matches_repeat_themselves_to_the_bit(tmp_path, monkeypatch):
+    # Small photos in many pairs: on two threads or more about every second run gives two pairs, or four, other matches, as
+    # OpenBLAS lends one buffer twice. That may miss four runs, so the number of threads is looked at too.
+    names = [f"{k:03d}.jpg" for k in range(90)]
+    attempt = features_of(tmp_path, names)
     monkeypatch.setattr(sfm, "MAX_EXHAUSTIVE_PAIRS", 90 * 90)
     match, threads = pycolmap.match_image_pairs, set()
 
@@ -197,11 +206,9 @@ def test_matches_repeat_themselves_to_the_bit(tmp_path, monkeypatch):
         match(*args, **options)
 
     monkeypatch.setattr(pycolmap, "match_image_pairs", spied)
-    scratch = tmp_path / "scratch"
-    scratch.mkdir()
     found = []
     for _ in range(4):
-        sfm._match(tmp_path, names, 0, Attempt(lambda *_: None, scratch))
+        sfm._match(tmp_path, names, 0, attempt)
         with closing(sqlite3.connect(tmp_path / "matches.db")) as database:
             found.append(
                 database.execute("SELECT pair_id, rows, data FROM matches ORDER BY pair_id").fetchall()
@@ -209,6 +216,21 @@ def test_matches_repeat_themselves_to_the_bit(tmp_path, monkeypatch):
     assert len(found[0]) == 90 * 89 // 2 and min(rows for _, rows, _ in found[0]) > 64
     assert all(again == found[0] for again in found[1:])
     assert threads == {1}
+
+
+def test_photos_whose_names_have_blanks_are_matched(tmp_path, monkeypatch):
+    names = ["a room/photo 1.jpg", "a room/photo 2.jpg", "#3.jpg"]
+    match = pycolmap.match_image_pairs
+
+    def quick(*args, **options):
+        options["matching_options"].skip_geometric_verification = True
+        match(*args, **options)
+
+    monkeypatch.setattr(pycolmap, "match_image_pairs", quick)
+    sfm._match(tmp_path, names, 0, features_of(tmp_path, names))
+    with pycolmap.Database.open(str(tmp_path / "matches.db")) as database:
+        assert {i.name for i in database.read_all_images()} == set(names)
+        assert database.num_matched_image_pairs() == 3
 
 
 def test_a_point_projects_to_where_its_photos_saw_it(posed):
@@ -267,6 +289,31 @@ def test_colmap_models_are_read_in_both_formats(posed, tmp_path):
     row = next(line for line in whole.splitlines() if not line.startswith("#"))
     points.write_text(whole.replace(row, " ".join(row.split()[:8])))  # a point that no photo shows
     assert len(sfm.read_colmap(tmp_path / "text").points) == len(posed[1].points) - 1
+
+
+def test_a_model_that_a_full_disk_cuts_short_is_an_error_and_no_finished_step(posed, tmp_path):
+    model = pycolmap.Reconstruction(str(posed[0] / "sfm" / "model"))
+    handler, limit = signal.signal(signal.SIGXFSZ, signal.SIG_IGN), resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limit[1]))
+        with pytest.raises(OSError, match=r"images\.bin was not written whole in .*: is the disk full"):
+            sfm._keep_known(tmp_path, {}, model, False, 0, None)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert not any(tmp_path.iterdir())
+
+
+def test_names_of_a_colmap_text_model_may_have_blanks(tmp_path):
+    names = ["a room/photo 1.jpg", "a room/photo 2.jpg", "c.jpg"]
+    images = [f"{k} 1 0 0 0 {k} 0 0 1 {name}\n{'1 2 -1' * (k < 2)}\n" for k, name in enumerate(names, 1)]
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 50 50 32 24\n")
+    (tmp_path / "images.txt").write_text("# Image list\n" + "".join(images))
+    (tmp_path / "points3D.txt").write_text("")
+    found = sfm.read_colmap(tmp_path).cameras
+    assert {name: -camera.position[0] for name, camera in found.items()} == dict(
+        zip(names, (1, 2, 3), strict=True)
+    )
 
 
 @pytest.mark.parametrize("at", [16, 43])  # x, and the reprojection error

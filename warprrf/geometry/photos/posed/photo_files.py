@@ -152,20 +152,22 @@ def mask_beside(photo: Path) -> Path | None:
 
 
 def check_photos(named: Mapping[str, Path]) -> None:
-    """Refuse photos that do not read as images, and masks of another size than their photo."""
+    """Refuse photos that do not read as images, and masks of another size than their photo or without white."""
     bad: list[str] = []
     for name, path in named.items():
         try:
             facts = photo_facts(path)
             open_photo(path, "RGB")
-            mask = mask_beside(path)
-            size = None if mask is None else open_photo(mask, "L").size
+            if (mask := mask_beside(path)) is not None:
+                size = open_photo(mask, "L").size
+                upright = (facts.width, facts.height)[:: -1 if facts.turns % 2 else 1]
+                if size != upright:
+                    raise ValueError(
+                        f"its mask is {size[0]} x {size[1]}, expected {upright[0]} x {upright[1]}"
+                    )
+                open_mask(mask)
         except ValueError as error:
             bad.append(f"{name} ({error})")
-            continue
-        upright = (facts.width, facts.height)[:: -1 if facts.turns % 2 else 1]
-        if size is not None and size != upright:
-            bad.append(f"{name} (its mask is {size[0]} x {size[1]}, expected {upright[0]} x {upright[1]})")
     if bad:
         raise ValueError(f"photos: {len(bad)} of {len(named)} files do not read as images: {some_of(bad)}")
 
@@ -197,7 +199,28 @@ def open_photo(path: str | os.PathLike[str], mode: str) -> Any:
     with opened(path) as photo:
         if photo.mode[0] in "IF":
             raise ValueError(f"its pixels have more than 8 bits ({photo.mode}); save it with 8")
+        shows_through = "A" in photo.getbands() or "transparency" in photo.info
+        if shows_through and photo.convert("RGBA").getchannel("A").getextrema()[0] < 255:
+            raise ValueError(
+                f"some of its pixels are transparent; save it without, and with a mask (NAME{MASK_SUFFIX}) where a photo is "
+                "to be ignored"
+            )
         return photo.convert(mode)
+
+
+def open_mask(path: str | os.PathLike[str]) -> Any:
+    """The mask of a photo as a grey Pillow image.
+
+    Raises:
+        ValueError: if it does not read, or has neither black alone nor any white: others count from 0 to 1, say.
+    """
+    mask = open_photo(path, "L")
+    brightest = mask.getextrema()[1]
+    if 0 < brightest < 255:
+        raise ValueError(
+            f"the mask {path} is {brightest} where it is brightest, expected 255 (white) where a photo counts"
+        )
+    return mask
 
 
 def read_photo(path: str | os.PathLike[str]) -> np.ndarray:

@@ -158,7 +158,7 @@ def _masks(named: Mapping[str, Path]) -> dict[str, Path]:
 
 def _straightened(steps: Steps, named: Mapping[str, Path], max_pixels: int) -> SparseModel:
     """The model in the folder of ``steps``, with undistorted photos beside it."""
-    model, kept = load_colmap().Reconstruction(str(steps.folder / "model")), steps.folder / "photos"
+    model, kept = _open_model(steps.folder / "model"), steps.folder / "photos"
     lenses = lenses_of(model)
 
     def straight(attempt: Attempt) -> None:
@@ -214,9 +214,22 @@ def _open_model(root: Path) -> Any:
         for name, walk in _RECORDS.items():
             if (root / name).is_file():
                 _check_whole(root / name, walk)
-        return load_colmap().Reconstruction(str(root))
+        model = load_colmap().Reconstruction(str(root))
+        if not all((root / f"{name}.bin").is_file() for name in ("cameras", "images", "points3D")):
+            _name_whole(model, root / "images.txt")
+        return model
     except Exception as error:  # pycolmap raises RuntimeError, ValueError or IndexError on a damaged file
         raise ValueError(f"colmap: {root} does not read as a COLMAP model: {error}") from error
+
+
+def _name_whole(model: Any, path: Path) -> None:
+    """Give images the names that a text file has for them, of which COLMAP reads one word."""
+    lines = iter(path.read_text("utf-8").split("\n"))
+    for line in lines:
+        words = line.split(maxsplit=9)
+        if words and not words[0].startswith("#"):
+            model.images[int(words[0])].name = words[9].rstrip()
+            next(lines, None)  # its points, or an empty line
 
 
 def is_colmap(folder: Path) -> bool:
@@ -262,6 +275,16 @@ def _quiet() -> Iterator[Any]:
         yield colmap
     finally:
         colmap.logging.minloglevel = before
+
+
+def _write_model(model: Any, folder: Path) -> None:
+    """Write a COLMAP model; COLMAP itself says nothing of a full disk."""
+    model.write_binary(str(folder))
+    for name, walk in _RECORDS.items():
+        try:
+            _check_whole(folder / name, walk)
+        except ValueError as error:
+            raise OSError(f"{name} was not written whole in {folder.parent}: is the disk full?") from error
 
 
 def _root(named: Mapping[str, Path]) -> Path:
@@ -343,7 +366,8 @@ def _match(folder: Path, names: list[str], seed: int, attempt: Attempt) -> None:
     working = shutil.copyfile(folder / "features.db", _fresh(attempt.folder) / "matches.db")
     listing = attempt.folder / "pairs.txt"
     with colmap.Database.open(str(working)) as database:
-        counts = {i.name: database.num_keypoints_for_image(i.image_id) for i in database.read_all_images()}
+        number = {i.name: i.image_id for i in database.read_all_images()}
+        counts = {name: database.num_keypoints_for_image(k) for name, k in number.items()}
         blank = [n for n in names if counts[n] < FEWEST_FEATURES]
         if len(names) - len(blank) < MIN_PHOTOS:
             raise ValueError(
@@ -359,9 +383,12 @@ def _match(folder: Path, names: list[str], seed: int, attempt: Attempt) -> None:
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     match_batch = 400
+    # COLMAP's list of pairs divides names at their blanks: photos go by numbers meanwhile.
+    _rename(working, {k: str(k) for k in number.values()})
     for start in range(0, len(chosen), match_batch):
         attempt.progress("matching", start, len(chosen))
-        listing.write_text("".join(f"{a} {b}\n" for a, b in chosen[start : start + match_batch]))
+        pairs = chosen[start : start + match_batch]
+        listing.write_text("".join(f"{number[a]} {number[b]}\n" for a, b in pairs))
         colmap.match_image_pairs(
             working,
             matching_options=matching,
@@ -370,7 +397,15 @@ def _match(folder: Path, names: list[str], seed: int, attempt: Attempt) -> None:
             device=colmap.Device.cpu,
         )
     attempt.progress("matching", len(chosen), len(chosen))
+    _rename(working, {k: name for name, k in number.items()})
     _settled(working, folder / "matches.db")
+
+
+def _rename(working: Path, names: Mapping[int, str]) -> None:
+    """Give images of a database other names, by their numbers."""
+    with closing(sqlite3.connect(working)) as connection, connection:
+        rows = [(name, k) for k, name in names.items()]
+        connection.executemany("UPDATE images SET name = ? WHERE image_id = ?", rows)
 
 
 def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[tuple[str, str]]:
@@ -477,9 +512,9 @@ def _map(folder: Path, named: Mapping[str, Path], lens: str, seed: int, attempt:
             continue
         pieces.append(names)
         with folder_in_place(folder / ("model" if len(pieces) == 1 else f"model-{len(pieces)}")) as whole:
-            model.write_binary(str(whole))
+            _write_model(model, whole)
             if len(pieces) == 1:
-                choose_lens(whole, lens).write_binary(str(whole))
+                _write_model(choose_lens(whole, lens), whole)
     report("mapping", len(named), len(named))
     return {"pieces": pieces}
 
@@ -615,7 +650,7 @@ def _keep_known(
             model = colmap.triangulate_points(model, working, root, whole, options=options)
             model.extract_colors_for_all_images(str(root))
             attempt.progress("triangulating", 1, 1)
-        model.write_binary(str(whole))
+        _write_model(model, whole)
     return {"pieces": []}
 
 

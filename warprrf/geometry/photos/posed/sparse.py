@@ -135,15 +135,22 @@ def align_to_known(sparse: SparseModel, known_positions: Mapping[str, ArrayLike]
     return replace(moved, metric=True, upright=True, scale_rms_m=rms_m)
 
 
+def check_known(known_positions: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
+    """Surveyed camera positions (3,) [m] by photo, three or more."""
+    found = {n: check_array(f"known_positions[{n!r}]", p, (3,)) for n, p in known_positions.items()}
+    if len(found) < 3:
+        raise ValueError(
+            f"known_positions: got {len(found)}, expected at least 3 camera positions that are not on a line"
+        )
+    return found
+
+
 def known_similarity(
     cameras: Mapping[str, Camera], unposed: Sequence[str], known_positions: Mapping[str, ArrayLike]
 ) -> tuple[float, np.ndarray, np.ndarray, float]:
     """Scale, rotation and shift that bring ``cameras``, by photo name, to surveyed positions, and the rms distance that is
     left there [m]; see :func:`align_to_known` for both and errors."""
-    if len(known_positions) < 3:
-        raise ValueError(
-            f"known_positions: got {len(known_positions)}, expected at least 3 camera positions that are not on a line"
-        )
+    known_positions = check_known(known_positions)
     names = match_names("known_positions", known_positions, (*cameras, *unposed))
     lost = [n for n in names if n not in cameras]
     usable = {n: p for n, p in zip(names, known_positions.values(), strict=True) if n in cameras}
@@ -154,7 +161,7 @@ def known_similarity(
             f"without pose: {some_of(lost)}"
         )
     source = np.array([cameras[n].position for n in usable])
-    target = np.array([check_array(f"known_positions[{n!r}]", p, (3,)) for n, p in usable.items()])
+    target = np.array(list(usable.values()))
     try:
         scale, rotation, shift = fit_similarity(source, target)
     except ValueError as error:

@@ -22,7 +22,13 @@ from numpy.typing import ArrayLike
 
 from warprrf.checks import Count, check_array, checked, one_of, positive, within
 from warprrf.device import require
-from warprrf.geometry.photos.posed.photo_files import mask_beside, mask_name, open_photo, photo_facts
+from warprrf.geometry.photos.posed.photo_files import (
+    mask_beside,
+    mask_name,
+    open_mask,
+    open_photo,
+    photo_facts,
+)
 from warprrf.geometry.splats.camera import Camera
 
 COEFFICIENTS = {
@@ -121,9 +127,7 @@ def write_undistorted(source: Path, target: Path, lens: Lens, max_pixels: int) -
         straight.rotate(-90 * turns, expand=True).save(target, **finest)
     if mask is not None:
         image = require("PIL.Image", extra="photos")
-        stored = open_photo(mask, "L").rotate(
-            90 * turns, expand=True
-        )  # a mask is upright, as its photo is seen
+        stored = open_mask(mask).rotate(90 * turns, expand=True)  # a mask is upright, as its photo is seen
         counts = np.asarray(_resampled(stored, mask, lens, small)) > 254
         whole = image.fromarray(np.where(counts, 255, 0).astype(np.uint8))
         whole.rotate(-90 * turns, expand=True).save(mask_name(target))
