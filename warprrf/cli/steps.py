@@ -14,6 +14,7 @@ import numpy as np
 import warprrf as wr
 from warprrf.checks import check_count
 from warprrf.cli.inputs import (
+    OF_GEOMETRY,
     POINTINGS,
     Add,
     add_effects,
@@ -408,8 +409,7 @@ def _suggest(args: argparse.Namespace, out: Output) -> None:
     if args.receive_pattern is not None:
         turned = {"arrival": arrival, "receive_pattern": read_pattern(args.receive_pattern)}
     if source.suffix.lower() == ".safetensors":
-        own = ("transmitter", "mesh", "unit", "up", "simplify", "materials")
-        refuse(args, own, f"{source} is a field, which has its own")
+        refuse(args, ("transmitter", *OF_GEOMETRY), f"{source} is a field, which has its own")
         field = load_field(source, args)
     else:
         for flag in ("transmitter", "frequency"):
@@ -571,8 +571,7 @@ def _relevance(args: argparse.Namespace, out: Output) -> None:
     if len(receivers) > args.most:
         receivers = receivers[np.random.default_rng(args.seed).permutation(len(receivers))[: args.most]]
     if source.suffix.lower() == ".safetensors":
-        own = ("mesh", "unit", "up", "simplify", "materials")
-        refuse(args, own, f"{source} is a field, which has its own")
+        refuse(args, OF_GEOMETRY, f"{source} is a field, which has its own")
         geometry = load_field(source, args)
     else:
         geometry = load_geometry(args.source, args)
