@@ -359,6 +359,17 @@ def test_locate_takes_spectra_which_name_their_carrier(tmp_path, capsys):
     run("locate {tmp}/f.safetensors {tmp}/s.nc --receiver 4 -o {tmp}/at.json", tmp_path)
     said = json.loads((tmp_path / "at.json").read_text())["position"]
     np.testing.assert_allclose(said, field.locate(ds.subset([4])).position, atol=1e-6)
+    for number in (-1, len(ds)):
+        run(f"locate {{tmp}}/f.safetensors {{tmp}}/s.nc --receiver {number}", tmp_path, status=2)
+        assert (
+            f"--receiver: got {number}, expected a whole number of 0 to {len(ds) - 1}"
+            in capsys.readouterr().err
+        )
+    (tmp_path / "p.csv").write_text(
+        "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,power_db\n1,1,1,2,2,1,-80\n1,1,1,3,2,1,-80\n"
+    )
+    run("locate {tmp}/f.safetensors {tmp}/p.csv --noise-floor-db -120 --receiver 1", tmp_path, status=2)
+    assert "--receiver: got 1, but no file of spectra is given" in capsys.readouterr().err
 
 
 def test_help_of_fit_names_every_option_of_its_models(capsys):

@@ -458,8 +458,11 @@ def _locate(args: argparse.Namespace, out: Output) -> None:
             ds = load_spectra(one)
             if args.receiver is None and len(ds) != 1:
                 raise ValueError(f"--receiver: {one} has {len(ds)} receivers, expected the number of one")
+            check_count("--receiver", args.receiver or 0, 0, len(ds) - 1)
             one = ds.subset([args.receiver or 0])
         measured.append(one)
+    if not any(isinstance(one, wr.SpectrumDataset) for one in measured):
+        refuse(args, ["receiver"], "no file of spectra is given; a table is of one receiver")
     found = field.locate(measured, store=args.map, progress=out)
     figures = "position", "covariance", "candidates", "likelihoods", "known", "misfit"
     zeros = "gains_db", "azimuth_zeros", "clock_offsets_s"
