@@ -149,6 +149,9 @@ BAD = {
     "camera looks straight up": (f"{RENDER} {{tmp}}/one.ply --position 0 0 1 --look-at 0 0 2", "--look-at"),
     "picture of no kind": ("render {tmp}/one.ply -o {tmp}/v --position 0 0 1 --look-at 1 0 1", "v: expected .png (a picture) or"),
     "spectrum of no kind": ("render {tmp}/bad.safetensors -o {tmp}/v.jpg --receiver 1 1 1", "expected .png (a picture) or .npz"),
+    "camera of a field": (f"{RENDER} {{tmp}}/bad.safetensors --receiver 1 1 1 --size 9 9", "--size: got [9, 9], but"),
+    "receiver of splats": (f"{RENDER} {{tmp}}/one.ply --position 0 0 1 --look-at 1 0 1 --receiver 1 1 1", "is no radio field"),
+    "direction of no array": (f"{RENDER} {{tmp}}/bad.safetensors --receiver 1 1 1 --facing 0 0", "no --array is given"),
     "field without receiver": (f"{RENDER} {{tmp}}/bad.safetensors", "--receiver"),
 }  # fmt: skip
 
@@ -350,6 +353,18 @@ def test_sample_render_and_suggest_say_what_the_library_says(tmp_path, capsys):
     best = field.suggest(np.tile(place, (3, 1)), 2, arrival=arrival, receive_pattern=wr.horn(np.radians(10)))
     chosen = np.loadtxt((tmp_path / "next.csv").read_text().splitlines()[1:], delimiter=",")
     np.testing.assert_allclose(chosen[:, 3:], turned[best])
+
+
+def test_a_reconstruction_is_drawn_as_its_gaussians_are(tmp_path):
+    drawn = gaussians()
+    drawn.save_ply(tmp_path / "one.ply")
+    wr.Reconstruction(drawn).save(tmp_path / "room")
+    for source in ("one.ply", "room"):
+        run(
+            f"render {{tmp}}/{source} -o {{tmp}}/{source}.png --position 0 0 1 --look-at 1 0.1 1 --size 16 8",
+            tmp_path,
+        )
+    assert (tmp_path / "one.ply.png").read_bytes() == (tmp_path / "room.png").read_bytes()
 
 
 def test_locate_takes_spectra_which_name_their_carrier(tmp_path, capsys):
