@@ -131,6 +131,7 @@ BAD = {
     "scale that is no number": ("reconstruct {tmp} -o {tmp}/out --scale a.jpg b.jpg far", "--scale"),
     "horn of no table": (f"{FIT} {{tmp}}/bad.nc --receive-pattern 10", "--receive-pattern"),
     "fading of spectra, behind their file": (f"{FIT} {{tmp}}/bad.nc samples=1", "--samples"),
+    "setting of a file that there is not": (f"{HORN} azimut=unknown", "horn.csv: got 'azimut=unknown' behind it, expected"),
     "part of a table": (f"{HORN} --train 3", "--train"),
     "floor that is no number": (f"{HORN} noise-floor-db=4000", "--noise-floor-db"),
     "horn that looks through its own foot": (f"{HORN} receive-pattern=10", "zenith of -1.91986"),

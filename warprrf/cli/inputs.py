@@ -158,10 +158,18 @@ def read_measured(
             files[-1][1].append(f"--{word}")
         else:
             files.append((word, []))
-    parser = Parser(prog=" ".join(sys.argv[1:2]), add_help=False, allow_abbrev=False)
+    parser = Parser(prog=" ".join(["warprrf", *sys.argv[1:2]]), add_help=False, allow_abbrev=False)
     add_measured_options(parser)
     kinds = [_kind(existing(path), others) for path, _ in files]
-    names = {*vars(parser.parse_args([])), "train"}.difference(*(TAKEN[kind] for kind in kinds))
+    known = vars(parser.parse_args([]))
+    flags = [flag.replace("_", "-") for flag in known]
+    for path, settings in files:
+        for setting in settings:
+            if setting[2:].partition("=")[0] not in flags:
+                raise ValueError(
+                    f"{path}: got {setting[2:]!r} behind it, expected NAME=VALUE, NAME among {', '.join(flags)}"
+                )
+    names = {*known, "train"}.difference(*(TAKEN[kind] for kind in kinds))
     refuse(args, sorted(names), "no file is given that it could be of")
     if args.frequency is None:
         args.frequency = frequency_hz
