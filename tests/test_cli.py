@@ -122,6 +122,7 @@ BAD = {
     "a result below a file": (SIMULATE.replace("x.nc", "one.ply/a/x.nc") + " 7,4,1.5", "one.ply is no folder that may be"),
     "a result where none may be written": (SIMULATE.replace("{tmp}/x", "/proc/self/x") + " 7,4,1.5", "/proc/self is no folder"),
     "empty name of the result": (SIMULATE.replace("-o {tmp}/x.nc", "--out=") + " 7,4,1.5", "-o/--out: got ''"),
+    "folder in the place of a scene": ("sample {tmp} -o {tmp}/r.csv", "is a folder, expected a scene file"),
     "materials of a reconstruction": ("relevance {tmp} --receivers 2,2,1 --materials {tmp}/materials.json", "--materials"),
     "mesh of a reconstruction, which has one": ("fit {tmp} {spectra} -o {tmp}/f --mesh {tmp}/one.ply", "--mesh: got"),
     "unit of a reconstruction": ("relevance {tmp} --receivers 2,2,1 --unit mm", "--unit: got 'mm', but"),
