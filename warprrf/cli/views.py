@@ -97,15 +97,15 @@ def _render(args: argparse.Namespace, out: Output) -> None:
     if args.position is None or args.look_at is None:
         raise ValueError("--position and --look-at: both are needed to draw Gaussians, three numbers each")
     gaussians = wr.Reconstruction.load(source).gaussians if source.is_dir() else wr.Gaussians.load_ply(source)
-    size = tuple(args.size or (640, 480))
+    width, height = args.size or (640, 480)
     fov_deg = 75.0 if args.field_of_view is None else args.field_of_view
-    camera = _look_at(args.position, args.look_at, size, fov_deg)
+    camera = _look_at(args.position, args.look_at, (width, height), fov_deg)
     image = wr.render(gaussians, camera, device=args.device).features
     from PIL import Image
 
     pixels = np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
     write_atomically(path, lambda name: Image.fromarray(pixels).save(name))
-    text = f"{args.out}: {size[0]} x {size[1]} pixels, {len(gaussians.means)} Gaussians"
+    text = f"{args.out}: {width} x {height} pixels, {len(gaussians.means)} Gaussians"
     out.result(text, files=[args.out], Gaussians=len(gaussians.means))
 
 
