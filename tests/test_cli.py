@@ -122,15 +122,27 @@ BAD = {
     "a result below a file": (SIMULATE.replace("x.nc", "one.ply/a/x.nc") + " 7,4,1.5", "one.ply is no folder that may be"),
     "a result where none may be written": (SIMULATE.replace("{tmp}/x", "/proc/self/x") + " 7,4,1.5", "/proc/self is no folder"),
     "empty name of the result": (SIMULATE.replace("-o {tmp}/x.nc", "--out=") + " 7,4,1.5", "-o/--out: got ''"),
+    "folder in the place of a scene": ("sample {tmp} -o {tmp}/r.csv", "is a folder, expected a scene file"),
     "materials of a reconstruction": ("relevance {tmp} --receivers 2,2,1 --materials {tmp}/materials.json", "--materials"),
+    "mesh of a reconstruction, which has one": ("fit {tmp} {spectra} -o {tmp}/f --mesh {tmp}/one.ply", "--mesh: got"),
+    "unit of a reconstruction": ("relevance {tmp} --receivers 2,2,1 --unit mm", "--unit: got 'mm', but"),
+    "axis of a mesh that splats lack": ("relevance {tmp}/one.ply --receivers 2,2,1 --up y", "no --mesh is given"),
+    "bands of a reconstruction": ("fit {tmp} {spectra} -o {tmp}/f --extrapolate", "--extrapolate: got True, but"),
+    "bands of a field": ("relevance {tmp}/bad.safetensors --receivers 2,2,1 --extrapolate", "is a field, which has its own"),
     "scale that is no number": ("reconstruct {tmp} -o {tmp}/out --scale a.jpg b.jpg far", "--scale"),
     "horn of no table": (f"{FIT} {{tmp}}/bad.nc --receive-pattern 10", "--receive-pattern"),
     "fading of spectra, behind their file": (f"{FIT} {{tmp}}/bad.nc samples=1", "--samples"),
+    "setting of a file that there is not": (f"{HORN} azimut=unknown", "horn.csv: got 'azimut=unknown' behind it, expected"),
     "part of a table": (f"{HORN} --train 3", "--train"),
     "floor that is no number": (f"{HORN} noise-floor-db=4000", "--noise-floor-db"),
     "horn that looks through its own foot": (f"{HORN} receive-pattern=10", "zenith of -1.91986"),
     "pattern of three numbers": (f"{HORN} --receive-pattern 10,-25,3", "'10,-25,3'"),
     "option of no model": (f"{FIT} {{spectra}} --option colour=red", "colour"),
+    "option without a value": (f"{FIT} {{spectra}} --option quick", "--option: got 'quick', expected NAME=VALUE"),
+    "option that has a name of its own": (f"{FIT} {{spectra}} --option seed=3", "--option: got 'seed=3', expected --seed"),
+    "option twice": (f"{FIT} {{spectra}} --option quick=false --quick", "got quick twice"),
+    "effects of a fit": (f"{SIMULATE} 7,4,1.5 --effects auto", "--effects: got 'auto', expected single, room, everything"),
+    "effects by a list": (f"{SIMULATE} 7,4,1.5 --effects [1]", "--effects: got '[1]', expected single, room"),
     "effects by a wrong name": (f'{FIT} {{spectra}} --effects {{{{"mirror":2}}}}', "got mirror, expected among line_of_sight"),
     "effects of Sionna": (f"{SIMULATE} 7,4,1.5 --engine sionna --effects room", "--effects: got 'room'"),
     "walls of Sionna": (f"{SIMULATE} 7,4,1.5 --refraction", "--refraction: got True, but engine exact has --effects"),
@@ -144,6 +156,9 @@ BAD = {
     "camera looks straight up": (f"{RENDER} {{tmp}}/one.ply --position 0 0 1 --look-at 0 0 2", "--look-at"),
     "picture of no kind": ("render {tmp}/one.ply -o {tmp}/v --position 0 0 1 --look-at 1 0 1", "v: expected .png (a picture) or"),
     "spectrum of no kind": ("render {tmp}/bad.safetensors -o {tmp}/v.jpg --receiver 1 1 1", "expected .png (a picture) or .npz"),
+    "camera of a field": (f"{RENDER} {{tmp}}/bad.safetensors --receiver 1 1 1 --size 9 9", "--size: got [9, 9], but"),
+    "receiver of splats": (f"{RENDER} {{tmp}}/one.ply --position 0 0 1 --look-at 1 0 1 --receiver 1 1 1", "is no radio field"),
+    "direction of no array": (f"{RENDER} {{tmp}}/bad.safetensors --receiver 1 1 1 --facing 0 0", "no --array is given"),
     "field without receiver": (f"{RENDER} {{tmp}}/bad.safetensors", "--receiver"),
 }  # fmt: skip
 
@@ -347,6 +362,18 @@ def test_sample_render_and_suggest_say_what_the_library_says(tmp_path, capsys):
     np.testing.assert_allclose(chosen[:, 3:], turned[best])
 
 
+def test_a_reconstruction_is_drawn_as_its_gaussians_are(tmp_path):
+    drawn = gaussians()
+    drawn.save_ply(tmp_path / "one.ply")
+    wr.Reconstruction(drawn).save(tmp_path / "room")
+    for source in ("one.ply", "room"):
+        run(
+            f"render {{tmp}}/{source} -o {{tmp}}/{source}.png --position 0 0 1 --look-at 1 0.1 1 --size 16 8",
+            tmp_path,
+        )
+    assert (tmp_path / "one.ply.png").read_bytes() == (tmp_path / "room.png").read_bytes()
+
+
 def test_locate_takes_spectra_which_name_their_carrier(tmp_path, capsys):
     field, ds = make.bistatic(), make.spectra()
     field.save(tmp_path / "f.safetensors")
@@ -354,6 +381,17 @@ def test_locate_takes_spectra_which_name_their_carrier(tmp_path, capsys):
     run("locate {tmp}/f.safetensors {tmp}/s.nc --receiver 4 -o {tmp}/at.json", tmp_path)
     said = json.loads((tmp_path / "at.json").read_text())["position"]
     np.testing.assert_allclose(said, field.locate(ds.subset([4])).position, atol=1e-6)
+    for number in (-1, len(ds)):
+        run(f"locate {{tmp}}/f.safetensors {{tmp}}/s.nc --receiver {number}", tmp_path, status=2)
+        assert (
+            f"--receiver: got {number}, expected a whole number of 0 to {len(ds) - 1}"
+            in capsys.readouterr().err
+        )
+    (tmp_path / "p.csv").write_text(
+        "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,power_db\n1,1,1,2,2,1,-80\n1,1,1,3,2,1,-80\n"
+    )
+    run("locate {tmp}/f.safetensors {tmp}/p.csv --noise-floor-db -120 --receiver 1", tmp_path, status=2)
+    assert "--receiver: got 1, but no file of spectra is given" in capsys.readouterr().err
 
 
 def test_help_of_fit_names_every_option_of_its_models(capsys):

@@ -64,6 +64,8 @@ def write_atomically(
 
 def file_at(path: str | os.PathLike[str], what: str = "file") -> Path:
     """``path``, at which there must be a file; the FileNotFoundError says of ``what`` kind."""
+    if os.path.isdir(path):
+        raise FileNotFoundError(f"path: {os.fspath(path)} is a folder, expected a {what}")
     if not os.path.isfile(path):
         raise FileNotFoundError(f"path: there is no {what} {os.fspath(path)}")
     return Path(path)

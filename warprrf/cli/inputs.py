@@ -158,10 +158,18 @@ def read_measured(
             files[-1][1].append(f"--{word}")
         else:
             files.append((word, []))
-    parser = Parser(prog=" ".join(sys.argv[1:2]), add_help=False, allow_abbrev=False)
+    parser = Parser(prog=" ".join(["warprrf", *sys.argv[1:2]]), add_help=False, allow_abbrev=False)
     add_measured_options(parser)
     kinds = [_kind(existing(path), others) for path, _ in files]
-    names = {*vars(parser.parse_args([])), "train"}.difference(*(TAKEN[kind] for kind in kinds))
+    known = vars(parser.parse_args([]))
+    flags = [flag.replace("_", "-") for flag in known]
+    for path, settings in files:
+        for setting in settings:
+            if setting[2:].partition("=")[0] not in flags:
+                raise ValueError(
+                    f"{path}: got {setting[2:]!r} behind it, expected NAME=VALUE, NAME among {', '.join(flags)}"
+                )
+    names = {*known, "train"}.difference(*(TAKEN[kind] for kind in kinds))
     refuse(args, sorted(names), "no file is given that it could be of")
     if args.frequency is None:
         args.frequency = frequency_hz
@@ -344,6 +352,10 @@ def read_receivers(values: Sequence[str], name: str = "--receivers", what: str =
     return np.array(rows)
 
 
+OF_GEOMETRY = ("mesh", "unit", "up", "simplify", "materials", "extrapolate", "allow_outside")
+"""Options that say how a scene or mesh file is read."""
+
+
 def add_geometry_options(parser: argparse.ArgumentParser, splats: str = "") -> None:
     """Define how a mesh file is read, what of a scene file's materials is taken, and that either may name any file; and a
     mesh beside splats, where the argument ``splats`` may be some."""
@@ -360,12 +372,14 @@ def add_geometry_options(parser: argparse.ArgumentParser, splats: str = "") -> N
     parser.add_argument("--materials", metavar="FILE", help="table that replaces a scene's materials by name")
     parser.add_argument(
         "--extrapolate",
-        action="store_true",
+        action="store_const",
+        const=True,
         help="let a scene's materials hold outside their bands, by the nearest band's law",
     )
     parser.add_argument(
         "--allow-outside",
-        action="store_true",
+        action="store_const",
+        const=True,
         help="read files outside the folder of a scene or mesh file too",
     )
 
@@ -373,8 +387,8 @@ def add_geometry_options(parser: argparse.ArgumentParser, splats: str = "") -> N
 def load_scene(path: str | Path, options: argparse.Namespace) -> wr.Scene:
     """A scene file that Sionna RT opens, or a mesh file."""
     materials = None if options.materials is None else existing(options.materials)
-    how = _mesh_options(options)
-    return wr.Scene.load(existing(path), materials=materials, extrapolate=options.extrapolate, **how)
+    how = _mesh_options(options) | {"extrapolate": bool(options.extrapolate)}
+    return wr.Scene.load(existing(path), materials=materials, **how)
 
 
 def load_geometry(path: str, options: argparse.Namespace) -> Any:
@@ -385,8 +399,12 @@ def load_geometry(path: str, options: argparse.Namespace) -> Any:
     if options.materials is not None and (source.is_dir() or splats):
         raise ValueError(f"--materials: {source} names no materials, expected a scene (.xml) or a mesh file")
     if source.is_dir():
+        refuse(options, OF_GEOMETRY, f"{source} is a reconstruction, which has its own mesh")
         return wr.Reconstruction.load(source)
     if splats:
+        if mesh is None:
+            refuse(options, OF_GEOMETRY, f"{source} holds splats, and no --mesh is given")
+        refuse(options, ["extrapolate"], f"{source} names no materials")
         return wr.Reconstruction.from_files(source, mesh=None if mesh is None else _load_mesh(mesh, options))
     if mesh is not None:
         raise ValueError(f"--mesh: {source} has surfaces itself, expected splats (.ply) with --mesh")
@@ -397,6 +415,7 @@ def load_geometry(path: str, options: argparse.Namespace) -> Any:
             f"{source}: expected a reconstruction's folder, splats (.ply), a scene (.xml) or a mesh "
             f"({', '.join(READERS)})"
         )
+    refuse(options, ["extrapolate"], f"{source} is read without --materials")
     return _load_mesh(source, options)
 
 
@@ -405,4 +424,5 @@ def _load_mesh(path: str | Path, options: argparse.Namespace) -> wr.Mesh:
 
 
 def _mesh_options(options: argparse.Namespace) -> dict[str, Any]:
-    return {name: getattr(options, name) for name in ("unit", "up", "simplify", "allow_outside")}
+    how = {name: getattr(options, name) for name in ("unit", "up", "simplify")}
+    return how | {"allow_outside": bool(options.allow_outside)}

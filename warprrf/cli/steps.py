@@ -14,6 +14,7 @@ import numpy as np
 import warprrf as wr
 from warprrf.checks import check_count
 from warprrf.cli.inputs import (
+    OF_GEOMETRY,
     POINTINGS,
     Add,
     add_effects,
@@ -216,6 +217,10 @@ def _simulate(args: argparse.Namespace, out: Output) -> None:
         if args.engine != "exact":
             refuse(args, ["effects"], f"engine {args.engine} has its own: --depth, --refraction")
         effects = read_effects(args.effects)
+        if not isinstance(effects, wr.Effects) and effects not in SETS:
+            raise ValueError(
+                f"--effects: got {args.effects!r}, expected {', '.join(SETS)}, or fields of wr.Effects in JSON"
+            )
         how["effects"] = SETS.get(effects, effects)
     unfinished = Path(f"{args.out}.receivers")
     there = os.listdir(unfinished) if unfinished.is_dir() else []
@@ -316,17 +321,22 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
     """
     geometry = load_geometry(args.geometry, args)
     data = read_measured(args.measurements, args)
-    options: dict[str, Any] = dict(map(_option, args.option))
+    given: list[tuple[str, Any]] = [_option(text) for text in args.option]
     if args.relevance is not None:
-        options["relevance"] = wr.Relevance.load(existing(args.relevance))
-    options |= {name: True for name in ("quick", "reciprocal") if getattr(args, name)}
+        given.append(("relevance", wr.Relevance.load(existing(args.relevance))))
+    given += [(name, True) for name in ("quick", "reciprocal") if getattr(args, name)]
     if args.effects is not None:
-        options["effects"] = read_effects(args.effects)
+        given.append(("effects", read_effects(args.effects)))
+    if args.iterations is not None:
+        given.append(("iterations", args.iterations))
+    options = dict(given)
+    if len(options) < len(given):
+        names = [name for name, _ in given]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"--option: got {twice} twice, by itself or as --{twice}; expected each option once")
     for option in ("relevance", "quick", "reciprocal", "effects"):
         if option in options and args.model != "bistatic":
             raise ValueError(f"--{option}: only the bistatic model takes it, got --model {args.model}")
-    if args.iterations is not None:
-        options["iterations"] = args.iterations
     if "checkpoint" in options:
         out.resumes(str(options["checkpoint"]))
     field = wr.RadioField.fit(
@@ -364,7 +374,9 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
 
 
 def _option(text: str) -> tuple[str, Any]:
-    name, _, value = text.partition("=")
+    name, equals, value = text.partition("=")
+    if not equals or name in ("model", "seed", "device"):
+        raise ValueError(f"--option: got {text!r}, expected {f'--{name}' if equals else 'NAME=VALUE'}")
     return name, (read_effects if name == "effects" else read_json_or_text)(value)
 
 
@@ -408,8 +420,7 @@ def _suggest(args: argparse.Namespace, out: Output) -> None:
     if args.receive_pattern is not None:
         turned = {"arrival": arrival, "receive_pattern": read_pattern(args.receive_pattern)}
     if source.suffix.lower() == ".safetensors":
-        own = ("transmitter", "mesh", "unit", "up", "simplify", "materials")
-        refuse(args, own, f"{source} is a field, which has its own")
+        refuse(args, ("transmitter", *OF_GEOMETRY), f"{source} is a field, which has its own")
         field = load_field(source, args)
     else:
         for flag in ("transmitter", "frequency"):
@@ -458,8 +469,11 @@ def _locate(args: argparse.Namespace, out: Output) -> None:
             ds = load_spectra(one)
             if args.receiver is None and len(ds) != 1:
                 raise ValueError(f"--receiver: {one} has {len(ds)} receivers, expected the number of one")
+            check_count("--receiver", args.receiver or 0, 0, len(ds) - 1)
             one = ds.subset([args.receiver or 0])
         measured.append(one)
+    if not any(isinstance(one, wr.SpectrumDataset) for one in measured):
+        refuse(args, ["receiver"], "no file of spectra is given; a table is of one receiver")
     found = field.locate(measured, store=args.map, progress=out)
     figures = "position", "covariance", "candidates", "likelihoods", "known", "misfit"
     zeros = "gains_db", "azimuth_zeros", "clock_offsets_s"
@@ -571,8 +585,7 @@ def _relevance(args: argparse.Namespace, out: Output) -> None:
     if len(receivers) > args.most:
         receivers = receivers[np.random.default_rng(args.seed).permutation(len(receivers))[: args.most]]
     if source.suffix.lower() == ".safetensors":
-        own = ("mesh", "unit", "up", "simplify", "materials")
-        refuse(args, own, f"{source} is a field, which has its own")
+        refuse(args, OF_GEOMETRY, f"{source} is a field, which has its own")
         geometry = load_field(source, args)
     else:
         geometry = load_geometry(args.source, args)

@@ -21,6 +21,7 @@ from warprrf.cli.inputs import (
     existing,
     load_field,
     read_measured,
+    refuse,
 )
 from warprrf.cli.output import Output, aligned
 from warprrf.device import require
@@ -31,7 +32,9 @@ from warprrf.rf.spectra.spectrum import pixel_directions, to_db
 def add_render(add: Add) -> None:
     """Define `render`."""
     ren = add("render", _render)
-    ren.add_argument("source", help="Gaussians (.ply) or a radio field (.safetensors)")
+    ren.add_argument(
+        "source", help="Gaussians (.ply, or a reconstruction's folder) or a radio field (.safetensors)"
+    )
     add_out(ren, "picture (.png), or for a spectrum also .npz")
     add_point(ren, "--receiver", "where the spectrum is taken")
     add_point(ren, "--transmitter", "if another than the fitted one")
@@ -44,15 +47,12 @@ def add_render(add: Add) -> None:
         help="what a coherent array hears, phases and all",
     )
     ren.add_argument(
-        "--facing", nargs=2, type=float, default=(0.0, 90.0), metavar=("AZIMUTH", "ELEVATION"),
-        help="of the array, degrees (0 90: up)",
+        "--facing", nargs=2, type=float, metavar=("AZIMUTH", "ELEVATION"), help="of the array, degrees (0 90: up)",
     )  # fmt: skip
     add_point(ren, "--position", "where the camera stands")
     add_point(ren, "--look-at", "a point it looks at")
-    ren.add_argument(
-        "--size", nargs=2, type=int, default=(640, 480), metavar=("W", "H"), help="pixels (640 480)"
-    )
-    ren.add_argument("--field-of-view", type=float, default=75.0, help="horizontal, degrees (default 75)")
+    ren.add_argument("--size", nargs=2, type=int, metavar=("W", "H"), help="pixels (640 480)")
+    ren.add_argument("--field-of-view", type=float, help="horizontal, degrees (default 75)")
 
 
 def _render(args: argparse.Namespace, out: Output) -> None:
@@ -63,13 +63,22 @@ def _render(args: argparse.Namespace, out: Output) -> None:
       warprrf render field.safetensors --receiver 7 4 1.5 -o spectrum.npz       path_gain, delay_s, aod as arrays
       warprrf render field.safetensors --receiver 7 4 1.5 -o other.png --transmitter 2 3 3.2 --frequency 140e9
       warprrf render field.safetensors --receiver 7 4 1.5 -o array.png --array 4 4
-      warprrf render room/geometry.ply --position 2 2 1.6 --look-at 8 6 1.2 -o view.png
+      warprrf render room --position 2 2 1.6 --look-at 8 6 1.2 -o view.png
+      warprrf render splats.ply --position 2 2 1.6 --look-at 8 6 1.2 -o view.png --size 1280 720
     """
     source, path = existing(args.source), Path(args.out)
     of_field = source.suffix.lower() == ".safetensors"
     kinds = ".png (a picture)", ".npz (path_gain, delay_s, aod)" if of_field else ".jpg (a smaller one)"
     if path.suffix.lower() not in (kind.split()[0] for kind in kinds):
         raise ValueError(f"{path}: expected {' or '.join(kinds)}")
+    others = (
+        ("position", "look_at", "size", "field_of_view")
+        if of_field
+        else ("receiver", "transmitter", "frequency", "array")
+    )
+    refuse(args, others, f"{source} is {'a' if of_field else 'no'} radio field")
+    if args.array is None:
+        refuse(args, ["facing"], "no --array is given")
     if of_field:
         if args.receiver is None:
             raise ValueError("--receiver: none given, expected three coordinates in metres for a radio field")
@@ -87,21 +96,23 @@ def _render(args: argparse.Namespace, out: Output) -> None:
         return
     if args.position is None or args.look_at is None:
         raise ValueError("--position and --look-at: both are needed to draw Gaussians, three numbers each")
-    gaussians = wr.Gaussians.load_ply(source)
-    camera = _look_at(args.position, args.look_at, tuple(args.size), args.field_of_view)
+    gaussians = wr.Reconstruction.load(source).gaussians if source.is_dir() else wr.Gaussians.load_ply(source)
+    width, height = args.size or (640, 480)
+    fov_deg = 75.0 if args.field_of_view is None else args.field_of_view
+    camera = _look_at(args.position, args.look_at, (width, height), fov_deg)
     image = wr.render(gaussians, camera, device=args.device).features
     from PIL import Image
 
     pixels = np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
     write_atomically(path, lambda name: Image.fromarray(pixels).save(name))
-    text = f"{args.out}: {args.size[0]} x {args.size[1]} pixels, {len(gaussians.means)} Gaussians"
+    text = f"{args.out}: {width} x {height} pixels, {len(gaussians.means)} Gaussians"
     out.result(text, files=[args.out], Gaussians=len(gaussians.means))
 
 
 def _array_spectrum(field: Any, place: np.ndarray, args: argparse.Namespace) -> wr.Spectrum:
     if field.model != "bistatic":
         raise ValueError(f"--array: got model {field.model}, which knows no phases; expected bistatic")
-    azimuth, elevation = np.radians(args.facing)
+    azimuth, elevation = np.radians(args.facing or (0.0, 90.0))
     rows, columns = args.array
     array = wr.PlanarArray(rows, columns, orientation=(azimuth, -elevation, 0.0))
     heard = field.array_spectrum(place, array, pixel_directions(field.shape), args.transmitter)

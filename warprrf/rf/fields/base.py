@@ -148,7 +148,8 @@ class RadioField(ABC):
 
         Args:
             geometry: a Reconstruction (anything with ``.gaussians`` and ``.mesh``), a Scene or a Mesh.
-            ds: training set: spectra, and for a ``bistatic`` field also :class:`Readings`, or a list of both.
+            ds: training set: spectra, and for a ``bistatic`` field also :class:`Readings`, :class:`ArraySpectra`, or a list
+                of any of them.
             model: ``"bistatic"``, ``"rf3dgs+"`` or ``"rf3dgs"``.
             options: by name, ``device`` and ``progress`` among them. A ``bistatic`` field takes ``client``, and those of
                 :class:`~warprrf.rf.fields.bistatic.options.FitOptions`: ``quick=True``, ``effects``, ``relevance``, ``lobes``,
@@ -160,7 +161,9 @@ class RadioField(ABC):
             ValueError, TypeError: for an unknown model or bad arguments.
 
         Warns:
-            UserWarning: below 100 GHz and outdoors, of diffraction and transmission where they are not modelled.
+            UserWarning: of diffraction and transmission where they are not modelled, below 100 GHz and outdoors, and, of a
+                ``bistatic`` field, where they would add much as estimated; of readings that are taken for wrong, and of spectra
+                whose strongest direction is not that of the transmitter.
         """
         check_choice("model", model, cls.models)
         return cls.models[model].fit(geometry, ds, model, **options)

@@ -103,7 +103,7 @@ class SpectrumDataset:
         floor: Noise floor N0 that dB images add [linear].
         range_db: 10 log10 N0 and the highest value of the dB images [dB].
         beam_sigma_rad: Width of the receiver beam, kappa = 1 / sigma^2 [rad].
-        engine: "exact" or "sionna".
+        engine: what they come from: "exact" or "sionna" where simulated, "paths", or "measured".
         polarisation: What is averaged and summed.
         seed: Seed of the engine.
         role: "train" or "test" for each receiver, shape ``(R,)``.

@@ -37,7 +37,7 @@ class Effects:
         mirror_scatter: whether mirrors light surfaces that scatter.
         scatter_mirror: whether lit surfaces are seen in mirrors, and through slabs. Sionna RT has no such paths.
         transmissions: most slabs that a path passes, 0 to 8.
-        diffractions: most edges on a path, 0 or 1; beside one mirror at most, and no scattering.
+        diffractions: most edges on a path, 0 or 1; beside one mirror or one slab at most, and no scattering.
         residual: whether what surfaces scatter differs within their group.
 
     Example::

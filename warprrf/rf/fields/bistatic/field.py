@@ -168,7 +168,7 @@ class BistaticField(RadioField):
             client: a ``dask.distributed.Client`` whose workers cast the rays; this process by default.
             device: where rays are cast.
             progress: called with the stages ``"patches"``, ``"mirrors"``, ``"transport"`` and ``"fit"``.
-            settings: attributes of :class:`warprrf.FitOptions`, in place of those of
+            settings: attributes of :class:`~warprrf.rf.fields.bistatic.options.FitOptions`, in place of those of
                 ``options``: ``quick=True``, ``effects="room"``, ``relevance=found``, ...
 
         Raises:
