@@ -56,6 +56,19 @@ def test_box_paths_are_the_image_lattice_to_1e_9(order):
         np.testing.assert_allclose(found, np.sort(np.concatenate(expected)), rtol=1e-12)
 
 
+@pytest.mark.parametrize("point", [LOW + 0.5 * (TX - LOW), TX * [1, 1, 0.5], TX * [0.5, 1, 1] - [3.5, 0, 0]])
+def test_paths_through_the_edges_of_a_room_are_the_image_lattice(point):
+    """Ends on a plane through an edge, a corner, or above each other: paths meet two or three walls at one place."""
+    paths = trace_paths(room(), transmitter=TX, receivers=point, frequency_hz=F, mirror_order=3)
+    expected = np.concatenate([np.linalg.norm(box_images(m) - point, axis=1) for m in range(4)])
+    np.testing.assert_allclose(np.sort(paths.length_m), np.sort(expected), rtol=1e-12)
+    outside = Mesh(*box_mesh(LOW, HIGH))
+    away = LOW + 2.0 * (LOW - TX) * [1, 1, 0.5], LOW + (LOW - TX) * [1, 1, -1]
+    assert trace_paths(
+        outside, transmitter=away[0], receivers=away[1], frequency_hz=F, mirror_order=2
+    ).kind.tolist() == ["los"]
+
+
 def test_angles_and_vertices_describe_the_same_polyline():
     paths = trace_paths(room(), transmitter=TX, receivers=receivers(5), frequency_hz=F, mirror_order=2)
     for r, point in enumerate(receivers(5)):

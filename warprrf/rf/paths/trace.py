@@ -217,7 +217,9 @@ class MirrorTracer:
             self.walls = Walls.of_slabs(
                 self.mesh, eta, thickness, self.wavelength_m, transmissions, clearance, device
             )
-        self.images = MirrorImages(self.patches, self.transmitter, max_chains=max_chains, device=device)
+        self.images = MirrorImages(
+            self.patches, self.transmitter, to_edges=True, max_chains=max_chains, device=device
+        )
         self._fixed = fixed_parameters(materials, self.table, self.frequency_hz, self.images.device)
         self.edges: EdgeFinder | None = None
         if diffractions:
