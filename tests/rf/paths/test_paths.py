@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from radio_scenes import METAL, RadioScene, SlabMaterial, box_mesh, joined, square
+from scipy.spatial.transform import Rotation
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -132,6 +133,18 @@ def test_a_screen_takes_away_what_it_hides():
     assert over.kind.tolist() == ["los"]
     beside = trace_paths(mesh, transmitter=[-2, 5, 1], receivers=[2, 5, 1.2], frequency_hz=F)
     assert beside.kind.tolist() == ["los", "mirror"]
+
+
+@pytest.mark.parametrize("turn", range(4))
+def test_a_partition_in_the_very_middle_stops_what_the_floor_mirrors_at_its_foot(turn):
+    half = np.array([[0, -1, 0], [0, 1, 0], [0, 1, 1], [0, -1, 1.0]])
+    mesh, _ = joined(square(5.0), (half, np.array([[0, 1, 2], [0, 2, 3]])))
+    turned = Rotation.random(random_state=turn).as_matrix().T if turn else np.eye(3)
+    ends = np.array([[-2.0, 0, 0.5], [2.0, 0, 0.5]]) @ turned
+    found = trace_paths(
+        Mesh(mesh.vertices @ turned, mesh.faces), transmitter=ends[0], receivers=ends[1], frequency_hz=F
+    )
+    assert len(found.gain) == 0
 
 
 def test_a_path_over_the_seam_of_two_faces_counts_once():

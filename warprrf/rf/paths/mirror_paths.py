@@ -133,7 +133,7 @@ def exact_paths(
         ways = _off_edges(images, receivers, ways)
         for j in range(k):
             ways = ways.take(patches.contains(ways.patch[:, j], ways.point[:, j]))
-        free = ways.unobstructed(images.device)
+        free = ways.unobstructed(images.device, beyond_m=1e-8)  # rounding does not decide
         found = [ways.take(free)]
         if walls is not None:
             found.append(ways.take(~free).through(walls)[1])
