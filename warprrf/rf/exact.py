@@ -151,7 +151,9 @@ class ExactEngine:
         )
         loss = 0.0 if self.air is None else self.air.loss_per_m(self.mirrors.frequency_hz)
 
-        grid = RayGrid(self.surface, self.shape, sub_pixels, loss_per_m=loss, dtype=np.float64, device=device)
+        grid = RayGrid(
+            self.surface, self.shape, sub_pixels, loss_per_m=loss, nearest_m=0.0, dtype=np.float64, device=device,
+        )  # fmt: skip
         source, frequency = self.mirrors.transmitter, self.mirrors.frequency_hz
         self._tracer = Tracer(self.surface, source, frequency, grid, walls=self.mirrors.walls)
 
