@@ -147,6 +147,14 @@ def test_a_partition_in_the_very_middle_stops_what_the_floor_mirrors_at_its_foot
     assert len(found.gain) == 0
 
 
+def test_ends_on_one_surface_are_refused():
+    """Ways between them lie in it; an end on a surface and one off it is an antenna mounted flush."""
+    ask = {"transmitter": [-5.0, 3, 0], "frequency_hz": F, "mirror_order": 1}
+    with pytest.raises(ValueError, match="receivers: .* lies on the same surface as the transmitter"):
+        trace_paths(room(), receivers=[2.0, 1, 0], **ask)
+    assert len(trace_paths(room(), receivers=[2.0, 1, 0.001], **ask).gain) == 6
+
+
 def test_a_path_over_the_seam_of_two_faces_counts_once():
     mesh = Mesh(*square(1.0))
     p = trace_paths(mesh, transmitter=[-0.5, -0.5, 1], receivers=[0.5, 0.5, 1], frequency_hz=F)
