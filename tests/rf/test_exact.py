@@ -43,6 +43,14 @@ def test_infinite_lambertian_conductor(h1, h2, apart):
     assert power == pytest.approx((WAVELENGTH / (4 * np.pi * d)) ** 2 * 0.49 * 2 * (h1 + h2) / d, rel=1e-3)
 
 
+def test_a_surface_close_to_the_transmitter_scatters_all_that_it_gets():
+    scene, near_m = one_material(Mesh(*square(3000.0)), conductor(scattering=1.0)), 0.02
+    power = engine(scene, [0.0, 0.0, near_m]).diffuse(np.array([1.0, 0.3, 1.0])).power.sum()
+    d = np.linalg.norm([1.0, 0.3, 1.0 + near_m])
+    expected = (WAVELENGTH / (4 * np.pi * d)) ** 2 * 2 * (1.0 + near_m) / d
+    assert power == pytest.approx(expected, rel=0.05)  # some tens of rays meet what is lit most
+
+
 @pytest.mark.parametrize(
     "material",
     [

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from radio_scenes import box_mesh, joined
 
+from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.materials import Material
 from warprrf.rf.scene import Scene
-from warprrf.rf.simulate import sample_receivers
+from warprrf.rf.simulate import sample_receivers, simulate
 
 LOW, HIGH = np.array([-7.0, -6, 0]), np.array([8.0, 6, 4])
 BOX = np.array([-1.0, -1, 0]), np.array([0.5, 1.5, 2.2])
@@ -26,3 +27,13 @@ def test_receivers_are_drawn_from_the_air():
     west = places[:, 0] < -1.3
     free = (5.4 * 11.4) / (14.4 * 11.4 - 2.1 * 3.1)
     assert west.mean() == pytest.approx(free, abs=0.07)
+
+
+def test_a_transmitter_that_few_rays_look_at_is_warned_of():
+    plaster = Material.custom("plaster", relative_permittivity=2.0, conductivity=0.1, scattering=0.5)
+    s = Scene(Mesh(*box_mesh(LOW, HIGH, inward=True)), [plaster], np.zeros(12, int))
+    ask = {"receivers": [3.0, -2.0, 1.4], "frequency_hz": 300e9, "shape": (6, 12)}
+    with pytest.warns(
+        UserWarning, match="transmitter: it stands 0.1 m off a surface, where rays .* 0.23 m apart"
+    ):
+        simulate(s, transmitter=[1.0, 1.0, 3.9], **ask)

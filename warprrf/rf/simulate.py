@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from warprrf.cache import Cache, making
-from warprrf.checks import NotNegative, Seed, check_array, check_count, checked, one_of
+from warprrf.checks import NotNegative, Seed, check_array, check_count, checked, one_of, warn
 from warprrf.cluster import each
 from warprrf.device import DeviceLike, Progress, silent
-from warprrf.geometry.mesh import as_mesh
+from warprrf.geometry.mesh import Mesh, as_mesh
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.fresnel import surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, Hertz
@@ -91,7 +91,8 @@ def simulate(
         ImportError: if ``engine="sionna"`` and Sionna RT is missing.
 
     Warns:
-        UserWarning: below 100 GHz and outdoors, of diffraction and transmission if not modelled.
+        UserWarning: below 100 GHz and outdoors, of diffraction and transmission if not modelled; of a transmitter so near to a
+            surface that few of the exact engine's rays meet what it lights most.
     """
     if not hasattr(scene, "materials"):
         raise TypeError(f"scene: got {type(scene).__name__}, expected a Scene (a mesh and its materials)")
@@ -104,6 +105,8 @@ def simulate(
     question_unit(mesh, wavelength_m)
     check_positions(mesh, source, points, wavelength_m, device=device)
     exact = engine == "exact"
+    if exact and effects.scatterings:
+        _question_rays(mesh, source, points, shape, device)
     modelled = {
         "transmission": effects.transmissions > 0 if exact else refraction,
         "diffraction": exact and effects.diffractions > 0,
@@ -197,6 +200,20 @@ def sample_receivers(
         if count >= n:
             return np.concatenate(found)[:n]
     raise ValueError(f"clearance: found {count} of {n} places {clearance:g} m from all in {most} draws")
+
+
+def _question_rays(
+    mesh: Mesh, source: np.ndarray, points: np.ndarray, shape: tuple[int, int], device: DeviceLike
+) -> None:
+    """Warn of a transmitter nearer to a surface than rays from receivers are apart there."""
+    off_m = float(mesh.distance(source[None], device=device)[0])
+    away_m = float(np.linalg.norm(points - source, axis=1).max(initial=0.0))
+    apart_m = away_m * np.sqrt(4.0 * np.pi / (shape[0] * shape[1])) / SUB_PIXELS
+    if off_m < apart_m:
+        warn(
+            f"transmitter: it stands {off_m:.2g} m off a surface, where rays from receivers are {apart_m:.2g} m apart: what that "
+            "scatters may err by some decibels; expected a finer shape, or a transmitter further off"
+        )
 
 
 def _versions(engine: str, solver_only: bool = False) -> dict[str, str]:

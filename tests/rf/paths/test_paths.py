@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from radio_scenes import METAL, RadioScene, SlabMaterial, box_mesh, joined, square
+from scipy.spatial.transform import Rotation
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -54,6 +55,19 @@ def test_box_paths_are_the_image_lattice_to_1e_9(order):
         expected = [np.linalg.norm(box_images(m) - point, axis=1) for m in range(order + 1)]
         found = np.sort(paths.length_m[k][paths.valid[k]])
         np.testing.assert_allclose(found, np.sort(np.concatenate(expected)), rtol=1e-12)
+
+
+@pytest.mark.parametrize("point", [LOW + 0.5 * (TX - LOW), TX * [1, 1, 0.5], TX * [0.5, 1, 1] - [3.5, 0, 0]])
+def test_paths_through_the_edges_of_a_room_are_the_image_lattice(point):
+    """Ends on a plane through an edge, a corner, or above each other: paths meet two or three walls at one place."""
+    paths = trace_paths(room(), transmitter=TX, receivers=point, frequency_hz=F, mirror_order=3)
+    expected = np.concatenate([np.linalg.norm(box_images(m) - point, axis=1) for m in range(4)])
+    np.testing.assert_allclose(np.sort(paths.length_m), np.sort(expected), rtol=1e-12)
+    outside = Mesh(*box_mesh(LOW, HIGH))
+    away = LOW + 2.0 * (LOW - TX) * [1, 1, 0.5], LOW + (LOW - TX) * [1, 1, -1]
+    assert trace_paths(
+        outside, transmitter=away[0], receivers=away[1], frequency_hz=F, mirror_order=2
+    ).kind.tolist() == ["los"]
 
 
 def test_angles_and_vertices_describe_the_same_polyline():
@@ -119,6 +133,26 @@ def test_a_screen_takes_away_what_it_hides():
     assert over.kind.tolist() == ["los"]
     beside = trace_paths(mesh, transmitter=[-2, 5, 1], receivers=[2, 5, 1.2], frequency_hz=F)
     assert beside.kind.tolist() == ["los", "mirror"]
+
+
+@pytest.mark.parametrize("turn", range(4))
+def test_a_partition_in_the_very_middle_stops_what_the_floor_mirrors_at_its_foot(turn):
+    half = np.array([[0, -1, 0], [0, 1, 0], [0, 1, 1], [0, -1, 1.0]])
+    mesh, _ = joined(square(5.0), (half, np.array([[0, 1, 2], [0, 2, 3]])))
+    turned = Rotation.random(random_state=turn).as_matrix().T if turn else np.eye(3)
+    ends = np.array([[-2.0, 0, 0.5], [2.0, 0, 0.5]]) @ turned
+    found = trace_paths(
+        Mesh(mesh.vertices @ turned, mesh.faces), transmitter=ends[0], receivers=ends[1], frequency_hz=F
+    )
+    assert len(found.gain) == 0
+
+
+def test_ends_on_one_surface_are_refused():
+    """Ways between them lie in it; an end on a surface and one off it is an antenna mounted flush."""
+    ask = {"transmitter": [-5.0, 3, 0], "frequency_hz": F, "mirror_order": 1}
+    with pytest.raises(ValueError, match="receivers: .* lies on the same surface as the transmitter"):
+        trace_paths(room(), receivers=[2.0, 1, 0], **ask)
+    assert len(trace_paths(room(), receivers=[2.0, 1, 0.001], **ask).gain) == 6
 
 
 def test_a_path_over_the_seam_of_two_faces_counts_once():

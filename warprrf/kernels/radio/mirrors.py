@@ -28,6 +28,7 @@ class Patches:
     node_half: wp.array(dtype=wp.vec3d)
     level: wp.array(dtype=wp.int32)
     two_sided: wp.bool
+    to_edges: wp.bool  # whether ways through an edge between two mirrors are told
 
 
 @wp.struct
@@ -142,19 +143,24 @@ def extend_chains(
 
 
 @wp.func
-def step_back(patches: Patches, p: int, here: wp.vec3d, image: wp.vec3d):
-    """Where the way from ``here`` to ``image`` meets patch p, the image before, and whether that is in the patch's box.
+def step_back(patches: Patches, p: int, here: wp.vec3d, image: wp.vec3d, mirrored: bool):
+    """Where the way from ``here``, on the mirror behind where it is ``mirrored``, to ``image`` meets patch p, the image before,
+    and whether that is in the patch's box.
 
     What is no further from the patch's plane than ``IN_PLANE`` is in it: rounding does not decide about a way through
-    the edge between two mirrors.
+    the edge between two mirrors. Where edges are asked for, it meets the second where it meets the first.
     """
     n = patches.normal[p]
     side = wp.dot(n, here) - patches.plane_offset[p]
     depth = wp.dot(n, image) - patches.plane_offset[p]
-    inside = wp.abs(side) > wp.float64(wp.static(IN_PLANE)) and side * depth < wp.float64(0.0)
+    at_edge = wp.abs(side) <= wp.float64(wp.static(IN_PLANE))
+    inside = side * depth < wp.float64(0.0)
+    if at_edge:
+        inside = patches.to_edges and mirrored and wp.abs(depth) > wp.float64(wp.static(IN_PLANE))
     point = here
     if inside:
-        point = here + side / (side - depth) * (image - here)
+        if not at_edge:
+            point = here + side / (side - depth) * (image - here)
         gap = point - patches.box_middle[p]
         half = patches.box_half[p]
         inside = wp.abs(gap[0]) <= half[0] and wp.abs(gap[1]) <= half[1] and wp.abs(gap[2]) <= half[2]
@@ -172,7 +178,8 @@ def leads_through(
     column = int(patch.shape[1])
     while inside and column > 0:
         column -= 1
-        here, image, inside = step_back(patches, patch[chain, column], here, image)
+        mirrored = column < patch.shape[1] - 1
+        here, image, inside = step_back(patches, patch[chain, column], here, image, mirrored)
     return inside
 
 
@@ -220,5 +227,5 @@ def unfold_chains(
     column = int(patch.shape[1])
     while column > 0:
         column -= 1
-        here, source, inside = step_back(patches, patch[k, column], here, source)
+        here, source, inside = step_back(patches, patch[k, column], here, source, column < patch.shape[1] - 1)
         point[k, column] = here

@@ -64,6 +64,7 @@ class MirrorImages:
 
     Args:
         slack_m: Boxes of patches are widened by it [m]: their tolerance by default.
+        to_edges: Whether ways are told that go through the edge between two mirrors, by either first.
         max_chains: Searches that would try more chains are refused.
 
     Warns:
@@ -76,6 +77,7 @@ class MirrorImages:
         transmitter: ArrayLike,
         *,
         slack_m: float | None = None,
+        to_edges: bool = False,
         max_chains: float = MOST_CHAINS,
         device: DeviceLike = None,
     ) -> None:
@@ -91,7 +93,7 @@ class MirrorImages:
         self.transmitter = np.asarray(transmitter, float)
         self.device = resolve(device)
         self._on_device = _patches_on_device(
-            patches, patches.tolerance_m if slack_m is None else slack_m, self.device
+            patches, patches.tolerance_m if slack_m is None else slack_m, to_edges, self.device
         )
         self._kept = [
             Chains(np.zeros((1, 0), np.int32), self.transmitter[None], np.zeros((1, 3)), np.array([2.0]))
@@ -352,7 +354,7 @@ def _cones(chains: Chains, where: wp.Device) -> Any:
     return filled(kernels.Cones, where, apex=chains.image, axis=chains.axis, sine=chains.sine)
 
 
-def _patches_on_device(patches: PlanarPatches, slack_m: float, where: wp.Device) -> Any:
+def _patches_on_device(patches: PlanarPatches, slack_m: float, to_edges: bool, where: wp.Device) -> Any:
     """The kernels' view of patches: boxes and balls ``slack_m`` too large, and a binary tree of the boxes."""
     low, high = patches.boxes[:, 0] - slack_m, patches.boxes[:, 1] + slack_m
     order = _along_curve(0.5 * (low + high))
@@ -375,6 +377,7 @@ def _patches_on_device(patches: PlanarPatches, slack_m: float, where: wp.Device)
         node_half=0.5 * (tree_high - tree_low),
         level=np.cumsum([0, *(len(a) for a, _ in levels[:-1])]),
         two_sided=patches.two_sided,
+        to_edges=to_edges,
     )
 
 

@@ -130,9 +130,10 @@ def exact_paths(
     """
     patches, parts = images.patches, list[MirrorPaths]()
     for k, ways in enumerate(images.search(receivers, order, progress)):
+        ways = _off_edges(images, receivers, ways)
         for j in range(k):
             ways = ways.take(patches.contains(ways.patch[:, j], ways.point[:, j]))
-        free = ways.unobstructed(images.device)
+        free = ways.unobstructed(images.device, beyond_m=1e-8)  # rounding does not decide
         found = [ways.take(free)]
         if walls is not None:
             found.append(ways.take(~free).through(walls)[1])
@@ -142,6 +143,20 @@ def exact_paths(
             parts.append(described(own.take(once), order, walls))
     paths = MirrorPaths.joined(parts)
     return paths.take(np.argsort(paths.receiver, kind="stable"))
+
+
+def _off_edges(images: MirrorImages, receivers: np.ndarray, ways: Ways) -> Ways:
+    """``ways``, those through the edge of two mirrors as they are a micrometre beside it: over the one that comes first there, and
+    none where the mirrors are not turned to each other."""
+    at_edge = (np.diff(ways.point, axis=1) == 0).all(axis=2).any(axis=1)
+    if not at_edge.any():
+        return ways
+    own = np.unique(ways.row[at_edge])
+    beside_m = 1e-6 * np.array([0.57, 0.65, 0.5])
+    near = images.candidates(receivers[own] + beside_m, ways.patch.shape[1])
+    near = near.take((np.linalg.norm(np.diff(near.point, axis=1), axis=2) < 1e-4).any(axis=1))
+    near = replace(near.over(-1, receivers[own[near.row]]), row=own[near.row])
+    return Ways.joined([ways.take(~at_edge), near])
 
 
 def zone_paths(

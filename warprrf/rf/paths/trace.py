@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_count, checked, whole
 from warprrf.device import DeviceLike, Progress, silent
-from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, GeometryLike, as_mesh
+from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, GeometryLike, Mesh, as_mesh
 from warprrf.geometry.planar_patches import planar_patches
 from warprrf.rf.em.absorption import Gas
 from warprrf.rf.em.fresnel import surface_table
@@ -80,8 +80,8 @@ def trace_paths(
         then by length; then those over edges.
 
     Raises:
-        ValueError: on a position that is NaN, outside a closed room, inside a solid, or within the reactive near
-            field of the transmitter; on a frequency that is not positive or outside a material's band, or
+        ValueError: on a position that is NaN, outside a closed room, inside a solid, on the same surface as the other end, or
+            within the reactive near field of the transmitter; on a frequency that is not positive or outside a material's band, or
             another order; if more than :data:`~warprrf.rf.paths.images.MOST_CHAINS` chains of mirrors would be tried
             (:class:`MirrorTracer` takes another limit).
 
@@ -167,8 +167,25 @@ def _check_question(
     check_positions(mesh, ends.transmitters, receivers, wavelength_m, on_surfaces=True, device=device)
     modelled = {"transmission": transmissions > 0, "diffraction": diffractions > 0}
     for source, own in ends.groups():
+        _refuse_along_surfaces(mesh, source, ends.receivers[own], device)
         warn_of_unmodelled(
             mesh, source, ends.receivers[own], frequency_hz=frequency_hz, device=device, **modelled
+        )
+
+
+def _refuse_along_surfaces(mesh: Mesh, source: np.ndarray, points: np.ndarray, device: DeviceLike) -> None:
+    """Refuse receivers (R, 3) on the same flat surface as the transmitter (3,): ways between them lie in it, and whether it stops
+    them is a matter of rounding."""
+    on_m = 1e-7
+    normal = mesh.face_normals[mesh.faces_at(source[None], on_m)[1]]
+    if len(normal) == 0:
+        return
+    along = (np.abs((points - source) @ normal.T) < on_m).any(axis=1)
+    along[along] = mesh.distance(points[along], device=device) < on_m
+    if along.any():
+        raise ValueError(
+            f"receivers: {points[along][0].tolist()} lies on the same surface as the transmitter, {source.tolist()} "
+            f"({int(along.sum())} such in all), along which nothing is known to be free; expected one of them a millimetre off it"
         )
 
 
@@ -217,7 +234,9 @@ class MirrorTracer:
             self.walls = Walls.of_slabs(
                 self.mesh, eta, thickness, self.wavelength_m, transmissions, clearance, device
             )
-        self.images = MirrorImages(self.patches, self.transmitter, max_chains=max_chains, device=device)
+        self.images = MirrorImages(
+            self.patches, self.transmitter, to_edges=True, max_chains=max_chains, device=device
+        )
         self._fixed = fixed_parameters(materials, self.table, self.frequency_hz, self.images.device)
         self.edges: EdgeFinder | None = None
         if diffractions:

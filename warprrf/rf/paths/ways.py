@@ -65,16 +65,16 @@ class Ways(Rows):
                 place[:, leg] += (lift_m * side)[:, None] * normal
         return begin, end
 
-    def unobstructed(self, device: DeviceLike) -> np.ndarray:
+    def unobstructed(self, device: DeviceLike, beyond_m: float = 0.0) -> np.ndarray:
         """Whether every leg of each is free, shape ``(L,)``.
 
         A leg is also drawn out by the clearance that :meth:`Mesh.visible` leaves at ends, so that whatever lies further off than
-        the tolerance is met.
+        the tolerance is met; and by ``beyond_m`` [m], so that what stands on a mirror where the way meets it is.
         """
         begin, end = self.legs(self.patches.tolerance_m)
         toward = headings(end - begin)[0]
-        begin[:, 1:] -= ENDPOINT_CLEARANCE * toward[:, 1:]
-        end[:, :-1] += ENDPOINT_CLEARANCE * toward[:, :-1]
+        begin[:, 1:] -= (ENDPOINT_CLEARANCE + beyond_m) * toward[:, 1:]
+        end[:, :-1] += (ENDPOINT_CLEARANCE + beyond_m) * toward[:, :-1]
         free = np.ones(len(self), bool)
         for k in range(begin.shape[1]):
             own = np.flatnonzero(free)

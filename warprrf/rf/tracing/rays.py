@@ -96,6 +96,8 @@ class RayGrid:
     Args:
         sub_pixels: square root of the rays per pixel.
         loss_per_m: absorption by the air [neper/m].
+        nearest_m: distance of a source from what it lights counts as no less [m]; with 0 it counts as it is, and no ray sees more
+            than half of what the source sends.
         dtype: precision of angles and of light.
     """
 
@@ -106,11 +108,12 @@ class RayGrid:
         sub_pixels: int,
         *,
         loss_per_m: float = 0.0,
+        nearest_m: float = NEAREST_M,
         dtype: Any = np.float32,
         device: DeviceLike = None,
     ) -> None:
         self.surface, self.shape, self.sub_pixels, self.dtype = surface, shape, sub_pixels, np.dtype(dtype)
-        self.loss_per_m = float(loss_per_m)
+        self.loss_per_m, self.nearest_m = float(loss_per_m), nearest_m
         self.device = resolve(device)
         self.directions, solid_angle = sub_pixel_directions(shape, sub_pixels)
         self.solid_angle = solid_angle.astype(self.dtype)
@@ -203,7 +206,11 @@ class RayGrid:
         inputs = [
             *self.surface.on_device(where, real), np.zeros(0, np.int32) if ray is None else ray,
             np.reshape(sources, (-1, 3)), hits.origins, each, hits.directions, hits.face, hits.range_m, hits.solid_angle,
-            NEAREST_M, self.loss_per_m, *found,
+            self.nearest_m, self.loss_per_m, *found,
         ]  # fmt: skip
         launch(illumination.build(real), count, inputs, device=where)
-        return Light(*(a.numpy() for a in found))
+        light = Light(*(a.numpy() for a in found))
+        if self.nearest_m == 0.0:
+            met_m = hits.range_m if ray is None else hits.range_m[ray]
+            np.minimum(light.strength, light.angle[:, 1] / (8.0 * np.pi * met_m**2), out=light.strength)
+        return light
