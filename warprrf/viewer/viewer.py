@@ -223,7 +223,9 @@ class Viewer:
             self._rays.show(found, self._channel.range_db.value)
         page.server.flush()
         carried = abs(found.frequency_hz - self.subject.carrier_hz) > 0.5 * answers.CARRIER_STEP_HZ
-        gain = f"**{found.total_db:.1f} dB** path gain" if np.isfinite(found.total_db) else "**nothing** arrives"
+        gain = (
+            f"**{found.total_db:.1f} dB** path gain" if np.isfinite(found.total_db) else "**nothing** arrives"
+        )
         page.say(
             f"{gain} at {', '.join(f'{x:.2f}' for x in found.receiver)} m"
             + (f", carried over to {found.frequency_hz / 1e9:g} GHz" if carried else "")
