@@ -33,7 +33,7 @@ WHAT = {"spectrum": "one spectrum", "horn": "readings of a turned horn"}
 
 
 def _dated(title: str, *names: str) -> str:
-    """``title`` of a column, which says so if the results ``names`` are older than what they depend on."""
+    """``title`` of a column, or a figure, which says so if the results ``names`` are older than what they depend on."""
     return f"{title}, by an earlier version of the code" if any(map(older, names)) else title
 
 
@@ -44,18 +44,19 @@ def _headline_less() -> str:
         next(r for r in rows if r["readings"] == name) for name in ("1 spectrum, mean of 20", "horn", "power")
     )
     at = [r for r in read("locate")["rows"] if r["measured"].startswith(("spectrum", "horn"))]
-    lines = [
-        ["one spectrum of 60 x 120 pixels", f"spectra: PSNR {one['psnr_db']:.1f} dB"],
-        ["readings of a horn of unknown gain, turned at ten places", f"spectra: PSNR {horn['psnr_db']:.1f} dB"],
-        ["total power at 50 places, by a meter of unknown gain", f"total power: error {power['total_rms_db']:.1f} dB rms"],
-        *(
-            [f"50 spectra, geometry {', '.join(given)}; at the new receiver {WHAT[seen]}",
-             f"position of the receiver: error {r['median_cm']:.0f} cm (median), {r['p90_cm']:.0f} cm (90th percentile)"]
-            for r, (seen, *given) in ((r, r["measured"].split(", ")) for r in at)
-        ),
+    fitted = [
+        ("one spectrum of 60 x 120 pixels", f"spectra: PSNR {one['psnr_db']:.1f} dB"),
+        ("readings of a horn of unknown gain, turned at ten places", f"spectra: PSNR {horn['psnr_db']:.1f} dB"),
+        ("total power at 50 places, by a meter of unknown gain", f"total power: error {power['total_rms_db']:.1f} dB rms"),
     ]  # fmt: skip
-    title = _dated("predicted for receivers held out", "measurements", "locate")
-    return markdown(("measured", title), lines)
+    located = [
+        (f"50 spectra, geometry {', '.join(given)}; at the new receiver {WHAT[seen]}",
+         f"position of the receiver: error {r['median_cm']:.0f} cm (median), {r['p90_cm']:.0f} cm (90th percentile)")
+        for r, (seen, *given) in ((r, r["measured"].split(", ")) for r in at)
+    ]  # fmt: skip
+    lines = [(what, _dated(found, "measurements")) for what, found in fitted]
+    lines += [(what, _dated(found, "locate")) for what, found in located]
+    return markdown(("measured", "predicted for receivers held out"), lines)
 
 
 @entry("headline-measured")
