@@ -133,8 +133,7 @@ def test_a_scene_far_from_zero_is_drawn_as_one_at_zero():
         np.testing.assert_allclose(far, near, atol=1e-4)
 
 
-@browsed
-def test_where_nothing_arrives_no_gain_is_made_up(page, tmp_path, capsys):
+def test_where_nothing_arrives_no_gain_is_made_up(tmp_path, capsys):
     dark = dataclasses.replace(
         make.bistatic(),
         effects=wr.Effects(mirrors=0, scatterings=0, transmissions=0, diffractions=0, residual=False),
@@ -144,13 +143,10 @@ def test_where_nothing_arrives_no_gain_is_made_up(page, tmp_path, capsys):
     assert answers.answer(dark, place, [dark.transmitter], asked).total_db == -np.inf
     viewer = wr.view(make.room_mesh()[0], dark, port=8194)
     try:
-        with _beside(page, viewer.url):
-            _until(lambda: viewer.clients, 60)
-            viewer.receiver = place
-            viewer.wait()
-            assert "nothing arrives" in viewer.message.replace("*", "")
-            assert np.isnan(viewer._channel._profile.data[1]).all()
-            time.sleep(2.0)  # the page draws it, and says what it cannot draw
+        viewer.receiver = place
+        viewer.wait()
+        assert "nothing arrives" in viewer.message.replace("*", "")
+        assert np.isnan(viewer._channel._profile.data[1]).all()
     finally:
         viewer.close()
     dark.save(tmp_path / "dark.safetensors")
