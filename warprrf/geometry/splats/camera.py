@@ -118,9 +118,7 @@ class Camera:
         """Which points ``(N, 3)`` have a pixel and lie deeper than ``nearest_m``, shape ``(N,)`` bool; and the row and column
         of each, shape ``(N, 2)`` int, 0 for the others."""
         uv, depth = self.project(points)
-        if (
-            self.kind == "spherical"
-        ):  # whose last column and row end at azimuth pi and at the pole, which every point has
+        if self.kind == "spherical":  # azimuth pi and the pole are of the last column and row
             uv = np.minimum(uv, np.nextafter([self.width, self.height], 0.0))
         with np.errstate(invalid="ignore"):
             inside = (
