@@ -152,6 +152,8 @@ def test_a_changed_setting_is_not_served_from_the_old_run(whole, made, lobby_sce
     centres = completed.mesh.triangles.mean(axis=1)
     assert np.median(lobby_scene.mesh.distance(centres)) < 0.03
     assert completed.patches.area.sum() > 0.5 * completed.mesh.areas.sum()
+    wider = replace(SMALL, surface=replace(SMALL.surface, patch_distance_m=0.07))
+    assert steps(made(whole[0], config=wider)[1]) == {"depth", "stereo", "segments", "surface"}
     less = replace(SMALL, stereo=False)
     other, told = made(whole[0], held_out=VIEWS[4:6], iterations=2, config=less)
     assert steps(told) == {"planes", "refine", "depth", "surface"}  # the photos' poses stay
@@ -237,7 +239,7 @@ def seen():
     sh = 0.2 * rng.standard_normal((len(splats), 16, 3))
     splats = replace(splats, sh=sh, scales=[0.09, 0.05, 0.02] + 0 * splats.scales)
     cameras = {f"{k}.jpg": look([4 + k, 3 - 2 * k, 1 + k * k], [1, 1.5, 0.5]) for k in range(3)}
-    guessed = ("scale: nobody measured one", "plain")
+    guessed = ("scale: nobody measured one", "floor: the lowest points", "plain")
     return Reconstruction(splats, box.mesh, cameras, patches=box, guessed=guessed)
 
 

@@ -300,7 +300,8 @@ def _steps(
     if measured:
         inputs.append({name: [file.path, file.unit_m] for name, file in measured.items()})
     else:
-        made_by = [steps.key("refined"), config.stereo, config.segments, config.surface.depth_pixels]
+        surface_read = config.surface.depth_pixels, config.surface.patch_distance_m
+        made_by = [steps.key("refined"), config.stereo, config.segments, *surface_read]
         rendered = _kept(steps, "depth", depth, made_by)
         inputs.append(steps.key("depth"))
     kept = _kept(steps, "surface", surface, inputs)

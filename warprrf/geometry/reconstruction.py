@@ -217,7 +217,9 @@ class Reconstruction:
         moved = self.transformed(scale=scale, rotation=rotation, shift=shift)
         moved.scale_rms_m, moved.metric = rms_m, True
         # Known now:
-        moved.guessed = tuple(line for line in self.guessed if not line.startswith(("scale:", "up:")))
+        moved.guessed = tuple(
+            line for line in self.guessed if not line.startswith(("scale:", "up:", "floor:"))
+        )
         return moved
 
     def save(self, folder: str | os.PathLike[str]) -> None:

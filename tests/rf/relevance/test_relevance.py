@@ -210,3 +210,9 @@ def test_a_fitted_field_is_judged_by_its_parameters(slabs, data):
     assert set(found.lobes) <= set(field.parameters.lobes)
     with pytest.raises(ValueError, match="frequency_hz"):
         relevance(field, receivers=RECEIVERS, frequency_hz=140e9)
+
+
+def test_a_fit_passes_slabs_and_goes_over_edges_where_that_was_found_relevant(slabs, data):
+    found = relevance(slabs, receivers=RECEIVERS[:1], **OPTIONS)
+    field = RadioField.fit(slabs, data, relevance=replace(found, model=Effects(transmissions=2)))
+    assert (field.effects.transmissions, field.effects.diffractions) == (2, 1)

@@ -11,8 +11,10 @@ from views import lobby_cameras
 import warprrf as wr
 from warprrf.geometry.photos.config import ReconstructionConfig, RefineConfig
 from warprrf.geometry.photos.posed import sfm
+from warprrf.geometry.photos.posed.measured_depth import range_maps
 from warprrf.geometry.photos.posed.photo_files import find_photos, mask_beside, mask_name
 from warprrf.geometry.photos.posed.poses import KnownPoses, find_depth, match_photos, read_depth, read_poses
+from warprrf.geometry.pipeline import _known_poses
 from warprrf.geometry.scans import SurfaceConfig
 
 image = pytest.importorskip("PIL.Image")
@@ -217,6 +219,20 @@ def test_measured_depth_is_fused_within_a_centimetre(rgbd, truth, tmp_path):
     distance = truth.distance(centres)
     assert rec.mesh.areas.sum() > 30 and np.average(distance < 0.03, weights=rec.mesh.areas) > 0.9
     assert np.median(np.repeat(distance, np.ceil(100 * rec.mesh.areas).astype(int))) < 0.01
+
+
+def test_measured_depth_counts_where_its_photo_is_not_masked(rgbd, tmp_path):
+    folder = tmp_path / "photos"
+    shutil.copytree(rgbd, folder)
+    mask = np.full((480, 640), 255, np.uint8)
+    mask[:, :160] = 0
+    image.fromarray(mask).save(folder / "frame-000001.color.mask.png")
+    known = _known_poses(folder, None, find_photos(folder), True)
+    sparse = sfm.structure_from_motion(folder, workspace=tmp_path / "w", poses=known)
+    maps = {name: measured for name, (_, measured) in range_maps(sparse, known.depth).items()}
+    masked, whole = maps["frame-000001.color.jpg"], maps["frame-000002.color.jpg"]
+    assert masked.shape == (240, 320) and not masked[:, :79].any()
+    assert (masked[:, 81:] > 0).mean() > 0.9 and (whole[:, :79] > 0).mean() > 0.9
 
 
 def test_depth_that_contradicts_the_poses_is_refused(rgbd, tmp_path):

@@ -27,7 +27,7 @@ from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.readings import Readings, path_weights
 from warprrf.rf.tracing.model import SETS, Effects, Layout
 from warprrf.rf.tracing.records import Bins, Materials
-from warprrf.rf.tracing.render import PathGains, irradiance
+from warprrf.rf.tracing.render import PathGains, irradiance, materials_of
 from warprrf.rf.tracing.tracer import SPECULAR
 
 RX = RECEIVERS[0]
@@ -288,3 +288,13 @@ def test_many_places_are_fitted_to_as_each_alone(scene, kinds, monkeypatch):
         for mine, theirs in zip(found, alone, strict=True):
             np.testing.assert_allclose(mine, theirs, rtol=1e-4, atol=1e-5 * np.abs(theirs).max())
     assert np.abs(together[0] - asked(observations[1:])[0]) > 1.0
+
+
+def test_light_over_several_surfaces_is_kept_apart_by_its_most_scatterings(field):
+    view = field.view(RECEIVERS[0])
+    o = observation(view, pixels(view), field.floor)
+    twice, thrice = (
+        o.further(effects, materials_of(view.tracer, field.parameters, effects))[1].sum()
+        for effects in (replace(SETS["room"], scatterings=count) for count in (2, 3))
+    )
+    assert thrice > 1.01 * twice > 0

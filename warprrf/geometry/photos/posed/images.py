@@ -41,6 +41,13 @@ class PosedPhotos:
         return PosedPhotos(*map(list, parts))
 
 
+def shown_at(mask: np.ndarray, camera: Camera) -> np.ndarray:
+    """The pixels that take part where a photo has ``mask`` (H, W), at the size of ``camera``, bool."""
+    rows, columns = ((np.arange(n) + 0.5) / n for n in (camera.height, camera.width))
+    inside = (rows * mask.shape[0]).astype(int), (columns * mask.shape[1]).astype(int)
+    return ~mask[np.ix_(*inside)]
+
+
 @dataclass(frozen=True)
 class GreyPhotos:
     """Grey photos.

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from warprrf.geometry.photos.posed.photo_files import read_photo, spread
+from warprrf.geometry.photos.posed.images import shown_at
+from warprrf.geometry.photos.posed.photo_files import read_mask, read_photo, spread
 from warprrf.geometry.photos.posed.poses import DepthFile, read_depth
 from warprrf.geometry.photos.posed.sparse import SparseModel
 from warprrf.geometry.photos.posed.undistort import stored_pixels
@@ -17,7 +18,7 @@ from warprrf.rows import distinct_rows, sums_of
 
 
 def range_maps(sparse: SparseModel, files: Mapping[str, DepthFile]) -> dict[str, tuple[Camera, np.ndarray]]:
-    """Cameras of about the size of their depth images, and Euclidean ranges [m], 0 where unknown; by photo."""
+    """Cameras of about the size of their depth images, and Euclidean ranges [m], 0 where unknown or masked; by photo."""
     found = {}
     views = 120  # most maps that are used, spread over all
     for name in spread((name for name in sparse.cameras if name in files), views):
@@ -34,6 +35,8 @@ def range_maps(sparse: SparseModel, files: Mapping[str, DepthFile]) -> dict[str,
         columns, rows = stored_pixels(lens, np.column_stack([x.ravel(), y.ravel()]), files[name].turns).T
         place = (rows * height / lens.height).astype(int), (columns * width / lens.width).astype(int)
         known = (rows >= 0) & (columns >= 0) & (place[0] < height) & (place[1] < width)
+        if (mask := read_mask(sparse.photos[name])) is not None:
+            known &= shown_at(mask, view).ravel()
         z = np.zeros(x.size, dtype=np.float32)
         z[known] = depth[place[0][known], place[1][known]]
         found[name] = view, z.reshape(x.shape) * np.sqrt(1 + x**2 + y**2)

@@ -16,11 +16,11 @@ import numpy as np
 from warprrf.device import DeviceLike, Progress, silent, threads
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.config import ReconstructionConfig
-from warprrf.geometry.photos.posed.images import PosedPhotos, lens_matrix
+from warprrf.geometry.photos.posed.images import PosedPhotos, lens_matrix, shown_at
 from warprrf.geometry.photos.posed.photo_files import spread
 from warprrf.geometry.photos.surface.completion import complete
 from warprrf.geometry.photos.surface.segments import segments_of, with_segments
-from warprrf.geometry.photos.surface.stereo import kept_pixels, mended
+from warprrf.geometry.photos.surface.stereo import mended
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.planes import Plane
 from warprrf.geometry.rays import open3d
@@ -110,7 +110,7 @@ def _flat(
     with ThreadPoolExecutor(threads()) as pool:
         cut = pool.map(segments_of, photos.images, views)
         for k, (depth, sure, segment, view) in enumerate(zip(depths, proved, cut, views, strict=True)):
-            result.append(with_segments(depth, sure, kept_pixels(photos, k, view), segment, view))
+            result.append(with_segments(depth, sure, shown_at(photos.mask(k), view), segment, view))
             progress("segments", len(result), len(views))
     return result
 

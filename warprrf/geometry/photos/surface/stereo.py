@@ -15,7 +15,14 @@ import warp as wp
 from scipy import ndimage
 
 from warprrf.device import DeviceLike, Progress, filled, launch
-from warprrf.geometry.photos.posed.images import GreyPhotos, PosedPhotos, layout, lens_matrix, projections
+from warprrf.geometry.photos.posed.images import (
+    GreyPhotos,
+    PosedPhotos,
+    layout,
+    lens_matrix,
+    projections,
+    shown_at,
+)
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.patch_match import UNKNOWN, Others, match
 from warprrf.kernels.photo_consistency import count_votes
@@ -65,7 +72,7 @@ def mended(
     for k, (view, depth, plane) in enumerate(zip(views, depths, planes, strict=True)):
         moved = (plane[..., 0] != started[k][..., 0]) | (depth == 0)
         there = np.where(moved, 1 / (np.maximum(plane[..., 0], 1e-6) * ahead(view)), depth)
-        found.append(np.where((costs[k] < PROVED) & kept_pixels(photos, k, view), there, 0.0))
+        found.append(np.where((costs[k] < PROVED) & shown_at(photos.mask(k), view), there, 0.0))
     result, proved = [], []
     tolerance = 0.015  # up to this part of the range two depths that photos found agree; one of Gaussians, up to twice as much
     for k, (view, depth) in enumerate(zip(views, depths, strict=True)):
@@ -81,14 +88,6 @@ def mended(
 def ahead(camera: Camera) -> np.ndarray:
     """Depth along the optical axis over range, shape ``(height, width)``."""
     return camera.directions() @ camera.rotation[2]
-
-
-def kept_pixels(photos: PosedPhotos, number: int, camera: Camera) -> np.ndarray:
-    """The pixels of a photo that are not masked, at the size of ``camera``, bool."""
-    mask = photos.mask(number)
-    rows, columns = ((np.arange(n) + 0.5) / n for n in (camera.height, camera.width))
-    inside = (rows * mask.shape[0]).astype(int), (columns * mask.shape[1]).astype(int)
-    return ~mask[np.ix_(*inside)]
 
 
 def _sharpness(pixels: Sequence[np.ndarray]) -> np.ndarray:

@@ -145,9 +145,9 @@ def _learned(
     """
     t = Training.of(surface, data, places, options, progress)
     given = t.candidates[0] if len(t.candidates) == 1 else None
-    decides = options.effects == "auto" and options.relevance is None
+    rare = None if options.effects == "auto" and options.relevance is None else t.candidates[0]
     started = time.perf_counter()
-    seen, sought = look(surface, [places[k] for k in t.deciding], effects=given, decides=decides)
+    seen, sought = look(surface, [places[k] for k in t.deciding], effects=given, rare=rare)
     tracing_s = time.perf_counter() - started
     data, zeros = with_zeros(data, seen)
     t = replace(t, data=data).as_sought(sought).and_at(t.deciding, seen)
@@ -160,7 +160,7 @@ def _learned(
         t = t if keeps else t.without_records()
         again = time.perf_counter()
         more, _ = look(
-            surface, [places[k] for k in others], effects=choice.effects, decides=False, keeps=keeps
+            surface, [places[k] for k in others], effects=choice.effects, rare=choice.effects, keeps=keeps
         )
         tracing_s += time.perf_counter() - again
         t = t.and_at(others, more)

@@ -260,7 +260,7 @@ class Observation:
     def further(self, effects: Effects, materials: Materials) -> tuple[np.ndarray, np.ndarray]:
         """What comes over more than one surface or through slabs, by the group that scatters it last or sends it on: groups
         ``(C,)``, and readings in units of the floor, shape ``(C, N)``."""
-        key = tuple(sequences(effects)), materials.parameters.values
+        key = tuple(sequences(effects)), effects.scatterings, materials.parameters.values
         return self._kept.get(key, lambda: self._further(effects, materials))
 
     def _further(self, effects: Effects, materials: Materials) -> tuple[np.ndarray, np.ndarray]:

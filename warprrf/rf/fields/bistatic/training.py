@@ -61,7 +61,7 @@ def trace(
     places: Sequence[Place],
     *,
     effects: Effects | None = None,
-    decides: bool = True,
+    rare: Effects | None = None,
     keeps: bool = True,
     sub_pixels: int = SUB_PIXELS,
     client: Any = None,
@@ -74,7 +74,7 @@ def trace(
     Args:
         effects: which tables are traced at once (others when they are first asked for); None for single bounces, and for
             as many mirrors up to 3 as can be searched (2 in a city).
-        decides: whether paths pass slabs and go over edges as the scene needs it (:func:`needed`), else as ``effects`` say.
+        rare: effects as which paths pass slabs and go over edges; None for as the scene needs it (:func:`needed`).
         keeps: whether records are kept, if they are not too many; else they are traced whenever they are asked for.
         sub_pixels: square root of the rays per pixel.
         client: a ``dask.distributed.Client`` whose workers trace, to the same bits; this process by default.
@@ -86,8 +86,10 @@ def trace(
     """
     tell = progress or (lambda *_: None)
     wanted = replace(SETS["single"], mirrors=3) if effects is None else effects
-    if decides:
+    if rare is None:
         wanted = needed(wanted, surface, places, device)
+    else:
+        wanted = replace(wanted, transmissions=rare.transmissions, diffractions=rare.diffractions)
     keeps = keeps and rays_of(places, sub_pixels) <= MOST_KEPT
     together: dict[tuple[object, ...], list[int]] = {}  # places under one transmitter
     for k, place in enumerate(places):
