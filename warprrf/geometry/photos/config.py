@@ -23,7 +23,8 @@ class RefineConfig:
 
     Attributes:
         iterations: steps, one photo each.
-        downscale: photos are averaged over squares of this many pixels while training.
+        downscale: photos are averaged over squares of this many pixels, of more at first where they are large, and of none in
+            the last steps.
         fit_exposure: whether every photo has a gain for each colour of its own.
         mean_rate: metres a step at the start.
         densify_from, densify_every: in iterations.
@@ -58,12 +59,12 @@ class ReconstructionConfig:
             ``"SIMPLE_RADIAL"``, ``"RADIAL"`` and ``"OPENCV"`` that explains the photos. A fisheye has to be named.
         max_pixels: undistorted photos are reduced to about so many pixels, 10,000 at least.
         planes: how planes are found among sparse points.
-        sweep: whether planes are corrected and completed by comparing the photos.
+        sweep: whether planes are corrected and completed by comparing the photos; level ones are sought where the scale is known.
         plain: whether surfaces without features are found from their edges.
         gaussians: Gaussians to start the refinement from (about).
         refine: photometric refinement.
-        stereo: whether depth maps are mended by comparing the photos.
-        segments: whether they are then made flat where one colour shows one surface.
+        stereo: whether depth maps are mended by comparing the photos, and emptied where neither photos nor planes hold them.
+        segments: whether they are then made flat where one colour shows one surface. Measured depth is taken as it is.
         surface: from Gaussians to a mesh.
         completion: whether holes are closed and borders straightened where the planes allow it.
     """

@@ -35,7 +35,8 @@ class Effects:
         scatterings: most scatterings on a path, 0 to 3; from the second on surfaces light each other evenly over half a
             metre.
         mirror_scatter: whether mirrors light surfaces that scatter.
-        scatter_mirror: whether lit surfaces are seen in mirrors, and through slabs. Sionna RT has no such paths.
+        scatter_mirror: whether lit surfaces are seen in mirrors, and through slabs if ``transmissions`` are not 0. Sionna RT
+            has no such paths.
         transmissions: most slabs that a path passes, 0 to 8.
         diffractions: most edges on a path, 0 or 1; beside one mirror or one slab at most, and no scattering.
         residual: whether what surfaces scatter differs within their group.
@@ -89,8 +90,8 @@ class Parameters:
             (2007), Sionna RT's, do not.
         log_gain: ln of a gain common to all paths (an uncalibrated receiver).
         roughness: power of the carrier with which roughness counts; 2 by Ament (1953).
-        log_through: ln of the share of what its slab lets through, by permittivity and thickness as far as they are known, that
-            it does let through, shape ``(G,)``; by default 0.
+        log_through: ln of the power that passes its slab over what permittivity and thickness say, or, where those are not
+            known, over what both faces let pass, shape ``(G,)``; by default 0.
         log_gains: ln of the unknown gains of measuring chains, shape ``(C,)``; only while a fit lasts.
 
     Raises:

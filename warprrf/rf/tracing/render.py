@@ -89,8 +89,8 @@ class PathGains:
 
 
 def materials_of(tracer: Tracer, p: Parameters, effects: Effects) -> Materials:
-    """Parameters of groups under a transmitter as kernels take them, with what elements send by ``effects``; the last ones are
-    kept."""
+    """Parameters of groups under a transmitter as kernels take them, with what elements send by ``effects``: light between
+    surfaces is found here (:func:`irradiance`). The last ones are kept."""
     surface = tracer.surface
 
     def make() -> Materials:
@@ -181,8 +181,8 @@ class Interreflection:
 
 def irradiance(tracer: Tracer, p: Parameters, effects: Effects) -> np.ndarray | None:
     """Irradiance of elements' sides by surfaces that scattered before, under parameters of groups, in units in which the
-    transmitter gives cos(theta_i) / d1^2 [1/m^2], shape ``(E,)``: as much even light as would be scattered alike; None where
-    ``effects`` hold no second scattering."""
+    transmitter gives cos(theta_i) / d1^2 [1/m^2], shape ``(E,)``: of even light that they scatter as strongly as what they get, at
+    whatever angles; None where ``effects`` hold no second scattering."""
     if effects.scatterings < 2:
         return None
     most, group, sides = effects.transmissions, tracer.surface.side_group, tracer.surface.element_sides

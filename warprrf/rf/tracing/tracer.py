@@ -98,7 +98,7 @@ class View:
 
     def cell(self, ray: np.ndarray) -> np.ndarray:
         """Surface cell that each ray of index ``ray`` (N,) meets, shape ``(N,)``; all must meet something."""
-        hits = self.hits if self.keeps else replace(self.hits)
+        hits = self.hits if self.keeps else replace(self.hits)  # which keeps nothing of its own yet
         return self.tracer.surface.cells.cell[self.tracer.grid.tile(hits)[ray]]
 
     @property
@@ -247,7 +247,7 @@ class Tracer:
         return self.kept.get("slabs", lambda: self.surface.slabs(self.frequency_hz)[:2])
 
     def paths(self, receivers: np.ndarray, effects: Effects, progress: Progress | None = None) -> MirrorPaths:
-        """Line of sight and mirror paths of ``receivers`` (R, 3) that ``effects`` want."""
+        """Line of sight and mirror paths of ``receivers`` (R, 3) that ``effects`` want, through slabs and over edges too."""
         most = effects.transmissions
         walls = self.walls(most) if most else None
         found = self._delayed(

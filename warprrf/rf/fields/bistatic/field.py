@@ -92,9 +92,9 @@ class BistaticField(RadioField):
         effects: what it models.
         parameters: of the groups; those of one material are alike.
         material: of each group, shape ``(G,)``.
-        residual: ln gain of each surface cell over its group, for single bounces and for light that it sends on, shape
+        residual: ln gain of each surface cell over its group, lit straight by the transmitter and lit in any other way, shape
             ``(2, X)``; see :mod:`warprrf.rf.fields.bistatic.residual`.
-        errors: how wrong it is; None if it was fitted to fewer receivers than that takes.
+        errors: how wrong it is; None if that was not learned: of few receivers, readings, spectra with gaps, a quick fit.
         sub_pixels: square root of the rays per pixel.
 
     The others are those of :class:`RadioField`.
@@ -446,8 +446,8 @@ class BistaticField(RadioField):
         return np.asarray(ends.shaped(np.stack(found)))
 
     def view(self, receivers: ArrayLike, transmitter: ArrayLike | None = None) -> View:
-        """What one receiver (3,) sees of the geometry under one transmitter (3,), whatever the materials: the costly part
-        of a spectrum.
+        """What one receiver (3,) sees of the geometry under one transmitter (3,), whatever the materials: rays and
+        mirror paths. What scatters is traced when it is first asked for, and kept in it.
 
         Raises:
             ValueError: as for :meth:`spectrum`, and for several.

@@ -1,8 +1,8 @@
 """Fitting a bistatic field: trace what receivers see, observe what was read, decide which effects count and which groups are of
 one material, fit parameters of materials, and find what differs within them and how wrong all that is.
 
-:func:`fit` reads as that list. Each step is a function of a :class:`~warprrf.rf.fields.bistatic.training.Training`; what it
-decides is handed on, and noted in the report.
+:func:`_learned` reads as that list, :func:`fit` is what stands before and after. Each step is a function of a
+:class:`~warprrf.rf.fields.bistatic.training.Training`; what it decides is handed on, and noted in the report.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from warprrf.rows import distinct_rows
 
 SHORT_STEPS = 10  # of a fit that only decides about something
 BETTER = 0.995
-"""Share to which further effects must lower the mean square error of receivers held out."""
+"""Share to which further effects must lower the mean square error, of receivers held out where there are any."""
 
 
 def fit(
@@ -184,7 +184,7 @@ def _learned(
 
 
 def choose(t: Training) -> Solution:
-    """Effects, and which groups are of one material."""
+    """Effects, and which groups are of one material: those of known names are, each of its own."""
     material = t.surface.material
     start = t.start(material)
     trials = [Solution(effects, material, start, np.zeros((0, 0)), []) for effects in t.candidates]

@@ -206,7 +206,7 @@ class Training:
         return np.setdiff1d(np.arange(len(self.places)), self.held)
 
     def few(self, times: int) -> np.ndarray:
-        """Places that fits which only decide about something learn from, those of every chain among them."""
+        """Places that trial fits learn from, ``times`` :data:`MOST_TO_CHOOSE` at most; one of every chain is among them."""
         others = np.setdiff1d(self.kept, self.always)
         chosen = others[: max(times * MOST_TO_CHOOSE - len(self.always), 0)]
         return np.union1d(self.always, chosen).astype(int)
