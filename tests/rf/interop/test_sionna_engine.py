@@ -84,8 +84,13 @@ def test_more_bounces_bring_more_power_and_simulate_says_how(scene):
 
 
 def test_a_scene_needs_no_file_and_its_own_devices_play_no_part(few, sionna, scene):
+    own = [replace(scene.materials[0], name="rx"), *scene.materials[1:]]
     bare = Scene(
-        scene.mesh, scene.materials, scene.face_material, transmitters={"tx": TX + 1}, receivers={"rx": SEES}
+        scene.mesh,
+        own,
+        scene.face_material,
+        transmitters={"tx": TX + 1},
+        receivers={"one": SEES},
     )
     found, usual = (e.solve(SEES).power.sum() for e in (sionna(bare, depth=1, samples=100_000), few))
     assert found == pytest.approx(usual, rel=2e-3)

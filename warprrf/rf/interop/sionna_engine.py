@@ -103,7 +103,7 @@ class SionnaEngine:
         both = {"num_rows": 1, "num_cols": 1, "pattern": "iso", "polarization": "VH"}
         self._scene.tx_array = self._rt.PlanarArray(**both)
         self._scene.rx_array = self._rt.PlanarArray(**both)
-        self._scene.add(self._rt.Transmitter("tx", position=self.transmitter.tolist()))
+        self._scene.add(self._rt.Transmitter("warprrf-tx", position=self.transmitter.tolist()))
         self._solver = self._rt.PathSolver(deterministic=True)
         # Sionna's default of 1e6 paths truncates silently; each sample can give one path a bounce.
         self._most = self.sampling.samples * max(self.sampling.depth, 1) + 100_000
@@ -117,7 +117,7 @@ class SionnaEngine:
         """
         point = check_array("receiver", receiver, (3,))
         select_variant()
-        self._scene.add(self._rt.Receiver("rx", position=point.tolist()))
+        self._scene.add(self._rt.Receiver("warprrf-rx", position=point.tolist()))
         try:
             paths = self._solver(
                 self._scene,
@@ -135,7 +135,7 @@ class SionnaEngine:
                 raise RuntimeError(f"Sionna filled its cap of {self._most} paths: power would be missing")
             (found,) = by_delay(paths, self.frequency_hz, 0, True)
         finally:
-            self._scene.remove("rx")
+            self._scene.remove("warprrf-rx")
         self._solved += 1
         if self._solved % 20 == 0:  # Dr.Jit keeps freed memory and compiled kernels
             drjit = require("drjit", extra="sionna")
