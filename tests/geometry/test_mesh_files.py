@@ -281,6 +281,13 @@ def test_a_ply_of_triangles_and_few_other_polygons_is_read(tmp_path):
     assert wr.Mesh.load(path).areas.sum() == pytest.approx(121.0)
 
 
+@pytest.mark.parametrize("origin", [(0, 0, 0), (500_000, 4_000_000, 300)])
+def test_a_written_mesh_stays_where_it_is_in_coordinates_of_maps_too(origin, tmp_path):
+    corners = np.random.default_rng(0).uniform(-20, 20, (30, 3)) + origin
+    write_mesh(tmp_path / "mesh.ply", corners, np.arange(30).reshape(-1, 3))
+    np.testing.assert_allclose(wr.Mesh.load(tmp_path / "mesh.ply").vertices, corners, rtol=0, atol=1e-5)
+
+
 def test_texture_coordinates_that_are_nan_are_left_out(tmp_path):
     corners, faces = np.eye(3), [[0, 1, 2]]
     write_mesh(tmp_path / "mesh.ply", corners, faces, uv=np.full((3, 2), 0.625))

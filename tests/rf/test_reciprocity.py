@@ -57,6 +57,12 @@ def test_the_narrowest_lobe_scatters_all_that_comes():
     assert list(over_the_hemisphere(NARROWEST_LOBE, False)) == pytest.approx([1.0] * 6, rel=1e-6)
 
 
+def test_light_from_inside_a_surface_and_into_it_is_refused():
+    for name, cosines in (("cos_incidence", (-0.3, 0.5)), ("cos_scatter", (0.5, -0.3))):
+        with pytest.raises(ValueError, match=name):
+            lobe(0, *cosines, 0.2)
+
+
 def test_a_fields_scattered_power_is_the_same_both_ways():
     plain = known_field()
     field = replace(plain, parameters=replace(plain.parameters, reciprocal=True))

@@ -83,12 +83,15 @@ def holds_gaussians(path: str | os.PathLike[str]) -> bool:
 
 
 def write_ply(
-    path: str | os.PathLike[str], columns: Mapping[str, np.ndarray], faces: np.ndarray | None
+    path: str | os.PathLike[str],
+    columns: Mapping[str, np.ndarray],
+    faces: np.ndarray | None,
+    number: str = "float",
 ) -> None:
-    """Write vertices by their ``columns``, each ``(V,)``, as single precision, and triangles ``(F, 3)``."""
-    table = np.column_stack(list(columns.values())).astype("<f4")
+    """Write vertices by their ``columns``, each ``(V,)``, in single precision or as "double", and triangles ``(F, 3)``."""
+    table = np.column_stack(list(columns.values())).astype("<f4" if number == "float" else "<f8")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
-    header += [f"property float {name}" for name in columns]
+    header += [f"property {number} {name}" for name in columns]
     content = table.tobytes()
     if faces is not None:
         header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]

@@ -187,6 +187,11 @@ def to_sionna_scene(
     """A ``sionna.rt.Scene`` of these objects, devices and antennas; see :meth:`Scene.to_sionna`."""
     rt = sionna_rt()
     mi = select_variant()
+    err_m = max(np.abs(part.vertices - part.vertices.astype(np.float32)).max() for part in parts)
+    if err_m > 1e-3:
+        warn(
+            f"scene: Sionna RT's single precision moves its vertices by {err_m:.2g} m; expected an origin near by"
+        )
     taken = {*transmitters, *receivers}  # Sionna's objects, materials and devices share one set of names
 
     def free(name: str, end: str) -> str:

@@ -1,5 +1,6 @@
 """Sionna RT and our own evaluation check each other on a room with a solid in it."""
 
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 from sionna_room import sionna_or_skip, write_scene
 
 from warprrf.rf import scene_sionna
+from warprrf.rf.channel.path_arrays import length_along, points_along
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.interop.sionna_engine import Sampling
@@ -84,11 +86,29 @@ def test_more_bounces_bring_more_power_and_simulate_says_how(scene):
 
 
 def test_a_scene_needs_no_file_and_its_own_devices_play_no_part(few, sionna, scene):
+    own = [replace(scene.materials[0], name="rx"), *scene.materials[1:]]
     bare = Scene(
-        scene.mesh, scene.materials, scene.face_material, transmitters={"tx": TX + 1}, receivers={"rx": SEES}
+        scene.mesh,
+        own,
+        scene.face_material,
+        transmitters={"tx": TX + 1},
+        receivers={"one": SEES},
     )
     found, usual = (e.solve(SEES).power.sum() for e in (sionna(bare, depth=1, samples=100_000), few))
     assert found == pytest.approx(usual, rel=2e-3)
+
+
+def test_a_room_in_coordinates_of_maps_is_the_room_at_home(few, scene):
+    far, moved = np.array([500_000.1, 4_000_000.1, 300.0]), copy(scene)
+    moved.mesh = scene.mesh.transformed(shift=far)
+    given = COMMON | {"transmitter": TX + far}
+    engine = sionna_or_skip()(moved, sampling=Sampling(depth=1, samples=100_000), **given)
+    found, usual = engine.solve(SEES + far), few.solve(SEES)
+    assert found.power.sum() == pytest.approx(usual.power.sum(), rel=2e-3)
+    along = length_along(points_along(found.transmitter, found.vertices, found.receiver))
+    np.testing.assert_allclose(along, found.length_m, rtol=1e-4)
+    with pytest.warns(UserWarning, match="single precision"):
+        moved.to_sionna(frequency_hz=F)
 
 
 def test_a_place_that_no_path_reaches_has_an_empty_spectrum(sionna):

@@ -166,6 +166,10 @@ def test_slabs_are_as_thick_as_the_scene_or_the_caller_says_and_else_let_nothing
             wr.interop.write_twin(unknown, tmp_path / "x", thickness_m=wrong)
 
 
+def test_names_of_groups_that_files_cannot_tell_apart_stay_apart():
+    assert twins._identifiers(["a_b", "a_b_2", "a b", "a/b", "c"]) == ["a_b", "a_b_2", "a_b_", "a_b__", "c"]
+
+
 def test_what_no_material_can_hold_is_said(field, tmp_path):
     assert wr.interop.write_twin(field, tmp_path / "plain").left_out == ()
     residual = np.full((2, len(field.surface.cells)), np.log(10**0.1))

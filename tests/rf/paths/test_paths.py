@@ -96,6 +96,7 @@ def test_paths_of_several_receivers_do_not_become_those_of_one():
     ):
         with pytest.raises(ValueError, match=f"parts: got (paths )?{said}"):
             join(parts)
+    assert [one.gain.shape for one in paths] == [paths[0].gain.shape, paths[1].gain.shape]
     np.testing.assert_array_equal(Paths.concatenate([paths[0], paths[0]]).receiver, paths[0].receiver)
     here, there, anywhere = (replace(paths[0], transmitter=at) for at in (TX, TX + 1.0, None))
     assert Paths.stack([here, there, anywhere]).transmitter is None  # it was said to be the first one's

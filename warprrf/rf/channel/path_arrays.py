@@ -174,6 +174,8 @@ class PathArrays:
         several = self.as_several()
         yield from (several[k] for k in range(len(several.gain)))
 
+    __iter__ = each
+
     def select(self, chosen: slice | np.ndarray) -> Self:
         """Paths ``chosen`` of one receiver: indices in any order, or a mask ``(L,)``.
 

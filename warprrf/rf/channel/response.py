@@ -337,8 +337,8 @@ def _response(
 ) -> np.ndarray:
     if len(job.tau) == 0:
         return np.zeros((*job.shape, len(f)), dtype=complex)
-    # A series of more nepers leaves double precision.
-    if gridded and (loss is None or np.abs(loss).max() * np.ptp(length_m) < 60.0):
+    # A series of more nepers loses the path that is absorbed most, or least, to rounding.
+    if gridded and (loss is None or np.abs(loss).max() * np.ptp(length_m) < 18.0):
         return gridded_sum(job, f) if loss is None else _gridded_with_air(job, f, loss, length_m)
     factor = None if loss is None else np.exp(-loss * length_m[:, None])
     if job.own_delays and job.lengths.separable:
@@ -352,13 +352,13 @@ def _response(
 
 
 def _gridded_with_air(job: Sum, f: np.ndarray, loss: np.ndarray, length_m: np.ndarray) -> np.ndarray:
-    """exp(-loss L) as a series in L about its middle, cut at 1e-8: one gridded sum a term."""
+    """exp(-loss L) as a series in L about its middle, cut at 1e-8 of its least value: one gridded sum a term."""
     middle = 0.5 * (length_m.min() + length_m.max())
     reach = max(0.5 * float(np.ptp(length_m)), 1e-12)
     size = reach * np.abs(loss).max()
     about = (length_m - middle) / reach
     total, k = np.zeros((*job.shape, len(f)), dtype=complex), 0
-    while size**k / factorial(k) > 1e-8:
+    while size**k / factorial(k) > 1e-8 * np.exp(-size):
         part = gridded_sum(replace(job, amplitude=job.amplitude * about**k), f)
         total += part * ((-loss * reach) ** k / factorial(k))
         k += 1

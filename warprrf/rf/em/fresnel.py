@@ -177,17 +177,18 @@ def lobe(
     The directive lobe of Degli-Esposti et al. is not reciprocal: f_s cos(theta_i) changes when the ends are swapped.
 
     Args:
-        cos_incidence: Cosine of the incidence angle.
-        cos_scatter: Cosine of the scattering angle.
+        cos_incidence: Cosine of the incidence angle, 0 to 1.
+        cos_scatter: Cosine of the scattering angle, 0 to 1.
         cos_to_mirror: Cosine of the angle psi between the scattered and the mirror direction.
         reciprocal: The reciprocal lobe: cos(theta_s) b(theta_i) b(theta_s) ((1 + cos psi) / 2)^alpha_r, with b of
             :func:`reciprocal_factor`.
     """
     cosines = {"cos_incidence": cos_incidence, "cos_scatter": cos_scatter, "cos_to_mirror": cos_to_mirror}
     check_alike(**cosines)
-    for name, value in cosines.items():
-        if (np.abs(check_array(name, value, finite=False)) > 1.0 + 1e-6).any():
-            raise ValueError(f"{name}: got values beyond -1 to 1, expected cosines")
+    for (name, value), low in zip(cosines.items(), (0, 0, -1), strict=True):
+        found = check_array(name, value, finite=False)
+        if ((found < low - 1e-6) | (found > 1.0 + 1e-6)).any():
+            raise ValueError(f"{name}: got values beyond {low} to 1, expected cosines")
     if alpha_r == LAMBERTIAN:
         return np.asarray(cos_scatter) / np.pi
     shape = (0.5 * (1.0 + np.asarray(cos_to_mirror))) ** alpha_r

@@ -186,7 +186,7 @@ class Material:
 
     @classmethod
     def conductor(cls, **options: Any) -> Material:
-        """A good conductor (1e7 S/m): reflects all but a thousandth at terahertz. ``options``: ``scattering``, ``pattern``
+        """A good conductor (1e7 S/m): reflects all but 0.7 % at 1 THz. ``options``: ``scattering``, ``pattern``
         and what else :meth:`custom` takes."""
         return cls.custom("conductor", relative_permittivity=1.0, conductivity=1e7, **options)
 

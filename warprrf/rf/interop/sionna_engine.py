@@ -8,9 +8,11 @@ no absorption by the air; where asked for, every path is given that of its own l
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import Count, Seed, check_array, checked, whole
@@ -97,13 +99,19 @@ class SionnaEngine:
         self.air = air_of(gas)
         self.device = device
         self._rt = sionna_rt()
+        # Single precision, which Sionna computes in, needs an origin near by: whole kilometres away.
+        self._origin = 1e3 * np.rint(scene.bounds.mean(axis=0) / 1e3)
+        scene = copy(scene)
+        scene.mesh = scene.mesh.transformed(shift=-self._origin)
         self._scene = load_sionna_scene(scene, frequency_hz=self.frequency_hz)
         for name in (*scene.transmitters, *scene.receivers):
             self._scene.remove(name)
         both = {"num_rows": 1, "num_cols": 1, "pattern": "iso", "polarization": "VH"}
         self._scene.tx_array = self._rt.PlanarArray(**both)
         self._scene.rx_array = self._rt.PlanarArray(**both)
-        self._scene.add(self._rt.Transmitter("tx", position=self.transmitter.tolist()))
+        self._scene.add(
+            self._rt.Transmitter("warprrf-tx", position=(self.transmitter - self._origin).tolist())
+        )
         self._solver = self._rt.PathSolver(deterministic=True)
         # Sionna's default of 1e6 paths truncates silently; each sample can give one path a bounce.
         self._most = self.sampling.samples * max(self.sampling.depth, 1) + 100_000
@@ -117,7 +125,7 @@ class SionnaEngine:
         """
         point = check_array("receiver", receiver, (3,))
         select_variant()
-        self._scene.add(self._rt.Receiver("rx", position=point.tolist()))
+        self._scene.add(self._rt.Receiver("warprrf-rx", position=(point - self._origin).tolist()))
         try:
             paths = self._solver(
                 self._scene,
@@ -135,13 +143,14 @@ class SionnaEngine:
                 raise RuntimeError(f"Sionna filled its cap of {self._most} paths: power would be missing")
             (found,) = by_delay(paths, self.frequency_hz, 0, True)
         finally:
-            self._scene.remove("rx")
+            self._scene.remove("warprrf-rx")
         self._solved += 1
         if self._solved % 20 == 0:  # Dr.Jit keeps freed memory and compiled kernels
             drjit = require("drjit", extra="sionna")
             drjit.flush_malloc_cache()
             drjit.flush_kernel_cache()
-        return found.with_gas(self.air)
+        found = replace(found, transmitter=self.transmitter, receiver=point)
+        return replace(found, vertices=found.vertices + self._origin).with_gas(self.air)
 
     def receive(self, receiver: ArrayLike) -> Received:
         """The spectrum of one receiver (3,)."""

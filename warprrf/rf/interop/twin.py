@@ -394,9 +394,11 @@ def _lobe_table(most: int, reciprocal: bool) -> tuple[np.ndarray, np.ndarray]:
 def _identifiers(names: Sequence[str]) -> list[str]:
     """Names for files and XML: characters other than letters, digits, ``_`` and ``-`` become ``_``; all differ."""
     found: list[str] = []
-    for k, name in enumerate(names):
+    for name in names:
         plain = re.sub(r"[^A-Za-z0-9_-]", "_", name)
-        found.append(plain if plain not in found else f"{plain}_{k}")
+        while plain in found:
+            plain += "_"
+        found.append(plain)
     return found
 
 
