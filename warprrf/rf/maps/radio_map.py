@@ -19,7 +19,6 @@ from warprrf.device import require
 from warprrf.files import write_bytes
 from warprrf.geometry.mesh import Mesh
 from warprrf.netcdf_files import Variable
-from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.maps.links import LinkOptions
 from warprrf.rf.positions import NEAR_FIELD, Ends, check_positions, ground_height, is_free
 from warprrf.rf.spectra.spectrum import to_db
@@ -255,12 +254,9 @@ def radio_map(
     if not isinstance(mesh, Mesh):
         raise ValueError("field: got one without a mesh, expected one that knows walls from air")
     source = field.transmitter if transmitter is None else transmitter
-    source, wavelength_m = (
-        check_array("transmitter", source, (3,)).copy(),
-        SPEED_OF_LIGHT / field.frequency_hz,
-    )
+    source = check_array("transmitter", source, (3,)).copy()
     check_positions(
-        mesh, source, np.zeros((0, 3)), wavelength_m, known=field.transmitter, device=field.device
+        mesh, source, np.zeros((0, 3)), field.wavelength_m, known=field.transmitter, device=field.device
     )
     low, high = mesh.bounds[:, 2] - (mesh.bounds[0, 2] if o.above_ground else 0.0)
     if not low < height < high:
@@ -270,7 +266,7 @@ def radio_map(
     ground = ground_height(mesh, across, along, device=field.device) if o.above_ground else None
     places = _places(across, along, height, ground)
     free = is_free(mesh, places.reshape(-1, 3), source, device=field.device).reshape(across.shape)
-    free &= np.linalg.norm(places - source, axis=-1) > NEAR_FIELD * wavelength_m
+    free &= np.linalg.norm(places - source, axis=-1) > NEAR_FIELD * field.wavelength_m
     if not free.any():
         raise ValueError(f"bounds: no cell of the {free.size} at {height!r} m lies in the air")
     links = field.trace_links(Ends.of(places[free], source), o)
