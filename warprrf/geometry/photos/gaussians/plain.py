@@ -111,7 +111,7 @@ def plain_surfaces(
         seen = list(pool.map(on_planes, cameras, edgels, plain))
     planes = [
         plane
-        for number in np.unique(np.concatenate([view.plane[view.plane >= 0] for view in seen])).tolist()
+        for number in np.unique(np.concatenate([plane[plane >= 0] for plane, _ in seen])).tolist()
         for side in (1, -1)
         for plane in _agreed(number, side, heights, cameras, seen)
     ]
@@ -199,13 +199,6 @@ def _has_twin(pane: Pane, line: Line, lines: Sequence[Line]) -> bool:
     return overlap > 0.5 * (high - low)
 
 
-class _View(NamedTuple):
-    """What one photo shows of plain surfaces, every so many-th pixel: number of the plane or -1, and range [m] or 0."""
-
-    plane: np.ndarray
-    range_m: np.ndarray
-
-
 def _regions_on(
     heights: Sequence[Height],
     lines: Sequence[Line],
@@ -214,8 +207,9 @@ def _regions_on(
     camera: Camera,
     edgels: Edgels,
     plain: np.ndarray,
-) -> _View:
-    """The plain regions of a photo, each on the plane that its border votes for."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """The plain regions of a photo, each on the plane that its border votes for, every so many-th pixel: number of the
+    plane or -1, and range [m] or 0."""
     of_line, barrier = _shown(lines, traced, camera, edgels)
     region, count = ndimage.label(plain & ~ndimage.binary_dilation(barrier, np.ones((3, 3))))
     size = np.bincount(region.ravel(), minlength=count + 1)
@@ -248,7 +242,7 @@ def _regions_on(
             nearest = min(rivals, key=lambda r: r[0])[0]
             best = max((r for r in rivals if r[0] < nearest + BEHIND_M), key=lambda r: r[1])
             plane[own], ranges[own] = np.where(best[3] > 0, best[2], -1), best[3]
-    return _View(plane, ranges)
+    return plane, ranges
 
 
 def _shown(
@@ -328,19 +322,20 @@ def _agreed(
     side: int,
     heights: Sequence[Height],
     cameras: Sequence[Camera],
-    seen: Sequence[_View],
+    seen: Sequence[tuple[np.ndarray, np.ndarray]],
 ) -> list[Plane]:
-    """The plane with the cells that more photos put on it than see through it; none where those are few."""
+    """The plane with the cells that more photos put on it than see through it; none where those are few. ``seen`` is what
+    :func:`_regions_on` found in each photo."""
     axis, height, _, bounds = heights[number]
     some = STRIDE // 2
     photos = [x for x in zip(cameras, seen, strict=True) if side * (x[0].position[axis] - height) > 0.1]
     found = [np.zeros((0, 3))]
-    for camera, view in photos:
-        own = view.plane == number
+    for camera, (planes, ranges) in photos:
+        own = planes == number
         y, x = np.nonzero(own)
         rays = lines_through(camera, np.stack([x, y], axis=1) * STRIDE + some + 0.5, axis)[0]
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        found.append(camera.position + view.range_m[own][:, None] * rays)
+        found.append(camera.position + ranges[own][:, None] * rays)
     hits = np.concatenate(found)
     if not len(hits):
         return []
@@ -354,15 +349,15 @@ def _agreed(
     plane = empty.spanning(np.floor(low / CELL_M - 1) * CELL_M, high + CELL_M)
     cells = plane.cells()
     yes, no = (np.zeros(len(cells), dtype=int) for _ in range(2))
-    for camera, view in photos:
+    for camera, (planes, ranges) in photos:
         inside, pixels = camera.in_frame(cells, 0.1)
         own = np.flatnonzero(inside)
         y, x = pixels[own].T // STRIDE
-        y, x = np.minimum(y, view.plane.shape[0] - 1), np.minimum(x, view.plane.shape[1] - 1)
-        here = view.plane[y, x] == number
+        y, x = np.minimum(y, planes.shape[0] - 1), np.minimum(x, planes.shape[1] - 1)
+        here = planes[y, x] == number
         away = np.linalg.norm(cells[own] - camera.position, axis=1)
         yes[own] += here
-        no[own] += ~here & (view.range_m[y, x] > away + BEHIND_M)
+        no[own] += ~here & (ranges[y, x] > away + BEHIND_M)
     # fewest photos that put a cell on its plane, and fewest cells of a piece of one: 0.1 square metres
     agreeing, piece_cells = 2, 10
     occupied = pieces(((yes >= agreeing) & (yes > no)).reshape(plane.occupied.shape), piece_cells)
