@@ -285,23 +285,26 @@ def _steps(
         seen = how_seen(patches.mesh, list(sparse.cameras.values()), device=device)
         return of_patches(patches) | {"shares": np.array([*seen.unseen_and_plain(planes), skipped])}
 
-    settings = [
+    computed = replace(sparse, causes={}, guessed=())  # without words, which name folders
+    inputs = [
+        computed,
+        list(fitted),
+        masks,
         config.planes,
         config.sweep,
         config.plain,
         config.gaussians,
         seed,
     ]
-    computed = replace(sparse, causes={}, guessed=())  # without words, which name folders
-    first = _kept(steps, "initial", initial, [computed, list(fitted), masks, *settings])
+    first = _kept(steps, "initial", initial, inputs)
     planes = to_planes(first)
     gaussians = to_gaussians(_kept(steps, "refined", refined, [steps.key("initial"), config.refine]))
-    inputs: list[Any] = [steps.key("refined"), config.surface, config.completion]
+    inputs = [steps.key("refined"), config.surface, config.completion]
     if measured:
         inputs.append({name: [file.path, file.unit_m] for name, file in measured.items()})
     else:
-        surface_read = config.surface.depth_pixels, config.surface.patch_distance_m
-        made_by = [steps.key("refined"), config.stereo, config.segments, *surface_read]
+        s = config.surface
+        made_by = [steps.key("refined"), config.stereo, config.segments, s.depth_pixels, s.patch_distance_m]
         rendered = _kept(steps, "depth", depth, made_by)
         inputs.append(steps.key("depth"))
     kept = _kept(steps, "surface", surface, inputs)

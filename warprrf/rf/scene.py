@@ -203,8 +203,8 @@ class Scene:
                 is too narrow for Sionna's single precision.
 
         Warns:
-            UserWarning: of antennas that are left out, because they differ, or have no polarisation; of coordinates too large
-                for Sionna's single precision.
+            UserWarning: of antennas that are left out, because they differ, or have no polarisation; of coordinates too
+                large for Sionna.
         """
         return to_sionna_scene(self._parts(), self.transmitters, self.receivers, self.antennas, frequency_hz)
 

@@ -23,8 +23,7 @@ class RefineConfig:
 
     Attributes:
         iterations: steps, one photo each.
-        downscale: photos are averaged over squares of this many pixels, of more at first where they are large, and of none in
-            the last steps.
+        downscale: photos are averaged over squares of this many pixels while training, at the last over none.
         fit_exposure: whether every photo has a gain for each colour of its own.
         mean_rate: metres a step at the start.
         densify_from, densify_every: in iterations.

@@ -337,7 +337,7 @@ def _response(
 ) -> np.ndarray:
     if len(job.tau) == 0:
         return np.zeros((*job.shape, len(f)), dtype=complex)
-    # A series of more nepers loses the path that is absorbed most, or least, to rounding.
+    # A series of more nepers loses paths to rounding.
     if gridded and (loss is None or np.abs(loss).max() * np.ptp(length_m) < 18.0):
         return gridded_sum(job, f) if loss is None else _gridded_with_air(job, f, loss, length_m)
     factor = None if loss is None else np.exp(-loss * length_m[:, None])

@@ -152,10 +152,8 @@ class RadioField(ABC):
                 of any of them.
             model: ``"bistatic"``, ``"rf3dgs+"`` or ``"rf3dgs"``.
             options: by name, ``device`` and ``progress`` among them. A ``bistatic`` field takes ``client``, and those of
-                :class:`~warprrf.rf.fields.bistatic.options.FitOptions`: ``quick=True``, ``effects``, ``relevance``, ``lobes``,
-                ``reciprocal``, ``sub_pixels``, ``gain_offset``, ``iterations``, ``seed``. The others take those of
-                :class:`~warprrf.rf.fields.harmonic.fitting.FieldOptions`: ``iterations``, ``batch``, ``sh_degree``,
-                ``checkpoint``, ``seed``, ...
+                :class:`~warprrf.rf.fields.bistatic.options.FitOptions`, such as ``quick=True``, ``effects``, ``seed``. The others
+                take those of :class:`~warprrf.rf.fields.harmonic.fitting.FieldOptions`.
 
         Raises:
             ValueError, TypeError: for an unknown model or bad arguments.

@@ -99,7 +99,7 @@ class SionnaEngine:
         self.air = air_of(gas)
         self.device = device
         self._rt = sionna_rt()
-        # Single precision, which Sionna computes in, needs an origin near by: whole kilometres away.
+        # Sionna's single precision needs an origin near by.
         self._origin = 1e3 * np.rint(scene.bounds.mean(axis=0) / 1e3)
         scene = copy(scene)
         scene.mesh = scene.mesh.transformed(shift=-self._origin)

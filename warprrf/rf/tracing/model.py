@@ -35,8 +35,7 @@ class Effects:
         scatterings: most scatterings on a path, 0 to 3; from the second on surfaces light each other evenly over half a
             metre.
         mirror_scatter: whether mirrors light surfaces that scatter.
-        scatter_mirror: whether lit surfaces are seen in mirrors, and through slabs if ``transmissions`` are not 0. Sionna RT
-            has no such paths.
+        scatter_mirror: whether lit surfaces are seen in mirrors, and through slabs. Sionna RT has no such paths.
         transmissions: most slabs that a path passes, 0 to 8.
         diffractions: most edges on a path, 0 or 1; beside one mirror or one slab at most, and no scattering.
         residual: whether what surfaces scatter differs within their group.
@@ -54,6 +53,10 @@ class Effects:
     transmissions: Annotated[int, whole(0, MOST_SLABS)] = 3
     diffractions: Annotated[int, whole(0, 1)] = 1
     residual: bool = True
+
+    def with_slabs_and_edges_of(self, other: Effects) -> Effects:
+        """The same with as many slabs and edges on a path as ``other`` has."""
+        return replace(self, transmissions=other.transmissions, diffractions=other.diffractions)
 
 
 SETS = {

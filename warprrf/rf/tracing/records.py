@@ -69,9 +69,8 @@ class Records(Interactions):
     """Paths of one sequence: N records of K interactions from the transmitter to the receiver.
 
     Attributes:
-        power: what geometry gives, air included, shape ``(N,)``: Friis' path gain of line of sight and mirrors; of a ray of
-            solid angle Omega that sees what scatters lambda^2 Omega cos(theta_i) / (4 pi d1)^2, or (lambda / 4 pi)^2 Omega of
-            an element. Its precision is that of what is computed of it.
+        power: path gain without interactions, shape ``(N,)``; where a ray sees what scatters or sends
+            lambda^2 Omega cos(theta_i) / (4 pi d1)^2 or (lambda / 4 pi)^2 Omega. Its precision is that of what is computed.
         ray: ray of the receiver's grid that sees it, or row of a specular path, or side of an element that is lit, ``(N,)``.
         residual_row: which row of the residual holds the gain of the cell that its ray sees, -1 for none.
         reach_m: of what is seen through slabs, how far along the ray that is [m], shape ``(N,)``; None elsewhere.

@@ -181,8 +181,8 @@ class Interreflection:
 
 def irradiance(tracer: Tracer, p: Parameters, effects: Effects) -> np.ndarray | None:
     """Irradiance of elements' sides by surfaces that scattered before, under parameters of groups, in units in which the
-    transmitter gives cos(theta_i) / d1^2 [1/m^2], shape ``(E,)``: of even light that they scatter as strongly as what they get, at
-    whatever angles; None where ``effects`` hold no second scattering."""
+    transmitter gives cos(theta_i) / d1^2 [1/m^2], shape ``(E,)``: as much even light as they would scatter alike; None where
+    ``effects`` hold no second scattering."""
     if effects.scatterings < 2:
         return None
     most, group, sides = effects.transmissions, tracer.surface.side_group, tracer.surface.element_sides

@@ -98,7 +98,7 @@ class View:
 
     def cell(self, ray: np.ndarray) -> np.ndarray:
         """Surface cell that each ray of index ``ray`` (N,) meets, shape ``(N,)``; all must meet something."""
-        hits = self.hits if self.keeps else replace(self.hits)  # which keeps nothing of its own yet
+        hits = self.hits if self.keeps else replace(self.hits)
         return self.tracer.surface.cells.cell[self.tracer.grid.tile(hits)[ray]]
 
     @property

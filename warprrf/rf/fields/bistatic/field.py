@@ -94,7 +94,7 @@ class BistaticField(RadioField):
         material: of each group, shape ``(G,)``.
         residual: ln gain of each surface cell over its group, lit straight by the transmitter and lit in any other way, shape
             ``(2, X)``; see :mod:`warprrf.rf.fields.bistatic.residual`.
-        errors: how wrong it is; None if that was not learned: of few receivers, readings, spectra with gaps, a quick fit.
+        errors: how wrong it is; None where no whole spectra were held out to learn it from.
         sub_pixels: square root of the rays per pixel.
 
     The others are those of :class:`RadioField`.
@@ -204,8 +204,9 @@ class BistaticField(RadioField):
         frame = frame_of(data)
         effects = replace(o.candidates(frame.frequency_hz)[:2][-1], residual=False)
         lobes = o.exponents(frame.frequency_hz)
-        known: dict[str, Any] = {"reciprocal": o.reciprocal, "sub_pixels": o.rays_a_side, "device": device}
-        prior = cls.prior(geometry, frame, effects=effects, lobes=lobes, **known)
+        prior = cls.prior(
+            geometry, frame, effects=effects, lobes=lobes, reciprocal=o.reciprocal, sub_pixels=o.rays_a_side, device=device
+        )  # fmt: skip
         places_of(data, prior.mesh, device)
         own = assumed(prior.surface, prior.frequency_hz)
         parameters = replace(prior.parameters, log_excess=own.log_excess)

@@ -1,8 +1,8 @@
 """Fitting a bistatic field: trace what receivers see, observe what was read, decide which effects count and which groups are of
 one material, fit parameters of materials, and find what differs within them and how wrong all that is.
 
-:func:`_learned` reads as that list, :func:`fit` is what stands before and after. Each step is a function of a
-:class:`~warprrf.rf.fields.bistatic.training.Training`; what it decides is handed on, and noted in the report.
+:func:`_learned` reads as that list. Each step is a function of a :class:`~warprrf.rf.fields.bistatic.training.Training`; what it
+decides is handed on, and noted in the report.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from warprrf.rows import distinct_rows
 
 SHORT_STEPS = 10  # of a fit that only decides about something
 BETTER = 0.995
-"""Share to which further effects must lower the mean square error, of receivers held out where there are any."""
+"""Share to which further effects must lower the mean square error of receivers held out."""
 
 
 def fit(
@@ -81,12 +81,13 @@ def fit(
     ends = ends[np.sort(distinct_rows(ends)[0])]
     check_rays(places, options.rays_a_side)
     if options.effects != "auto":  # else these are decided on by what they are worth
-        frequency_hz, first = frame_of(data).frequency_hz, places[0]
+        frequency_hz, source = frame_of(data).frequency_hz, places[0].transmitter
         effects = options.candidates(frequency_hz)[0]
-        rare: dict[str, Any] = {name: any(getattr(effects, key) for key in on) for name, on in RARE.items()}
-        receivers = [p.receiver for p in places if np.array_equal(p.transmitter, first.transmitter)]
-        link = mesh, first.transmitter, np.array(receivers)
-        warn_of_unmodelled(*link, frequency_hz=frequency_hz, device=device, **rare)
+        receivers = np.array([p.receiver for p in places if np.array_equal(p.transmitter, source)])
+        warn_of_unmodelled(
+            mesh, source, receivers, frequency_hz=frequency_hz, device=device,
+            transmission=effects.transmissions > 0, diffraction=effects.diffractions > 0,
+        )  # fmt: skip
     tell = progress or (lambda *_: None)
     tell("patches", 0, 1)
     surface = Surface.of(geometry, frequency_hz=frame_of(data).frequency_hz)
@@ -184,7 +185,7 @@ def _learned(
 
 
 def choose(t: Training) -> Solution:
-    """Effects, and which groups are of one material: those of known names are, each of its own."""
+    """Effects, and which groups are of one material; groups of known materials stay as they are."""
     material = t.surface.material
     start = t.start(material)
     trials = [Solution(effects, material, start, np.zeros((0, 0)), []) for effects in t.candidates]
@@ -259,10 +260,10 @@ def merged(t: Training, best: Solution) -> Solution:
 
 def _name(effects: Effects) -> str:
     """What a choice of effects is called in a report: the set that it is, whatever its mirrors and :data:`RARE` effects."""
-    free = ["mirrors", *(key for on in RARE.values() for key in on)]
-    own: dict[str, Any] = {key: getattr(effects, key) for key in free}
-    known = [name for name, one in SETS.items() if replace(one, **own) == effects]
-    return (known or [str(effects)])[0]
+    for name, one in SETS.items():
+        if replace(one.with_slabs_and_edges_of(effects), mirrors=effects.mirrors) == effects:
+            return name
+    return str(effects)
 
 
 def cross_validate(t: Training, choice: Solution) -> ErrorModel | None:

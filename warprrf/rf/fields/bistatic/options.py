@@ -83,9 +83,8 @@ class FitOptions:
             Effects(**{f.name: min(getattr(one, f.name), getattr(most, f.name)) for f in fields(Effects)})
             for one in given
         ]
-        rare: dict[str, Any] = {"transmissions": most.transmissions, "diffractions": most.diffractions}
         if self.relevance is not None:
-            found = [replace(one, **rare) for one in found]
+            found = [one.with_slabs_and_edges_of(most) for one in found]
         return list(dict.fromkeys(found))
 
     def exponents(self, frequency_hz: float) -> tuple[int, ...]:

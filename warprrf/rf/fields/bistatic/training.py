@@ -74,7 +74,7 @@ def trace(
     Args:
         effects: which tables are traced at once (others when they are first asked for); None for single bounces, and for
             as many mirrors up to 3 as can be searched (2 in a city).
-        rare: effects as which paths pass slabs and go over edges; None for as the scene needs it (:func:`needed`).
+        rare: whose slabs and edges are sought; None for what the scene needs (:func:`needed`).
         keeps: whether records are kept, if they are not too many; else they are traced whenever they are asked for.
         sub_pixels: square root of the rays per pixel.
         client: a ``dask.distributed.Client`` whose workers trace, to the same bits; this process by default.
@@ -86,10 +86,8 @@ def trace(
     """
     tell = progress or (lambda *_: None)
     wanted = replace(SETS["single"], mirrors=3) if effects is None else effects
-    if rare is None:
-        wanted = needed(wanted, surface, places, device)
-    else:
-        wanted = replace(wanted, transmissions=rare.transmissions, diffractions=rare.diffractions)
+    decided = needed(wanted, surface, places, device) if rare is None else rare
+    wanted = wanted.with_slabs_and_edges_of(decided)
     keeps = keeps and rays_of(places, sub_pixels) <= MOST_KEPT
     together: dict[tuple[object, ...], list[int]] = {}  # places under one transmitter
     for k, place in enumerate(places):
@@ -206,7 +204,7 @@ class Training:
         return np.setdiff1d(np.arange(len(self.places)), self.held)
 
     def few(self, times: int) -> np.ndarray:
-        """Places that trial fits learn from, ``times`` :data:`MOST_TO_CHOOSE` at most; one of every chain is among them."""
+        """Places that trial fits learn from, those of every chain among them."""
         others = np.setdiff1d(self.kept, self.always)
         chosen = others[: max(times * MOST_TO_CHOOSE - len(self.always), 0)]
         return np.union1d(self.always, chosen).astype(int)
@@ -248,8 +246,8 @@ class Training:
     def as_sought(self, effects: Effects) -> Training:
         """The same that chooses from slabs and edges as they were sought for ``effects``, and no more mirrors; of power alone
         from one candidate."""
-        rare: dict[str, Any] = {"transmissions": effects.transmissions, "diffractions": effects.diffractions}
-        found = [replace(one, mirrors=min(one.mirrors, effects.mirrors), **rare) for one in self.candidates]
+        every = (one.with_slabs_and_edges_of(effects) for one in self.candidates)
+        found = [replace(one, mirrors=min(one.mirrors, effects.mirrors)) for one in every]
         if len(found) > 1 and any(isinstance(one, ArraySpectra) for one in self.data):
             found = [replace(one, mirrors=effects.mirrors) for one in found]  # they hear the phases of all
         return replace(self, candidates=found[1:2] if len(found) > 1 and self.totals else found)
