@@ -231,7 +231,7 @@ class RadioField(ABC):
         Args:
             receivers: positions [m], shape ``(3,)`` or ``(R, 3)``.
             transmitter: position ``(3,)``, or one for each receiver ``(R, 3)`` [m]; the fitted one by default. Lengths,
-                visibility and mirror points are those of any other too, materials and gains are kept.
+                visibility and mirror points are those of any other too, as are materials; gains only of what it lights straight.
             shape: rows and columns; the field's own by default. Floor and range go with the size of the pixels.
 
         Returns:

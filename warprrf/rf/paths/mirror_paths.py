@@ -70,7 +70,7 @@ class MirrorPaths(Rows):
 
     @property
     def order(self) -> np.ndarray:
-        """Number of reflections, shape ``(L,)``: 0 is line of sight, or a path over an edge."""
+        """Number of mirrors, shape ``(L,)``: 0 through slabs alone too, and over any edge."""
         return (self.patch >= 0).sum(axis=1)
 
     @property

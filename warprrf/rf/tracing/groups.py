@@ -23,7 +23,7 @@ from warprrf.rows import sums_of
 
 SHAPES = 6  # numbers that tell shapes apart
 
-GROUP_M2 = 0.5  # smaller groups, from which nothing is learned, join the one that looks most like them
+GROUP_M2 = 0.5  # smaller materials, from which nothing is learned, join the one that looks most like them
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ def _alike(colour: np.ndarray, flat: np.ndarray, area: np.ndarray) -> np.ndarray
         flat: area on patches, shape ``(G,)`` [m^2].
         area: in all.
     """
-    large_m2 = 1.5  # of one colour and one patch: a group of its own
+    large_m2 = 1.5  # of one colour and one patch: a material of its own
     alike, rest_alike = 1.0, 4.0  # distance at which small pieces join large ones, and others each other
     large = np.flatnonzero(flat >= large_m2)
     material = np.full(len(colour), -1)

@@ -54,9 +54,10 @@ class Effects:
     diffractions: Annotated[int, whole(0, 1)] = 1
     residual: bool = True
 
-    def with_slabs_and_edges_of(self, other: Effects) -> Effects:
-        """The same with as many slabs and edges on a path as ``other`` has."""
-        return replace(self, transmissions=other.transmissions, diffractions=other.diffractions)
+
+def with_slabs_and_edges(effects: Effects, of: Effects) -> Effects:
+    """``effects`` with as many slabs and edges on a path as ``of`` has."""
+    return replace(effects, transmissions=of.transmissions, diffractions=of.diffractions)
 
 
 SETS = {

@@ -33,7 +33,7 @@ class Hits:
     Attributes:
         origins: where they start [m], shape ``(O, 3)``.
         directions: unit vectors, one for each ray, or one set for every origin, shape ``(K, 3)``.
-        solid_angle: that each ray stands for [sr], shape ``(K,)``.
+        solid_angle: that each ray stands for [sr], less what air took before, shape ``(K,)``.
         face: face that each hits, one origin's rays after another's, -1 for none, shape ``(O K,)`` int32.
         range_m: distance to it, shape ``(O K,)``; infinite for none.
     """

@@ -1,9 +1,9 @@
 """Surfaces as radio sees them: planar patches, material groups, small elements, and images of a transmitter.
 
-A group holds faces that look alike: a Scene's materials where they are known, else patches gathered by the colour that photos
-gave them, or by shape. A fit never tells its faces apart but may take several groups for one material. An element is a piece of
-one group, about half a metre wide in a room and wider in a street, at which scale surfaces light each other; a cell is a piece
-of an element: what differs within a group is told apart at both scales.
+A group is what a fit never parts: a Scene's material where that is known, else a piece of one colour in a plane, or of one
+shape. A fit may take several groups for one material. An element is a piece of one group, about half a metre wide in a room and
+wider in a street, at which scale surfaces light each other; a cell is a piece of an element: what differs within a group is
+told apart at both scales.
 """
 
 from __future__ import annotations

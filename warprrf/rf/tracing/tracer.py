@@ -1,12 +1,12 @@
-"""The tracer: from a receiver backwards to records of paths, whatever the materials. It alone knows sequences by name.
+"""The tracer: from a receiver backwards to records of paths, whatever the materials. Sequences are named here.
 
-Rays fill the sphere around a receiver. What they hit is connected to the transmitter (``S``) and to its images in mirrors
-(``MS``); some go on turned at a mirror and are connected there (``SM``, ``MSM``). Elements of the surface send on what they
-got of others (:mod:`warprrf.rf.tracing.render`), and are seen directly (``E``) or in a mirror (``EM``). Slabs
-(``T``) may stand in the way of light to a surface (``TS``; ``MTS``, before or behind the mirror), or of sight (``ST``, ``ET``),
-where rays go straight on. Line of sight and mirrors alone, through slabs too, come from the image method
-(:mod:`warprrf.rf.paths.mirror_paths`). What slabs let rays pass, and how strong paths over edges are, follows materials as they
-are taken to be before any measurement; else tables hold geometry alone.
+Rays fill the sphere around a receiver. What they hit is connected to the transmitter (``S``), and of some to those images
+of it that light the piece of surface there (``MS``); some go on turned at a mirror and are connected there (``SM``,
+``MSM``). Elements of the surface send on what they got of others (:mod:`warprrf.rf.tracing.render`), and are seen directly
+(``E``) or in a mirror (``EM``). Slabs (``T``) may stand in the way of light to a surface (``TS``; ``MTS``, before or behind
+the mirror), or of sight (``ST``, ``ET``), where rays go straight on. Line of sight and mirrors alone, through slabs too,
+come from the image method (:mod:`warprrf.rf.paths.mirror_paths`). What slabs let rays pass, and how strong paths over edges
+are, follows materials as they are taken to be before any measurement; else tables hold geometry alone.
 
 A :class:`Tracer` belongs to a surface, a transmitter and a grid of rays; what it traced gives the :class:`View` of a receiver.
 """
@@ -44,7 +44,7 @@ MIRROR_SLACK_M = 0.1
 UNMODELLED = {("MTS", "M"), ("MTS", "T")}
 """Ways of light and of sight that are not traced together."""
 SPECULAR = "specular"
-"""Name of the table of line of sight and mirrors."""
+"""Name of the table of paths without scattering."""
 _TRACED = Cache(6)  # a lobby's take up to 90 MB each; the bound is the process's, not a surface's
 
 

@@ -94,7 +94,7 @@ class BistaticField(RadioField):
         material: of each group, shape ``(G,)``.
         residual: ln gain of each surface cell over its group, lit straight by the transmitter and lit in any other way, shape
             ``(2, X)``; see :mod:`warprrf.rf.fields.bistatic.residual`.
-        errors: how wrong it is; None where no whole spectra were held out to learn it from.
+        errors: how wrong it is; None of few receivers, or where not all are whole spectra.
         sub_pixels: square root of the rays per pixel.
 
     The others are those of :class:`RadioField`.

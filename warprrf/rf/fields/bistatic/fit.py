@@ -43,7 +43,7 @@ from warprrf.rf.positions import warn_of_unmodelled
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import angle_deg, strongest_direction
 from warprrf.rf.spectra.readings import Readings
-from warprrf.rf.tracing.model import SETS, Effects, Model
+from warprrf.rf.tracing.model import SETS, Effects, Model, with_slabs_and_edges
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rows import distinct_rows
 
@@ -261,13 +261,13 @@ def merged(t: Training, best: Solution) -> Solution:
 def _name(effects: Effects) -> str:
     """What a choice of effects is called in a report: the set that it is, whatever its mirrors and :data:`RARE` effects."""
     for name, one in SETS.items():
-        if replace(one.with_slabs_and_edges_of(effects), mirrors=effects.mirrors) == effects:
+        if replace(with_slabs_and_edges(one, effects), mirrors=effects.mirrors) == effects:
             return name
     return str(effects)
 
 
 def cross_validate(t: Training, choice: Solution) -> ErrorModel | None:
-    """The errors of places held out; where they are few, of all, held out in turn. None where no whole spectra were measured."""
+    """The errors of places held out; where they are few, of all, held out in turn. None where not all are whole spectra."""
     whole = (
         isinstance(o.measured, SpectrumPixels) and (o.target.trust == 1.0).all()
         for o in t.observations.values()
@@ -299,7 +299,7 @@ def _folds(t: Training) -> list[np.ndarray]:
 
 
 def everyone(t: Training, choice: Solution) -> tuple[Solution, Model]:
-    """The choice fitted to all places, and its model."""
+    """The choice fitted to readings of all places, and its model."""
     choice = t.refined(choice, t.telling, t.options.iterations)
     return choice, with_residual(t, choice, list(t.observations), quick=t.options.quick)
 

@@ -208,7 +208,7 @@ class Problem:
         material: of each group, shape ``(G,)``.
         chains: measuring chains whose gain is unknown.
         gain_offset: whether a gain common to all paths is free.
-        energy: standard deviation a priori of scattered and mirrored shares from a sum of one.
+        energy: standard deviation a priori of the sum of S^2 and 1 - S^2, as fitted, from one.
         known_through: ln of the share that materials let through before any measurement, and its deviation, shape ``(2, M)``; None
             for that of the start.
     """

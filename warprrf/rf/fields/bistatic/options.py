@@ -16,7 +16,7 @@ from warprrf.device import DeviceLike
 from warprrf.rf.em.materials import assumed_permittivity
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.bistatic.observations import Place
-from warprrf.rf.tracing.model import LOBES, SETS, Effects, Model, Parameters
+from warprrf.rf.tracing.model import LOBES, SETS, Effects, Model, Parameters, with_slabs_and_edges
 from warprrf.rf.tracing.render import path_gains
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import Tracer
@@ -84,7 +84,7 @@ class FitOptions:
             for one in given
         ]
         if self.relevance is not None:
-            found = [one.with_slabs_and_edges_of(most) for one in found]
+            found = [with_slabs_and_edges(one, most) for one in found]
         return list(dict.fromkeys(found))
 
     def exponents(self, frequency_hz: float) -> tuple[int, ...]:

@@ -37,7 +37,7 @@ from warprrf.rf.fields.bistatic.observations import (
 )
 from warprrf.rf.fields.bistatic.options import SUB_PIXELS, FitOptions, evenly, needed
 from warprrf.rf.spectra.readings import Readings
-from warprrf.rf.tracing.model import SETS, Effects, Model, Parameters
+from warprrf.rf.tracing.model import SETS, Effects, Model, Parameters, with_slabs_and_edges
 from warprrf.rf.tracing.surface import Surface
 from warprrf.rf.tracing.tracer import Tracer, View, view_of
 
@@ -87,7 +87,7 @@ def trace(
     tell = progress or (lambda *_: None)
     wanted = replace(SETS["single"], mirrors=3) if effects is None else effects
     decided = needed(wanted, surface, places, device) if rare is None else rare
-    wanted = wanted.with_slabs_and_edges_of(decided)
+    wanted = with_slabs_and_edges(wanted, decided)
     keeps = keeps and rays_of(places, sub_pixels) <= MOST_KEPT
     together: dict[tuple[object, ...], list[int]] = {}  # places under one transmitter
     for k, place in enumerate(places):
@@ -246,7 +246,7 @@ class Training:
     def as_sought(self, effects: Effects) -> Training:
         """The same that chooses from slabs and edges as they were sought for ``effects``, and no more mirrors; of power alone
         from one candidate."""
-        every = (one.with_slabs_and_edges_of(effects) for one in self.candidates)
+        every = (with_slabs_and_edges(one, effects) for one in self.candidates)
         found = [replace(one, mirrors=min(one.mirrors, effects.mirrors)) for one in every]
         if len(found) > 1 and any(isinstance(one, ArraySpectra) for one in self.data):
             found = [replace(one, mirrors=effects.mirrors) for one in found]  # they hear the phases of all
