@@ -39,7 +39,7 @@ Progress = Callable[[str, int, int], None]
 """``progress(stage, done, total)``: called by long work; the library itself never prints.
 
 Stages come one after the other. ``done`` never falls within one, and starts above zero where an earlier run's work is
-kept; the last call of a stage has ``done == total``. What shows it makes seconds of it with :class:`TimeLeft`.
+kept; the last call of a stage has ``done == total``.
 """
 
 
@@ -60,9 +60,7 @@ RECENT_S = 15.0  # the rate is that of so many seconds
 class TimeLeft:
     """Seconds left of a stage, by its recent rate, for all that shows progress: bars, JSON lines, the viewer.
 
-    A callback stays three plain arguments, which anybody can write and call; only who shows it needs a clock. What an
-    earlier run did does not count, as the rate is of differences. Nor does the first step once there is a second one:
-    it may have compiled kernels.
+    What an earlier run did does not count. Nor does the first step once there is a second one: it may have compiled kernels.
     """
 
     def __init__(self) -> None:

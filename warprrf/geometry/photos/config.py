@@ -1,7 +1,4 @@
-"""Settings of stage 1. Lengths in metres; the defaults suit a furnished room that 50 to 150 photos show.
-
-What nobody has had reason to change is a constant beside its use.
-"""
+"""Settings of stage 1. Lengths in metres; the defaults suit a furnished room that 50 to 150 photos show."""
 
 from __future__ import annotations
 
