@@ -34,7 +34,7 @@ PACKAGES = (
 )
 
 VERSIONS = {
-    "geometry": 7,
+    "geometry": 8,
     "renderer": 1,
     "metrics": 1,
     "exact": 2,

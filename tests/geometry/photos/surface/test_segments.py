@@ -1,17 +1,12 @@
 """Depth maps made flat, in a box whose walls have a colour each."""
 
 import numpy as np
-import pytest
 import views
 
 from warprrf.geometry.photos.posed.images import PosedPhotos
 from warprrf.geometry.photos.surface.fusion import _flat
 from warprrf.geometry.photos.surface.segments import (
-    BLUR_PX,
-    COARSENESS,
-    LEAST_PX,
     UNSURE,
-    cut_by_colour,
     segments_of,
     with_segments,
 )
@@ -45,17 +40,6 @@ def rough(noise=0.01):
     """Depths of the rims alone, with errors."""
     factor = 1 + noise * np.random.default_rng(3).standard_normal(TRUE.shape)
     return np.where(RIM, factor * TRUE, 0.0)
-
-
-def test_segments_are_those_of_scikit_image():
-    felzenszwalb = pytest.importorskip("skimage.segmentation").felzenszwalb
-    rng = np.random.default_rng(6)
-    colours = np.round(200 * PHOTO + rng.integers(0, 40, PHOTO.shape)).astype(np.uint8)
-    colours[5:11, 5:15] = colours[-11:-5, -15:-5] = 0  # too small for segments of their own
-    expected = felzenszwalb(colours, scale=COARSENESS, sigma=BLUR_PX, min_size=LEAST_PX)
-    pairs = np.unique(np.stack([expected.ravel(), cut_by_colour(colours).ravel()]), axis=1)
-    assert expected.max() > 10
-    assert all(len(pairs[0]) == len(np.unique(side)) for side in pairs)  # one of theirs for each of ours
 
 
 def test_walls_are_whole_and_smooth_where_their_rims_alone_are_known():

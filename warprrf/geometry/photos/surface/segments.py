@@ -13,18 +13,13 @@ walls; the figures change little with any of them.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import warp as wp
-from scipy import ndimage
 
-from warprrf.device import launch
+from warprrf.device import require
 from warprrf.geometry.photos.posed.images import resized
 from warprrf.geometry.splats.camera import Camera
-from warprrf.kernels.segments import cut
 
-COARSENESS = 60.0  # of the segments: scikit-image's ``scale``, of colours from 0 to 255
+COARSENESS = 60.0  # of the segments, of colours from 0 to 255
 BLUR_PX, LEAST_PX = 0.6, 80  # before a photo is cut, and pixels of the smallest segment
 TRIALS, DRAWN = 48, 300  # planes through three proved pixels, and pixels that they are judged by
 UNSURE = 0.02  # where a plane's standard deviation is larger than this part of the depth, it says nothing
@@ -65,30 +60,10 @@ def with_segments(
 
 def segments_of(photo: np.ndarray, view: Camera) -> np.ndarray:
     """A number for the segment of each pixel of ``view`` in its ``photo``, in [0, 1], shape ``(H, W, 3)``, of any size."""
-    return cut_by_colour(resized(np.round(255 * np.asarray(photo)).astype(np.uint8), view))
-
-
-def cut_by_colour(colours: np.ndarray) -> np.ndarray:
-    """A number for the segment of each pixel of a photo ``(H, W, 3)`` of bytes, shape ``(H, W)``."""
-    smooth = ndimage.gaussian_filter(colours / 255.0, [BLUR_PX, BLUR_PX, 0])
-    number = np.arange(smooth[..., 0].size, dtype=np.int32).reshape(smooth.shape[:2])
-    pairs: list[tuple[Any, Any]] = [
-        (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]),
-        (np.s_[:-1, :-1], np.s_[1:, 1:]), (np.s_[1:, :-1], np.s_[:-1, 1:]),
-    ]  # fmt: skip
-    first, second = (np.concatenate([number[pair[k]].ravel() for pair in pairs]) for k in (0, 1))
-    apart = [np.sqrt(((smooth[a] - smooth[b]) ** 2).sum(axis=2)).ravel() for a, b in pairs]
-    difference, count = np.concatenate(apart).astype(np.float32), len(first)
-    ascending, order = (
-        wp.array(np.resize(x, 2 * count), device="cpu")
-        for x in (difference, np.arange(count, dtype=np.int32))
-    )
-    wp.utils.radix_sort_pairs(ascending, order, count)
-    parent = wp.array(number.ravel(), device="cpu")
-    edges = [first, second, difference, order[:count]]
-    alone = np.ones(number.size, dtype=np.int32), np.zeros(number.size, dtype=np.float32)
-    launch(cut, 1, [*edges, COARSENESS / 255, LEAST_PX, parent, *alone], device="cpu")
-    return parent.numpy().reshape(number.shape)
+    segmentation = require("skimage.segmentation", extra="photos")
+    colours = resized(np.round(255 * np.asarray(photo)).astype(np.uint8), view)
+    segment = segmentation.felzenszwalb(colours, scale=COARSENESS, sigma=BLUR_PX, min_size=LEAST_PX)
+    return np.asarray(segment)
 
 
 def _plane(
