@@ -107,7 +107,7 @@ def test_a_part_whose_goldens_change_is_counted_up(part):
 
 def test_geometry_is_counted_up_with_its_steps():
     assert (tables.common.VERSIONS["geometry"], pipeline.VERSIONS) == (
-        7,
+        8,
         {
             "features": 3,
             "matches": 2,
@@ -115,7 +115,7 @@ def test_geometry_is_counted_up_with_its_steps():
             "photos": 1,
             "initial": 4,
             "refined": 2,
-            "depth": 3,
+            "depth": 4,
             "surface": 10,
         },
     )
