@@ -281,9 +281,7 @@ start = time.perf_counter()
 field = wr.RadioField.fit(rec, train, model="bistatic", seed=0)
 print(f"bistatic: {time.perf_counter() - start:.1f} s, {field.report['materials']} materials")
 for choice in field.report["choices"]:
-    print(
-        f"  {choice['term']:<28}{choice['held_out_rmse_db']:6.2f} dB  {'kept' if choice['kept'] else 'left out'}"
-    )
+    print(f"  {choice['term']:<28}{choice['rmse_db']:6.2f} dB  {'kept' if choice['kept'] else 'left out'}")
 losses = harmonic.report["losses"]["gain"]
 figure, ax = plt.subplots(figsize=(6, 2.6))
 ax.plot(losses, color="#0b6e99")

@@ -64,7 +64,10 @@ def test_no_figure_is_typed(page):
     assert {*re.findall(r"\d+\.\d+ (?:dB|%|n?s|ms|mm|cm|degrees|times)(?!\w)", typed)} <= SETTINGS
 
 
-STALE = {"beams", "bistatic", "filmed", "filmed-cafe", "lobby", "lobby_seeds", "map", "measurements", "suggest"}
+STALE = {
+    "arrays", "bare_mesh", "beams", "bistatic", "edited", "filmed", "filmed-cafe", "lobby", "lobby_seeds", "locate", "map",
+    "measured_flat", "measured_hall", "measured_office", "measurements", "office", "outside", "suggest",
+}  # fmt: skip
 """Result files of before what they depend on computed something else; their pages say so. What is made anew leaves this list."""
 
 
@@ -84,7 +87,7 @@ def test_result_files_say_which_code_made_them_and_whether_it_is_todays():
 
 GOLDENS = {
     "bistatic": (
-        13,
+        14,
         "d2bcbb07",
         ("bistatic_field", "bistatic_field_of_a_bare_mesh", "bistatic_field_with_held_out_receivers"),
     ),

@@ -77,6 +77,7 @@ class View:
         receivers: positions [m], shape ``(R, 3)``.
         hits: what the rays hit.
         paths: line of sight and mirror paths, L in all.
+        effects: whose mirrors, slabs and edges ``paths`` were sought over.
         records: tables by sequence, of those that were asked for; of line of sight and mirrors under :data:`SPECULAR`, one row
             for each of ``paths``.
         keeps: whether what is made when it is first asked for is kept.
@@ -86,6 +87,7 @@ class View:
     receivers: np.ndarray
     hits: Hits
     paths: MirrorPaths
+    effects: Effects
     records: dict[str, Records] = field(repr=False)
     keeps: bool = True
     _kept: Cache = field(init=False, repr=False, default_factory=lambda: Cache(2))
@@ -133,7 +135,9 @@ class View:
         hits = replace(h, origins=h.origins[[k]], face=h.face[rays], range_m=h.range_m[rays])
         paths, direct = self.paths.of(np.array([k])), self.records[SPECULAR].take(own)
         direct = replace(direct, ray=np.arange(len(paths), dtype=np.int32))
-        return View(self.tracer, self.receivers[[k]], hits, paths, {SPECULAR: direct}, self.keeps)
+        return View(
+            self.tracer, self.receivers[[k]], hits, paths, self.effects, {SPECULAR: direct}, self.keeps
+        )
 
     def without_records(self) -> View:
         """The same that keeps no records but those of line of sight and mirrors."""
@@ -286,7 +290,9 @@ class Tracer:
         """
         places = np.asarray(receivers, np.float64).reshape(-1, 3)
         found = self.paths(places, effects) if paths is None else paths
-        return View(self, places, self.grid.hit(places), found, {SPECULAR: self.specular(found)}, keeps)
+        return View(
+            self, places, self.grid.hit(places), found, effects, {SPECULAR: self.specular(found)}, keeps
+        )
 
     def trace(self, view: View, wanted: dict[str, tuple[str, str]], most: int) -> dict[str, Records]:
         """Tables of the sequences ``wanted`` of what a receiver sees, with up to ``most`` slabs, by name; see :func:`sequences`."""

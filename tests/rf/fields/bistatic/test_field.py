@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from warprrf.rf.fields.bistatic.gauss_newton import Problem, layout_of
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, WeighedPaths
 from warprrf.rf.fields.bistatic.merging import _mirror_changes
 from warprrf.rf.fields.bistatic.observations import Columns
+from warprrf.rf.fields.bistatic.options import FitOptions
 from warprrf.rf.fields.bistatic.training import trace
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.beam import BeamOperator
@@ -163,6 +165,16 @@ def test_some_of_many_receivers_decide_and_all_are_learned_from(scene, data, fie
     assert psnr(kept, data.subset(left)) > psnr(alone, data.subset(left)) + 0.5
 
 
+def test_receivers_that_decide_are_spread_over_the_order_in_which_they_came():
+    """A receiver that was carried along a line would else be known by the line's beginning."""
+    place, held = SimpleNamespace(chain=""), np.arange(1, 100, 4)
+    known = training.Training(FitOptions(), None, [], [place] * 100, held, [], None, None)
+    for times in (1, 2):
+        few = known.few(times)
+        assert len(few) == times * training.MOST_TO_CHOOSE and not np.isin(few, held).any()
+        assert few[0] == 0 and few[-1] == 99 and np.diff(few).max() <= 8
+
+
 def test_ten_times_better_than_the_nearest_measurement(field, data):
     test = data.subset(np.arange(6, 10))
     ours = evaluate(test, field.spectrum)
@@ -178,6 +190,19 @@ def test_a_transmitter_never_seen_is_as_good(scene, field, data):
     moved = spectra(scene, RECEIVERS[[2, 4, 6, 8]], transmitter=other)
     assert psnr(field, moved, other) > psnr(field, data.subset(np.arange(6, 10))) - 4
     assert psnr(field, moved, other) > psnr(field, moved) + 8  # and it does depend on the transmitter
+
+
+def test_a_view_is_of_its_link_and_of_no_fewer_mirrors(field):
+    view = field.view(RECEIVERS[3])
+    assert field.spectrum(RECEIVERS[3], TX, view=view).total_path_gain > 0
+    for asked in ((RECEIVERS[2], TX), (RECEIVERS[3], TX + 0.1)):
+        for ask in (field.spectrum, field.paths):
+            with pytest.raises(ValueError, match=r"view: got one of (receivers|transmitter) \["):
+                ask(*asked, view=view)
+    fewer = replace(field, effects=replace(field.effects, mirrors=0))
+    assert fewer.spectrum(RECEIVERS[3], view=view).total_path_gain > 0
+    with pytest.raises(ValueError, match=r"view: got one of \[0, 0, 0\] mirrors, slabs and edges"):
+        field.path_gains(fewer.view(RECEIVERS[3]))
 
 
 def test_paths_carry_the_spectrum_and_line_of_sight_is_exact(field):

@@ -355,7 +355,7 @@ class BistaticField(RadioField):
         """
         field = self.on_grid(shape)
         if view is not None:
-            return field._seen(view, uncertainty)
+            return field._seen(_of_link(view, receivers, transmitter), uncertainty)
         look = partial(field._trace_spectrum, uncertainty=uncertainty)
         return field._looked(receivers, transmitter, look)
 
@@ -394,7 +394,7 @@ class BistaticField(RadioField):
             return super().paths(
                 receivers, transmitter, max_paths, store=store, client=client, progress=progress
             )
-        return self._paths_of(view, max_paths)
+        return self._paths_of(_of_link(view, receivers, transmitter), max_paths)
 
     def _trace_paths(self, receiver: np.ndarray, transmitter: np.ndarray, max_paths: int | None) -> Paths:
         return self._paths_of(self._view(receiver, transmitter), max_paths)
@@ -467,7 +467,7 @@ class BistaticField(RadioField):
         """Path gain of all that is seen, by sequence of interactions.
 
         Raises:
-            ValueError: for a view of another geometry, carrier, air or grid.
+            ValueError: for a view of another geometry, carrier, air or grid, or of fewer mirrors, slabs or edges.
         """
         check_type("view", view, View)
         loss = 0.0 if self.air is None else self.air.loss_per_m(self.frequency_hz)
@@ -476,6 +476,9 @@ class BistaticField(RadioField):
             raise ValueError(
                 "view: got one of another geometry, carrier, air or grid, expected this field's own"
             )
+        sought, own = ([e.mirrors, e.transmissions, e.diffractions] for e in (view.effects, self.effects))
+        if np.less(sought, own).any():
+            raise ValueError(f"view: got one of {sought} mirrors, slabs and edges, expected at least {own}")
         return path_gains(view, self.state)
 
     def tracer(self, transmitter: ArrayLike | None = None) -> Tracer:
@@ -586,6 +589,15 @@ class BistaticField(RadioField):
     @classmethod
     def _put_together(cls, tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict[str, Any]:
         return files.put_together(tensors, header)
+
+
+def _of_link(view: View, receivers: ArrayLike, transmitter: ArrayLike | None) -> View:
+    """``view``, if it is of this link."""
+    ends = (receivers, view.receivers), (transmitter, view.tracer.transmitter)
+    for name, (given, own) in zip(("receivers", "transmitter"), ends, strict=True):
+        if given is not None and not np.array_equal(np.ravel(given), np.ravel(own)):
+            raise ValueError(f"view: got one of {name} {np.ravel(own).tolist()}, expected {given}")
+    return view
 
 
 _ARRAYS = {"material": index_to("G", "G"), "residual": Expected("2 X", -MOST_NEPERS, MOST_NEPERS)}

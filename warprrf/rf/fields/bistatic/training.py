@@ -204,9 +204,9 @@ class Training:
         return np.setdiff1d(np.arange(len(self.places)), self.held)
 
     def few(self, times: int) -> np.ndarray:
-        """Places that trial fits learn from, those of every chain among them."""
+        """Places that trial fits learn from, up to ``times`` :data:`MOST_TO_CHOOSE`, those of every chain among them."""
         others = np.setdiff1d(self.kept, self.always)
-        chosen = others[: max(times * MOST_TO_CHOOSE - len(self.always), 0)]
+        chosen = evenly(others, max(times * MOST_TO_CHOOSE - len(self.always), 0))
         return np.union1d(self.always, chosen).astype(int)
 
     @property
@@ -388,7 +388,7 @@ class Training:
 
     def note(self, what: str, kept: bool, loss: float) -> None:
         """Log a choice."""
-        self.log.append({"term": what, "kept": bool(kept), "held_out_rmse_db": float(np.sqrt(loss))})
+        self.log.append({"term": what, "kept": bool(kept), "rmse_db": float(np.sqrt(loss))})
 
 
 def _counted(progress: Progress | None, count: int, total: int) -> Callable[..., None]:
