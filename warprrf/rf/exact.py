@@ -86,7 +86,7 @@ class DiffusePaths(Rows):
 
 
 @dataclass(frozen=True)
-class _Beams:
+class _Bundle:
     """Rays that went ``length_m`` (N,) from the receiver to where they start, along the directions ``ray`` (N,) of its
     grid, over ``sequence``; solid angles of ``hits`` hold what they lost on the way. Each stands for ``times`` rays of the grid."""
 
@@ -171,7 +171,7 @@ class ExactEngine:
         if not e.scatterings:
             return
         hits = self._tracer.grid.hit(receiver)
-        first = _Beams(hits, np.arange(len(hits.face)), np.zeros(len(hits.face)), "")
+        first = _Bundle(hits, np.arange(len(hits.face)), np.zeros(len(hits.face)), "")
         waiting = [first]
         while waiting:
             rays = waiting.pop()
@@ -183,7 +183,7 @@ class ExactEngine:
             depth = rays.sequence.count("S") + 1
             for own in reversed(met if rays is first else [rays]):
                 if rays is first and e.scatter_mirror:
-                    waiting.append(self._on(own, self._tracer.turned(own.seen), own.reach_m, "M"))
+                    waiting.append(self._on(own, self._tracer.reflected(own.seen), own.reach_m, "M"))
                 if depth < e.scatterings:
                     waiting.append(self._scattered_on(own, depth))
 
@@ -207,7 +207,7 @@ class ExactEngine:
             line_of_sight=bool((specular.kind == "los").any()),
         )
 
-    def _and_behind(self, rays: _Beams) -> Iterator[_Beams]:
+    def _and_behind(self, rays: _Bundle) -> Iterator[_Bundle]:
         """``rays``, and what those of them that pass slabs meet behind."""
         yield rays
         if self.mirrors.walls is None or not self.effects.scatter_mirror:
@@ -216,14 +216,14 @@ class ExactEngine:
         if len(behind.ray):
             yield self._on(rays, behind, rays.length_m, "T")
 
-    def _lit(self, rays: _Beams) -> Iterator[DiffusePaths]:
+    def _lit(self, rays: _Bundle) -> Iterator[DiffusePaths]:
         """What the transmitter lights where rays hit, and what it lights through slabs."""
         tracer = self._tracer
-        for name, records in tracer.lit(rays.seen, self.effects.transmissions).items():
+        for name, records in tracer.lit_straight(rays.seen, self.effects.transmissions).items():
             out = rays.hits.points(records.ray) - tracer.transmitter
             yield self._paths(rays, records, np.linalg.norm(out, axis=1), out, name)
 
-    def _lit_by_mirrors(self, rays: _Beams) -> Iterator[DiffusePaths]:
+    def _lit_by_mirrors(self, rays: _Bundle) -> Iterator[DiffusePaths]:
         """What images of the transmitter light where some of the rays hit, and what they light through slabs."""
         tracer, patches = self._tracer, self.mirrors.patches
         most = 4 if rays.sequence else 16  # each is a search: fewer after they hit first
@@ -245,7 +245,7 @@ class ExactEngine:
             )
 
     def _paths(
-        self, rays: _Beams, records: Records, legs: np.ndarray, departure: np.ndarray, name: str
+        self, rays: _Bundle, records: Records, legs: np.ndarray, departure: np.ndarray, name: str
     ) -> DiffusePaths:
         """Paths over where rays hit, ``legs`` (N,) from the transmitter; ``records`` name rows of ``rays``."""
         grid = self._tracer.grid
@@ -255,7 +255,7 @@ class ExactEngine:
         power, direction = records.powers(self.materials), grid.directions[ray]
         return DiffusePaths(direction, power, length, departure, beams, name + rays.sequence)
 
-    def _scattered_on(self, rays: _Beams, depth: int) -> _Beams:
+    def _scattered_on(self, rays: _Bundle, depth: int) -> _Bundle:
         """Some of the rays scattered where they hit, one direction each, drawn by the cosine."""
         most = 9  # of a pixel
         ray, every = self._some(rays, most)
@@ -272,16 +272,16 @@ class ExactEngine:
         found = self._on(rays, Rays(hits, ray, surface), rays.reach_m, "S")
         return replace(found, times=every * rays.times)
 
-    def _on(self, rays: _Beams, onward: Rays, length_m: np.ndarray, name: str) -> _Beams:
+    def _on(self, rays: _Bundle, onward: Rays, length_m: np.ndarray, name: str) -> _Bundle:
         """Rays that go on, ``length_m`` (N,) from the receiver, with what interactions leave of their solid angles."""
         hits, met, own = onward.hits, onward.after, rays.ray[onward.ray]
         if met is not None:
             width, power = self._tracer.grid.half_width, hits.solid_angle
             records = Records(met.index, met.angle, met.kind, power, own, half_width=width)
             hits = replace(hits, solid_angle=records.powers(self.materials))
-        return _Beams(hits, own, length_m[onward.ray], name + rays.sequence, rays.times)
+        return _Bundle(hits, own, length_m[onward.ray], name + rays.sequence, rays.times)
 
-    def _some(self, rays: _Beams, most: int) -> tuple[np.ndarray, int]:
+    def _some(self, rays: _Bundle, most: int) -> tuple[np.ndarray, int]:
         """Of the rays those that hit something, at most so many of a pixel (of more than by default, more): a lattice again. How
         many each of them stands for."""
         per_pixel = self._tracer.grid.per_pixel
@@ -290,7 +290,7 @@ class ExactEngine:
         place = rays.ray % per_pixel // rays.times
         return np.flatnonzero((rays.hits.face >= 0) & (place % every == every // 2)), every
 
-    def _met(self, rays: _Beams, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _met(self, rays: _Bundle, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Where the rows ``ray`` hit, their directions, and normals of what they meet, on the side that they meet, (N, 3) each."""
         direction = rays.hits.rays(ray)[1]
         normal = self.surface.mesh.face_normals[rays.hits.face[ray]]

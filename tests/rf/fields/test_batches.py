@@ -119,7 +119,7 @@ def test_answers_keep_their_places_when_the_caller_moves_on():
         np.testing.assert_array_equal(own, PLACES[1])
     for own in (many.transmitters, found.transmitter, ds.transmitter, empty.transmitter):
         np.testing.assert_array_equal(own, TX)
-    np.testing.assert_array_equal(field.spectrum(at, source, view=view).delay_s, before)
+    np.testing.assert_array_equal(field.spectrum(PLACES[1], TX, view=view).delay_s, before)
     field.spectrum(PLACES[1]).attributes["transmitter"] += 1.0  # what the next answer is reckoned from stays
     np.testing.assert_array_equal(field.spectrum(PLACES[1], TX, view=field.view(PLACES[1])).delay_s, before)
 

@@ -412,6 +412,6 @@ def test_what_counts_of_more_paths_is_what_is_traced_for_fewer(fewer):
     every = Effects(mirrors=1, transmissions=2, diffractions=1)
     view, few = BistaticField.prior(SHEET, frame, effects=every).view(RX), replace(every, **fewer)
     known = BistaticField.prior(SHEET, frame, effects=few).view(RX).paths
-    kept = view.kept_paths(few)
+    kept = view.counted_paths(few)
     assert 0 < len(known) == kept.sum() < len(kept)
     np.testing.assert_allclose(np.sort(view.paths.delay_m[kept]), np.sort(known.delay_m), rtol=1e-12)

@@ -1,4 +1,4 @@
-"""Propagation paths: line of sight and mirror reflections by the image method, and what is made of path lists."""
+"""Propagation paths without scattering: line of sight, mirrors (image method), slabs, edges; and what is made of path lists."""
 
 from warprrf.lazy import attach
 

@@ -30,14 +30,14 @@ from warprrf.rows import Rows
 
 @dataclass(frozen=True)
 class MirrorPaths(Rows):
-    """Line of sight and mirror paths of several receivers, L rows, over up to K mirrors and slabs.
+    """Paths without scattering of several receivers, L rows: line of sight, over up to K mirrors and slabs, and over edges.
 
     Attributes:
         receiver: Index of the receiver, shape ``(L,)``.
         patch: Patches that mirror, from the transmitter on, -1 for a slab and past the last, shape ``(L, K)``.
         slab: Faces by which slabs are entered, -1 for a mirror and past the last, shape ``(L, K)``.
         point: Points where either is met [m], shape ``(L, K, 3)``; NaN past the last.
-        share: Part of the field that is not blocked, shape ``(L,)``, in (0, 1].
+        share: Of the field of a free path of this length, shape ``(L,)``: what is not blocked, in (0, 1]; what an edge diffracts.
         length_m: Unfolded length, shape ``(L,)``.
         excess_m: What slabs make it longer by for a wave, shape ``(L,)``; 0 where their materials were not asked.
         arrival: Unit direction from the receiver to what it sees last, shape ``(L, 3)``.

@@ -24,7 +24,7 @@ from warprrf.geometry.mesh import as_mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.options import RARE
+from warprrf.rf.fields.bistatic.options import OPTIONAL
 from warprrf.rf.positions import check_positions, check_receivers, question_unit
 from warprrf.rf.relevance.model import FullModel, effects_of, full_field, lobe_name
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -381,7 +381,7 @@ def _reason(model: FullModel, name: str, lost: frozenset[str]) -> str:
     if name == "gas":
         rate, longest = model.gas_db_per_m, model.longest_m
         return f"{1e3 * rate:.2g} dB/km, longest path {longest:.1f} m: at most {rate * longest:.2g} dB"
-    if name in RARE:
+    if name in OPTIONAL:
         return _rare(model, name)
     if name.startswith("lobe_"):
         return _lobe(model, int(name.removeprefix("lobe_")))

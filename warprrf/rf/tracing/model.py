@@ -32,8 +32,7 @@ class Effects:
     Attributes:
         line_of_sight: whether the transmitter is seen directly.
         mirrors: most mirror reflections on a path without scattering, 0 to 3.
-        scatterings: most scatterings on a path, 0 to 3; from the second on surfaces light each other evenly over half a
-            metre.
+        scatterings: most scatterings on a path, 0 to 3; from the second on by radiosity, on elements of half a metre in a room.
         mirror_scatter: whether mirrors light surfaces that scatter.
         scatter_mirror: whether lit surfaces are seen in mirrors, and through slabs. Sionna RT has no such paths.
         transmissions: most slabs that a path passes, 0 to 8.
@@ -67,11 +66,12 @@ SETS = {
     "room": Effects(scatter_mirror=False, transmissions=0, diffractions=0),
     "everything": Effects(transmissions=0, diffractions=0),
 }
-"""Sets of effects that a fit tries. None has slabs or edges: ``effects="auto"`` adds them where the scene needs them."""
+"""Sets of effects that a fit tries: one bounce; all of a room but what is seen in mirrors; that too. None has slabs or edges:
+``effects="auto"`` adds them where the scene needs them."""
 
 MOST_NEPERS = 40.0  # of any logarithm: 174 dB from one, where no surface is
 ROUGHNESS = 2.0
-"""Power of the carrier that roughness goes with (Ament 1953)."""
+"""Exponent of frequency in ln(1 - S^2) (Ament 1953)."""
 ARRAYS = {
     "log_weight": Expected("G L", most=MOST_NEPERS),
     "log_excess": Expected("G", -MOST_NEPERS, MOST_NEPERS),
@@ -88,12 +88,12 @@ class Parameters:
     Attributes:
         log_weight: ln of the lobe weights, shape ``(G, L)``; their sum is S^2.
         log_excess: ln(epsilon_r - 1), shape ``(G,)``.
-        log_mirror: ln of the share of |Gamma|^2 that is reflected as by a mirror, shape ``(G,)``; 1 - S^2.
+        log_mirror: ln of the share of |Gamma|^2 that is reflected as by a mirror, shape ``(G,)``; a prior holds it near 1 - S^2.
         lobes: exponents of the lobes, 0 for Lambertian, at most 1000 and each once.
         reciprocal: whether lobes scatter alike when transmitter and receiver change places. Those of Degli-Esposti et al.
             (2007), Sionna RT's, do not.
         log_gain: ln of a gain common to all paths (an uncalibrated receiver).
-        roughness: power of the carrier with which roughness counts; 2 by Ament (1953).
+        roughness: exponent of frequency in ln(1 - S^2); 2 by Ament (1953).
         log_through: ln of the power that passes its slab over what permittivity and thickness say, or, where those are not
             known, over what both faces let pass, shape ``(G,)``; by default 0.
         log_gains: ln of the unknown gains of measuring chains, shape ``(C,)``; only while a fit lasts.
@@ -149,11 +149,11 @@ class Parameters:
 
     @property
     def scattered_share(self) -> np.ndarray:
-        """Share of power that each group scatters under even light, ``(G,)``: lobe weights times 2 int F cos dcos."""
+        """Share of isotropic light that each group scatters, ``(G,)``: lobe weights times 2 int F cos dcos."""
         return self.weight.sum(axis=1) * fresnel_curves().even(self.log_excess)[0]
 
     def scattered_over_even(self, group: np.ndarray, cosine: np.ndarray) -> np.ndarray:
-        """What groups (K,) scatter of light at cosines of incidence (K,), by what they do of as much even light, ``(K,)``."""
+        """What groups (K,) scatter of light at cosines of incidence (K,), over what they do of isotropic light, ``(K,)``."""
         curves = fresnel_curves()
         table = curves.at(curves.curves, self.log_excess)[0] / curves.even(self.log_excess)[0][:, None]
         found = table[group, np.rint((COSINES - 1) * cosine).astype(int)]
@@ -181,7 +181,7 @@ class Parameters:
 
         What is not scattered, exp(-(4 pi sigma_h / lambda)^2) (Ament 1953), is raised to the square of the ratio, or to
         another power where the data say so; the sum of both shares, the mix of lobes and the permittivity stay. What slabs
-        lose beside, as absorption does at one loss tangent, goes with the carrier; what more they let through stays.
+        lose beside, as absorption does at one loss tangent, goes with the carrier; a positive ``log_through`` stays.
         """
         if ratio == 1.0:
             return self
@@ -267,33 +267,33 @@ class Layout:
 
     @property
     def common_gain(self) -> int:
-        """Place of the common gain."""
+        """Index of the common gain."""
         return self.groups * self.stride
 
     @property
-    def carrier_power(self) -> int:
-        """Place of the power of the carrier."""
+    def roughness_exponent(self) -> int:
+        """Index of the exponent of frequency."""
         return self.groups * self.stride + self.gain
 
     def weight(self, group: np.ndarray) -> np.ndarray:
-        """Places of the lobe weights of each of ``group`` (K,), shape ``(K, L)``."""
+        """Indices of the lobe weights of each of ``group`` (K,), shape ``(K, L)``."""
         return self.stride * group[:, None] + np.arange(self.lobes)
 
     def excess(self, group: np.ndarray) -> np.ndarray:
-        """Places of the permittivity of each of ``group``."""
+        """Indices of the permittivity of each of ``group``."""
         return self.stride * group + self.lobes + EXCESS_COLUMN
 
     def mirror(self, group: np.ndarray) -> np.ndarray:
-        """Places of the mirror share of each of ``group``."""
+        """Indices of the mirror share of each of ``group``."""
         return self.stride * group + self.lobes + MIRRORED_COLUMN
 
     def let_through(self, group: np.ndarray) -> np.ndarray:
-        """Places of what each of ``group`` lets through, if that is free."""
+        """Indices of what each of ``group`` lets through, if that is free."""
         return self.stride * group + self.lobes + THROUGH_COLUMN
 
     def columns(self, groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where the parameters of each group begin in a table of those of ``groups`` alone, shape ``(G,)`` int32, and the places of
-        its columns in the vector."""
+        """Where the parameters of each group begin in a table of those of ``groups`` alone, shape ``(G,)`` int32, and the index of
+        each of its columns in the vector."""
         own = np.unique(groups)
         place = np.zeros(self.groups, np.int32)
         place[own] = self.stride * np.arange(len(own))
@@ -316,7 +316,7 @@ class Layout:
             like, log_through=through, log_weight=table[:, : self.lobes].copy(), log_excess=excess,
             log_mirror=mirror, log_gains=vector[self.first_chain :].copy(),
             log_gain=float(vector[self.common_gain]) if self.gain else like.log_gain,
-            roughness=float(vector[self.carrier_power]) if self.roughness else like.roughness,
+            roughness=float(vector[self.roughness_exponent]) if self.roughness else like.roughness,
         )  # fmt: skip
 
     def slopes_at_ratio(self, p: Parameters, ratio: float) -> csr_matrix:
@@ -345,5 +345,5 @@ class Layout:
             change = np.log(ratio) * steeper * p.log_smooth  # of ln smooth
             rows = np.zeros((self.groups, self.stride))
             rows[:, :n], rows[:, mirrored] = (-fall * change)[:, None], change
-            found[: rows.size, self.carrier_power] = rows.reshape(-1, 1)
+            found[: rows.size, self.roughness_exponent] = rows.reshape(-1, 1)
         return found.tocsr()

@@ -43,7 +43,7 @@ class Hits:
     solid_angle: np.ndarray
     face: np.ndarray
     range_m: np.ndarray
-    kept: Cache = field(init=False, repr=False, default_factory=lambda: Cache(1))
+    cache: Cache = field(init=False, repr=False, default_factory=lambda: Cache(1))
 
     def rays(self, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of the rays of index ``ray`` (N,) where they start [m] and their unit vectors, shape ``(N, 3)``, and solid angles
@@ -64,7 +64,7 @@ class Light:
     """How a source illuminates what rays hit.
 
     Attributes:
-        strength: Omega cos(theta_i) / (4 pi d1)^2 [sr/m^2] if nothing throws a shadow; less what the air absorbs, shape ``(K,)``.
+        strength: Omega cos(theta_i) / (4 pi d1)^2 [sr/m^2] less what the air absorbs, shadows not counted, shape ``(K,)``.
         angle: cosines of incidence, of scattering, and of the angle to the mirror direction, shape ``(K, 3)``.
         point: where the rays hit [m], known where there is light, shape ``(K, 3)``.
     """
@@ -95,9 +95,9 @@ class RayGrid:
 
     Args:
         sub_pixels: square root of the rays per pixel.
-        loss_per_m: absorption by the air [neper/m].
-        nearest_m: distance of a source from what it lights counts as no less [m]; with 0 it counts as it is, and no ray sees more
-            than half of what the source sends.
+        loss_per_m: absorption of power by the air [neper/m].
+        nearest_m: least distance of a source from what it lights [m]: a smaller one counts as this. With 0 it counts as it is, and
+            no ray sees more than half of what the source sends.
         dtype: precision of angles and of light.
     """
 
@@ -171,7 +171,7 @@ class RayGrid:
             found[hit] = self.surface.tile_at(hits.face[hit], hits.points(hit), hits.rays(hit)[1])
             return found
 
-        return hits.kept.get("tile", make)
+        return hits.cache.get("tile", make)
 
     def tiles_met(self, hits: Hits) -> tuple[np.ndarray, np.ndarray]:
         """Which rays hit something, and the sides of tiles that they do."""

@@ -31,7 +31,8 @@ class Interactions(Rows):
 
     Attributes:
         index: group that each meets, or side of the element that sends, from the transmitter on, -1 for none, shape ``(N, K)``.
-        angle: its angles, see :mod:`warprrf.kernels.radio.records`, shape ``(N, K, 3)``.
+        angle: of each (cosine of incidence, turn of its plane [rad], thickness in wavelengths), of one that scatters three
+            cosines; see :mod:`warprrf.kernels.radio.records`; shape ``(N, K, 3)``.
         kind: ``MIRROR``, ``SCATTER``, ``SLAB``, ``SOURCE`` of the kernels or 0, shape ``(N, K)`` int8. What is rough is in the same
             column of all rows.
     """
@@ -71,10 +72,10 @@ class Records(Interactions):
     Attributes:
         power: path gain without interactions, shape ``(N,)``; where a ray sees what scatters or sends
             lambda^2 Omega cos(theta_i) / (4 pi d1)^2 or (lambda / 4 pi)^2 Omega. Its precision is that of what is computed.
-        ray: ray of the receiver's grid that sees it, or row of a specular path, or side of an element that is lit, ``(N,)``.
-        residual_row: which row of the residual holds the gain of the cell that its ray sees, -1 for none.
+        ray: what its maker sums over: rays of the receiver's grid, paths without scattering, or sides of elements, ``(N,)``.
+        residual_row: row of :attr:`Model.residual`: 0 where the transmitter lights the cell that is seen, else 1; -1 for none.
         reach_m: of what is seen through slabs, how far along the ray that is [m], shape ``(N,)``; None elsewhere.
-        half_width: half of the cosine's stretch that a ray stands for.
+        half_width: half the spacing of rays in the cosine of scattering, over which 1 / cosine is averaged.
     """
 
     power: np.ndarray
@@ -236,7 +237,7 @@ class Materials:
             :attr:`~warprrf.rf.tracing.tracer.Tracer.slabs`.
         material: row of each group in the parameters, shape ``(G,)``; by default groups are rows.
         side_group: group of each element's side, shape ``(E,)``; None where no element sends.
-        radiance: that each side sends [1/(m^2 sr)], in units of (4 pi / lambda)^2, shape ``(E,)``.
+        radiance: that each side sends [1/(m^2 sr)] where the transmitter gives cos(theta_i) / d1^2 [1/m^2], shape ``(E,)``.
     """
 
     def __init__(

@@ -1,9 +1,9 @@
 """From what receivers see and a model to the path gains that they get, and from those to spectra.
 
-Surfaces light each other: elements are a source that records may start from in the transmitter's place. Rays from every
-side of an element, density by the cosine, see what the transmitter lights; that is what the element gets of first
-scatterings. What elements get of others after that is even over each. Each ray's light is reflected as its angle of
-incidence has it. Elements are half a metre wide in a room.
+Surfaces light each other by radiosity: elements, half a metre wide in a room, get light and send it on in all directions alike,
+whatever their lobes. Rays from every side of an element, density by the cosine, see what the transmitter lights; that is what
+it gets of first scatterings. Each ray's light is reflected as its angle of incidence has it. Records of the sequence ``E`` start
+at elements.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class PathGains:
         return found
 
     def by_ray(self, names: Iterable[str] | None = None) -> np.ndarray:
-        """Of everything but those, or of the sequences ``names``, by the ray that sees it, shape ``(R K,)``."""
+        """Power of the sequences ``names``, by default all but :data:`SPECULAR`, by the ray that sees it, shape ``(R K,)``."""
         count, records = len(self.view.hits.face), self.records
         chosen = [n for n in (self.powers if names is None else names) if n != SPECULAR and n in self.powers]
         return sum((np.bincount(records[n].ray, self.powers[n], count) for n in chosen), np.zeros(count))
@@ -114,7 +114,7 @@ def path_gains(view: View, model: Model) -> PathGains:
         found[name] = model.parameters.gain * records.powers(materials)
         if 0 <= records.residual_row < learned:
             found[name] *= np.exp(model.residual[records.residual_row, view.cell(records.ray)])
-    found[SPECULAR] = np.where(view.kept_paths(model.effects), found[SPECULAR], 0.0)
+    found[SPECULAR] = np.where(view.counted_paths(model.effects), found[SPECULAR], 0.0)
     return PathGains(view, found, tables, model.parameters)
 
 
@@ -138,9 +138,9 @@ class Interreflection:
         most: slabs that first scatterings may pass, at most.
 
     Attributes:
-        side: of the element that each ray starts from, shape ``(K,)``; solids' inner ones have no rays.
+        side: of the element that each ray starts from, shape ``(K,)``; those that no light reaches have none.
         cosine: of each ray to the normal there, shape ``(K,)``.
-        lit: what the rays see of first scatterings, by sequence: of surfaces that the transmitter lights, ``"S"``, of those
+        tables: what the rays see of first scatterings, by sequence: of surfaces that the transmitter lights, ``"S"``, of those
             that it lights through slabs, ``"TS"``, and of lit ones that are seen through slabs, ``"ST"``. Records of
             irradiance where the transmitter gives cos(theta_i) / d1^2 [1/m^2].
     """
@@ -162,11 +162,11 @@ class Interreflection:
         hits = grid.hit_from(start, point[start], *(x.ravel() for x in turn))
         self.side, self.cosine = np.repeat(known, ELEMENT_RAYS), np.sqrt(1.0 - turn[0].ravel())
         rays = Rays(hits, np.arange(len(self.side)))
-        self.lit = tracer.lit(rays, most)
+        self.tables = tracer.lit_straight(rays, most)
         if most:
-            self.lit["ST"] = tracer.lit(tracer.behind(rays, most), 0)["S"]
+            self.tables["ST"] = tracer.lit_straight(tracer.behind(rays, most), 0)["S"]
         scale = np.float32(np.pi / ELEMENT_RAYS * (4.0 * np.pi / tracer.wavelength_m) ** 2)
-        self.lit = {name: replace(found, power=scale * found.power) for name, found in self.lit.items()}
+        self.tables = {name: replace(found, power=scale * found.power) for name, found in self.tables.items()}
         self._hit, met = grid.tiles_met(hits)
         self._met = surface.tile_side[met]
         self._left = (
@@ -181,16 +181,16 @@ class Interreflection:
 
 def irradiance(tracer: Tracer, p: Parameters, effects: Effects) -> np.ndarray | None:
     """Irradiance of elements' sides by surfaces that scattered before, under parameters of groups, in units in which the
-    transmitter gives cos(theta_i) / d1^2 [1/m^2], shape ``(E,)``: as much even light as they would scatter alike; None where
-    ``effects`` hold no second scattering."""
+    transmitter gives cos(theta_i) / d1^2 [1/m^2], shape ``(E,)``: that of isotropic light of which they would scatter as much;
+    None where ``effects`` hold no second scattering."""
     if effects.scatterings < 2:
         return None
     most, group, sides = effects.transmissions, tracer.surface.side_group, tracer.surface.element_sides
-    light = tracer.kept.get(("interreflection", most), lambda: Interreflection(tracer.of_transmitter, most))
+    light = tracer.cache.get(("interreflection", most), lambda: Interreflection(tracer.of_transmitter, most))
     materials = Materials(p, tracer.slabs, device=tracer.grid.device)
     share = p.scattered_share[group] / np.pi
     over_even = p.scattered_over_even(group[light.side], light.cosine)
-    tables = [table for name, table in light.lit.items() if name != "ST" or effects.scatter_mirror]
+    tables = [table for name, table in light.tables.items() if name != "ST" or effects.scatter_mirror]
     got = sum(np.bincount(light.side[r.ray], r.powers(materials) * over_even[r.ray], sides) for r in tables)
     if effects.mirror_scatter:
         for mirrored in (tracer.mirrored(slabs) for slabs in {0, most}):

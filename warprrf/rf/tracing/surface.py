@@ -57,10 +57,10 @@ ARRAYS = {
 
 @dataclass(frozen=True)
 class Parts:
-    """What walls part of a surface.
+    """Cells, and elements split where something stands on the surface.
 
     Attributes:
-        element: of each cell, shape ``(X,)``.
+        element: of each cell, after the split, shape ``(X,)``.
         parted: whether something stands between a cell's middle and that of one beside it, shape ``(X,)``.
         middle: tile in the middle of each cell, shape ``(X,)``.
         tree: of places in these tiles [m].
@@ -82,7 +82,7 @@ class Surface:
         patch: planar patch of each face, -1 for none, shape ``(F,)`` int32.
         plane_normal, plane_offset: planes of the patches, ``normal . x = offset`` [m], shapes ``(P, 3)``, ``(P,)``.
         group: group of each face, the smallest unit that may be of a material of its own, shape ``(F,)`` int32.
-        material: which groups are taken for the same material before any measurement, shape ``(G,)`` int32.
+        material: number of the material that each group is taken for before any measurement, shape ``(G,)`` int32.
         appearance: what tells groups apart before any measurement, scaled so that 1 tells materials apart: log chromaticities
             and log luminance as photos show them, else place and extents, shape ``(G, 4)`` or ``(G, 6)``; NaN where names
             tell it.
@@ -342,7 +342,7 @@ class Surface:
 
         return self._uploaded.get((str(where), real), upload)
 
-    def slabs(self, frequency_hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def slab_properties(self, frequency_hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What each group lets through before any measurement: complex permittivity, 0 where that or the thickness is not known;
         thickness in wavelengths; and, where it is not known, ln of the share of power that is not absorbed, by an assumed
         one, else 0; shape ``(G,)`` each."""
@@ -365,15 +365,15 @@ class Surface:
         )
 
     def table(self, frequency_hz: float) -> SurfaceTable:
-        """Its groups as smooth surfaces, before any measurement: slabs as far as :meth:`slabs` knows them, else half-spaces."""
-        eta, thickness, _ = self.slabs(frequency_hz)
+        """Its groups as smooth surfaces, before any measurement: slabs where that is known, else half-spaces."""
+        eta, thickness, _ = self.slab_properties(frequency_hz)
         known, none = np.abs(eta) > 0, np.zeros(self.groups, np.int32)
         thickness_m = np.where(known, thickness * SPEED_OF_LIGHT / frequency_hz, np.inf)
         return SurfaceTable(np.where(known, eta, LOSSY), thickness_m, np.zeros(self.groups), none, none > 0)
 
     def walls(self, frequency_hz: float, most: int, device: DeviceLike = None) -> Walls:
-        """Its faces that may be passed, as far as :meth:`slabs` tells, up to ``most`` on one way."""
-        eta, thickness, absorbed = self.slabs(frequency_hz)
+        """Its faces that may be passed, as far as :meth:`slab_properties` tells, up to ``most`` on one way."""
+        eta, thickness, absorbed = self.slab_properties(frequency_hz)
         wavelength_m, known = SPEED_OF_LIGHT / frequency_hz, np.abs(eta) > 0
         permittivity = np.where(known, eta, 1.0 + 0.5j * absorbed / (np.pi * thickness))[self.group]
         return Walls.of_slabs(

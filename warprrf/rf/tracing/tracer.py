@@ -4,9 +4,9 @@ Rays fill the sphere around a receiver. What they hit is connected to the transm
 of it that light the piece of surface there (``MS``); some go on turned at a mirror and are connected there (``SM``,
 ``MSM``). Elements of the surface send on what they got of others (:mod:`warprrf.rf.tracing.render`), and are seen directly
 (``E``) or in a mirror (``EM``). Slabs (``T``) may stand in the way of light to a surface (``TS``; ``MTS``, before or behind
-the mirror), or of sight (``ST``, ``ET``), where rays go straight on. Line of sight and mirrors alone, through slabs too,
-come from the image method (:mod:`warprrf.rf.paths.mirror_paths`). What slabs let rays pass, and how strong paths over edges
-are, follows materials as they are taken to be before any measurement; else tables hold geometry alone.
+the mirror), or of sight (``ST``, ``ET``), where rays go straight on. Paths without scattering, through slabs and over edges
+too, come from :mod:`warprrf.rf.paths`. Tables hold geometry alone, but for two things that follow materials as they are taken to
+be before any measurement, and are not fitted: through which slabs rays pass, and how strong paths over edges are.
 
 A :class:`Tracer` belongs to a surface, a transmitter and a grid of rays; what it traced gives the :class:`View` of a receiver.
 """
@@ -45,12 +45,12 @@ UNMODELLED = {("MTS", "M"), ("MTS", "T")}
 """Ways of light and of sight that are not traced together."""
 SPECULAR = "specular"
 """Name of the table of paths without scattering."""
-_TRACED = Cache(6)  # a lobby's take up to 90 MB each; the bound is the process's, not a surface's
+_TRACED = Cache(6)  # tracers of a lobby take up to 90 MB each; the bound is the process's, not a surface's
 
 
 def sequences(effects: Effects) -> dict[str, tuple[str, str]]:
     """How a surface is lit, and how it is seen, in the tables that ``effects`` want besides :data:`SPECULAR`, by their names: from
-    the transmitter to the receiver, and the most slabs on each of those ways.
+    the transmitter to the receiver and, where slabs may be passed, the most on either way (``"TS3"``).
 
     Lit: ``"S"`` by the transmitter, ``"MS"`` by its images in mirrors, ``"TS"`` through slabs, ``"MTS"`` through slabs before or
     behind a mirror; ``"E"``: it is an element that sends on what it got of others. Seen: ``""`` directly, ``"M"`` in a mirror,
@@ -76,10 +76,9 @@ class View:
         tracer: surface, transmitter and grid.
         receivers: positions [m], shape ``(R, 3)``.
         hits: what the rays hit.
-        paths: line of sight and mirror paths, L in all.
+        paths: those without scattering, L in all.
         effects: whose mirrors, slabs and edges ``paths`` were sought over.
-        records: tables by sequence, of those that were asked for; of line of sight and mirrors under :data:`SPECULAR`, one row
-            for each of ``paths``.
+        records: tables by sequence, of those that were asked for; under :data:`SPECULAR` one row for each of ``paths``.
         keeps: whether what is made when it is first asked for is kept.
     """
 
@@ -105,7 +104,7 @@ class View:
 
     @property
     def outward(self) -> np.ndarray:
-        """Way of each path of one receiver from the transmitter to its first point [m], shape ``(L, 3)``."""
+        """Vector from the transmitter to the first point of each path of one receiver [m], shape ``(L, 3)``."""
         first = self.paths.point[:, 0]
         return np.where(np.isnan(first), self.receivers[0], first) - self.tracer.transmitter
 
@@ -144,8 +143,8 @@ class View:
         hits = replace(self.hits)
         return replace(self, hits=hits, records={SPECULAR: self.records[SPECULAR]}, keeps=False)
 
-    def kept_paths(self, effects: Effects) -> np.ndarray:
-        """Which line of sight and mirror paths count, shape ``(L,)`` bool."""
+    def counted_paths(self, effects: Effects) -> np.ndarray:
+        """Which ``paths`` count, shape ``(L,)`` bool."""
         order, slabs = self.paths.order, (self.paths.code == SLAB).sum(axis=1)
         few = (order <= effects.mirrors) & (slabs <= effects.transmissions)
         few &= ~self.paths.over_edge | (effects.diffractions > 0)
@@ -155,7 +154,7 @@ class View:
 @dataclass(frozen=True)
 class Rays:
     """Rays and what they hit: ``ray`` of the receiver's grid that each belongs to, and the interactions between the hit and
-    the receiver, if any; ``straight``: slabs alone."""
+    the receiver, if any; ``straight``: those are slabs alone."""
 
     hits: Hits
     ray: np.ndarray
@@ -171,7 +170,7 @@ class Tracer:
 
     Attributes:
         wavelength_m: wavelength.
-        kept: what belongs to the transmitter, by name.
+        cache: what belongs to the transmitter, by name.
         materials: last ones that light was sent on by, see :func:`~warprrf.rf.tracing.render.materials_of`.
     """
 
@@ -188,7 +187,7 @@ class Tracer:
         self.frequency_hz = frequency_hz
         self.wavelength_m = SPEED_OF_LIGHT / frequency_hz
         self._first_grid = grid
-        self.kept = Cache(12)  # all kinds under two bounds of slabs and of bounces
+        self.cache = Cache(12)  # all kinds under two bounds of slabs and of bounces
         self.materials = Cache(2)
 
     @classmethod
@@ -229,26 +228,26 @@ class Tracer:
         return first
 
     def mirrored(self, most: int = 0) -> MirroredLight:
-        """Images of the transmitter that light faces; with ``most`` those that do so through slabs alone, up to that many."""
-        return self.kept.get(("mirrored", most), lambda: MirroredLight(self, most))
+        """Images of the transmitter that light faces; with ``most`` those that need slabs to do so, up to that many."""
+        return self.cache.get(("mirrored", most), lambda: MirroredLight(self, most))
 
     @property
     def images(self) -> MirrorImages:
         """Images of the transmitter in the surface's mirrors, whose outlines may be torn."""
         s, device = self.surface, self.grid.device
-        return self.kept.get(
+        return self.cache.get(
             "images", lambda: MirrorImages(s.patches, self.transmitter, slack_m=MIRROR_SLACK_M, device=device)
         )
 
     def walls(self, most: int) -> Walls:
         """What may be passed, up to ``most`` slabs on one way."""
         make = partial(self.surface.walls, self.frequency_hz, most, self.grid.device)
-        return self._walls or self.kept.get(("walls", most), make)
+        return self._walls or self.cache.get(("walls", most), make)
 
     @property
     def slabs(self) -> tuple[np.ndarray, np.ndarray]:
         """Permittivity and thickness in wavelengths of each group, as :class:`Materials` takes them."""
-        return self.kept.get("slabs", lambda: self.surface.slabs(self.frequency_hz)[:2])
+        return self.cache.get("slabs", lambda: self.surface.slab_properties(self.frequency_hz)[:2])
 
     def paths(self, receivers: np.ndarray, effects: Effects, progress: Progress | None = None) -> MirrorPaths:
         """Line of sight and mirror paths of ``receivers`` (R, 3) that ``effects`` want, through slabs and over edges too."""
@@ -259,7 +258,7 @@ class Tracer:
         )
         if not effects.diffractions:
             return found
-        edges = self.kept.get(("edges", most), lambda: self._edges(walls))
+        edges = self.cache.get(("edges", most), lambda: self._edges(walls))
         return edges.find(receivers, min(effects.mirrors, 1), progress).beside(found)
 
     def _delayed(self, found: MirrorPaths) -> MirrorPaths:
@@ -300,15 +299,15 @@ class Tracer:
         seen, lit, made = {"": first}, dict[str, dict[str, Records]](), dict[str, Records]()
         for name, (light, sight) in wanted.items():
             if sight not in seen:
-                seen[sight] = self.turned(first) if sight == "M" else self.behind(first, most)
+                seen[sight] = self.reflected(first) if sight == "M" else self.behind(first, most)
             rays = seen[sight]
             if light == "E":
-                table = self.seen(rays)
+                table = self.elements_seen(rays)
             elif light in ("MS", "MTS"):
                 table = self.lit_by_mirrors(rays, most if light == "MTS" else 0)
             else:
                 if sight not in lit:
-                    lit[sight] = self.lit(rays, most)
+                    lit[sight] = self.lit_straight(rays, most)
                 table = lit[sight][light]
             made[name] = table
         return made
@@ -326,7 +325,7 @@ class Tracer:
         row = np.arange(len(p), dtype=np.int32)
         return Records(group.astype(np.int32), angle, kind.astype(np.int8), power, row)
 
-    def lit(self, rays: Rays, most: int) -> dict[str, Records]:
+    def lit_straight(self, rays: Rays, most: int) -> dict[str, Records]:
         """What rays see of surfaces that the transmitter lights, ``"S"``, and, if ``most`` is not 0, through slabs, up to that
         many, ``"TS"``."""
         light, lit = self.grid.light(rays.hits, self.transmitter)
@@ -341,8 +340,8 @@ class Tracer:
         return found
 
     def lit_by_mirrors(self, rays: Rays, most: int = 0) -> Records:
-        """What some rays of each pixel see of surfaces that images of the transmitter light; with ``most`` those that they light
-        through slabs alone, up to that many."""
+        """What some rays of each pixel see of surfaces that images of the transmitter light; with ``most`` those that they need
+        slabs to light, up to that many."""
         most_rays = 3  # of a pixel
         places = ((np.arange(most_rays) + 0.5) * self.grid.per_pixel / most_rays).astype(int)
         places = np.unique(places)
@@ -370,7 +369,7 @@ class Tracer:
             mirrors = before.take(k)
         return k, self.scattered(rays, row[k], strength, light.angle[k], mirrors)
 
-    def seen(self, rays: Rays) -> Records:
+    def elements_seen(self, rays: Rays) -> Records:
         """What rays see of elements."""
         row, tile = self.grid.tiles_met(rays.hits)
         side, friis = self.surface.tile_side[tile], (self.wavelength_m / (4.0 * np.pi)) ** 2
@@ -433,9 +432,9 @@ class Tracer:
 
     def reached(self, most: int) -> np.ndarray:
         """Where light from the transmitter reaches each side of a tile, over any number of bounces [m]: first sides, then second
-        ones, shape ``((1 + two_sided) T, 3)``; NaN where it does not. With ``most`` also through so many slabs between two
-        bounces, to sides of elements that it reaches no tile of in the air."""
-        return self.kept.get(("reached", most), lambda: self.of_transmitter._reached(most))
+        ones, shape ``((1 + two_sided) T, 3)``; NaN where it does not. With ``most`` sides of elements that it reaches nowhere
+        in the air are reached through up to so many slabs between two bounces."""
+        return self.cache.get(("reached", most), lambda: self.of_transmitter._reached(most))
 
     def _reached(self, most: int) -> np.ndarray:
         s, few = self.surface, 4  # rays of each tile
@@ -466,7 +465,7 @@ class Tracer:
             point[own] = air[own]
         return point
 
-    def turned(self, rays: Rays) -> Rays:
+    def reflected(self, rays: Rays) -> Rays:
         """``rays`` turned at the mirrors that they hit, and what they hit there."""
         s, grid, hits = self.surface, self.grid, rays.hits
         ray = np.flatnonzero((hits.face >= 0) & (s.patch[hits.face] >= 0))
@@ -502,7 +501,7 @@ class MirroredLight:
     is what faces one of six ways of a cell.
 
     Args:
-        most: if not 0, the images are those whose light comes through some slabs, before or behind the mirror, up to that many.
+        most: if not 0, the images are those whose light has to pass slabs, before or behind the mirror, up to that many.
 
     Attributes:
         patch: of each pair of a piece and an image that lights it the mirror, shape ``(N,)``.

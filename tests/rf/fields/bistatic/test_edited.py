@@ -295,4 +295,4 @@ def test_a_new_pane_at_another_carrier_is_the_one_that_is_added_there(field):
     pane = {"objects": {"pane": sheet(1.6, (0.1, 0.1), (3.9, 2.9))}, "materials": {"pane": glass}}
     first, then = field.with_objects(**pane).at_frequency(28e9), field.at_frequency(28e9).with_objects(**pane)
     for one in first, then:
-        assert one.surface.slabs(28e9)[0][-1] == pytest.approx(glass.permittivity(28e9))
+        assert one.surface.slab_properties(28e9)[0][-1] == pytest.approx(glass.permittivity(28e9))

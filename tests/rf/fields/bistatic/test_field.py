@@ -390,7 +390,7 @@ def test_what_readings_would_change_by_is_known_of_slabs_too():
     changed = _mirror_changes(batch, materials, np.arange(2))
     before, after = (Materials(p, view.tracer.slabs, np.array(material)) for material in ([0, 1], [0, 0]))
     powers = [view.records[SPECULAR].powers(own) for own in (after, before)]
-    expected = (powers[0] - powers[1])[view.kept_paths(effects)] @ o.path[view.kept_paths(effects)]
+    expected = (powers[0] - powers[1])[view.counted_paths(effects)] @ o.path[view.counted_paths(effects)]
     np.testing.assert_allclose(changed[1][0], expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
 
 
@@ -400,7 +400,7 @@ def test_an_array_s_slopes_are_those_of_what_counts_where_more_slabs_were_sought
     sought = replace(SETS["single"], transmissions=3, residual=False)
     field = BistaticField.prior(scene, spectra(scene, RECEIVERS, frequency_hz=140e9), effects=sought)
     view, fewer = field.view(RECEIVERS[3]), replace(sought, transmissions=0)
-    assert 0 < view.kept_paths(fewer).sum() < view.kept_paths(sought).sum()
+    assert 0 < view.counted_paths(fewer).sum() < view.counted_paths(sought).sum()
     o = observation(view, ArrayImage.of(view, array, hemisphere((18, 36)).reshape(-1, 3), 0.0), field.floor)
     problem = Problem.of([o], fewer, np.arange(2), field.parameters)
     layout = layout_of(problem, field.parameters)
@@ -447,7 +447,9 @@ def test_what_a_slab_is_made_of_does_not_hang_on_what_it_is_called(carrier_hz):
     for one in glass, replace(glass, name="window"), replace(glass, name="screen", itu=None):
         scene = Scene(mesh, [Material("walls", ()), one], part)
         field = BistaticField.prior(scene, frame, effects=effects)
-        assert field.surface.slabs(carrier_hz)[0][1] == pytest.approx(glass.permittivity(carrier_hz))
+        assert field.surface.slab_properties(carrier_hz)[0][1] == pytest.approx(
+            glass.permittivity(carrier_hz)
+        )
         found.append(field.links(RECEIVERS[3]).total_path_gain)
     np.testing.assert_allclose(found, found[0], rtol=1e-6)
 
@@ -607,7 +609,7 @@ def test_a_fit_goes_on_after_steps_that_were_cut_short(field, monkeypatch):
     nowhere = np.full(len(view.hits.face), -1)  # the bin of each ray
     unlit = np.zeros((count, 1), np.float32), np.arange(count), np.zeros((len(view.paths), count), np.float32)
     o = observation(view, WeighedPaths(nowhere, *unlit), 1.0, target)
-    problem = newton.Problem([o], [columns], Effects(True, 0, 0), np.zeros(1, int), energy=1e6)
+    problem = newton.Problem([o], [columns], Effects(True, 0, 0), np.zeros(1, int), energy_std=1e6)
     for name, loose in {"WEIGHT_STD": 1e3, "EXCESS_STD": 1e-3, "MIRROR_STD": 1e3}.items():
         monkeypatch.setattr(newton, name, loose)
     found = newton.gauss_newton(problem, replace(true, log_weight=true.log_weight - 9.0), 40)

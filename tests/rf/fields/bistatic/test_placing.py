@@ -31,7 +31,7 @@ def readings(scene, effects, **how):
     one = Readings(
         TX, np.repeat(RX[None], count, axis=0), np.full(count, 1e-9), F, 1e-20, position_std_m=0.05, **how
     )
-    ((place, view),) = seen(scene, one, effects=effects, rare=effects, sub_pixels=1)
+    ((place, view),) = seen(scene, one, effects=effects, slabs_and_edges=effects, sub_pixels=1)
     power = view.records["specular"].power
     read = path_weights(one, place.rows, *direct_paths(view)) @ power
     one = Readings(
@@ -87,6 +87,6 @@ def test_the_zero_of_azimuths_is_that_of_what_walls_let_through():
         path_weights(one, np.arange(len(azimuth)), paths.arrival, paths.departure, paths.tau) @ paths.power
     )
     one = Readings(source, places, power, carrier_hz, 1e-6 * power.max(), **how)
-    every = seen(scene, one, effects=effects, rare=effects, sub_pixels=1)
+    every = seen(scene, one, effects=effects, slabs_and_edges=effects, sub_pixels=1)
     zero = with_zeros([one], every)[1]["azimuth_zero_deg"]["readings"]
     assert zero == pytest.approx(0.0, abs=1.0)

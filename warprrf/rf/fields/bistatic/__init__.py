@@ -4,4 +4,7 @@
 ``files``. ``fit`` reads as the list of steps that make it: ``observations`` of data sets of any kind (``measured`` says how
 readings come from paths), ``gauss_newton`` on parameters, ``merging`` of materials, ``residual``, ``uncertainty``; ``placing``
 finds where a receiver stood.
+
+Of each ``Place`` (a link) the tracer gives a ``View``, which with what was read is an ``Observation``; its ``Columns`` are what
+each group scatters into the readings. ``Batch`` es of these are a ``Problem``, and what that is solved by a ``Solution``.
 """

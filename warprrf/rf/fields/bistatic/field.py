@@ -94,7 +94,7 @@ class BistaticField(RadioField):
         material: of each group, shape ``(G,)``.
         residual: ln gain of each surface cell over its group, lit straight by the transmitter and lit in any other way, shape
             ``(2, X)``; see :mod:`warprrf.rf.fields.bistatic.residual`.
-        errors: how wrong it is; None of few receivers, or where not all are whole spectra.
+        errors: how wrong it is; None after a quick fit, of fewer than four receivers, or if not all are whole spectra.
         sub_pixels: square root of the rays per pixel.
 
     The others are those of :class:`RadioField`.
@@ -172,8 +172,8 @@ class BistaticField(RadioField):
                 ``options``: ``quick=True``, ``effects="room"``, ``relevance=found``, ...
 
         Raises:
-            ValueError: for options out of range, receivers on a surface or outside the scene, or spectra that are all
-                empty.
+            ValueError: for options out of range, receivers on a surface or outside the scene, spectra without power above
+                their floor, a chain without a reading above it, or too many rays or mirrors.
             TypeError: for a geometry without a mesh, or an unknown option.
         """
         chosen, data = with_settings(options or FitOptions(), settings), as_list(ds)
@@ -251,7 +251,7 @@ class BistaticField(RadioField):
             effects=replace(SETS["single"], residual=False) if effects is None else effects,
             parameters=replace(
                 Parameters.prior(surface.groups, *([] if lobes is None else [lobes]), reciprocal=reciprocal),
-                log_through=surface.slabs(ds.frequency_hz)[2],
+                log_through=surface.slab_properties(ds.frequency_hz)[2],
             ),
             material=surface.material,
             residual=np.zeros((2, len(surface.cells))),
@@ -476,9 +476,11 @@ class BistaticField(RadioField):
             raise ValueError(
                 "view: got one of another geometry, carrier, air or grid, expected this field's own"
             )
-        sought, own = ([e.mirrors, e.transmissions, e.diffractions] for e in (view.effects, self.effects))
-        if np.less(sought, own).any():
-            raise ValueError(f"view: got one of {sought} mirrors, slabs and edges, expected at least {own}")
+        most = [[e.mirrors, e.transmissions, e.diffractions] for e in (view.effects, self.effects)]
+        if np.less(most[0], most[1]).any():
+            raise ValueError(
+                f"view: got one of {most[0]} mirrors, slabs and edges, expected at least {most[1]}"
+            )
         return path_gains(view, self.state)
 
     def tracer(self, transmitter: ArrayLike | None = None) -> Tracer:

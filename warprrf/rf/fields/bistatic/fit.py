@@ -1,7 +1,7 @@
 """Fitting a bistatic field: trace what receivers see, observe what was read, decide which effects count and which groups are of
 one material, fit parameters of materials, and find what differs within them and how wrong all that is.
 
-:func:`_learned` reads as that list. Each step is a function of a :class:`~warprrf.rf.fields.bistatic.training.Training`; what it
+:func:`_steps` reads as that list. Each step is a function of a :class:`~warprrf.rf.fields.bistatic.training.Training`; what it
 decides is handed on, and noted in the report.
 """
 
@@ -25,8 +25,8 @@ from warprrf.rf.fields.bistatic.gauss_newton import Solution, gauss_newton
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, read
 from warprrf.rf.fields.bistatic.merging import merge
 from warprrf.rf.fields.bistatic.observations import Place, Seen, as_list, frame_of, places_of
-from warprrf.rf.fields.bistatic.options import RARE, FitOptions, evenly
-from warprrf.rf.fields.bistatic.placing import Heard, moved, position_offset, with_zeros
+from warprrf.rf.fields.bistatic.options import OPTIONAL, FitOptions, evenly
+from warprrf.rf.fields.bistatic.placing import Evidence, moved, position_offset, with_zeros
 from warprrf.rf.fields.bistatic.report import covariance_of, left_out, report_of, warn_of
 from warprrf.rf.fields.bistatic.residual import fit_residual, shares_of
 from warprrf.rf.fields.bistatic.training import (
@@ -69,8 +69,8 @@ def fit(
             raise ValueError("ds: got no pixel above the floor, expected spectra with power to fit to")
     places = places_of(data, mesh, device)
     tables = [one for one in data if isinstance(one, Readings)]
-    heard = [np.asarray(one.chain)[one.power > one.floor] for one in tables]
-    if dark := {place.chain for place in places} - {""}.union(*heard):
+    lit = [np.asarray(one.chain)[one.power > one.floor] for one in tables]
+    if dark := {place.chain for place in places} - {""}.union(*lit):
         raise ValueError(
             f"chain: got no reading of {sorted(dark)} above its floor, so that nothing tells the gain; leave it out"
         )
@@ -95,12 +95,12 @@ def fit(
     look = partial(trace, sub_pixels=options.rays_a_side, client=client, device=device, progress=progress)
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
     with threadpool_limits(1, user_api="blas"):
-        t, model, found, zeros = _learned(surface, data, places, look, options, progress)
+        t, model, found, zeros = _steps(surface, data, places, look, options, progress)
         offsets = _offsets(t, model)
         if offsets:
             data = [moved(one, offsets[k]) if k in offsets else one for k, one in enumerate(t.data)]  # type: ignore[arg-type]
             places = places_of(data, mesh, device)
-            t, model, found, _ = _learned(surface, data, places, look, options, progress)
+            t, model, found, _ = _steps(surface, data, places, look, options, progress)
     report = found["report"]
     warn_of(t.data, report)
     places_moved = {}
@@ -132,7 +132,7 @@ def _question_directions(ds: SpectrumDataset, mesh: Mesh, device: DeviceLike) ->
         )
 
 
-def _learned(
+def _steps(
     surface: Surface,
     data: Sequence[Measured],
     places: Sequence[Place],
@@ -146,9 +146,11 @@ def _learned(
     """
     t = Training.of(surface, data, places, options, progress)
     given = t.candidates[0] if len(t.candidates) == 1 else None
-    rare = None if options.effects == "auto" and options.relevance is None else t.candidates[0]
+    slabs_and_edges = None if options.effects == "auto" and options.relevance is None else t.candidates[0]
     started = time.perf_counter()
-    seen, sought = look(surface, [places[k] for k in t.deciding], effects=given, rare=rare)
+    seen, sought = look(
+        surface, [places[k] for k in t.deciding], effects=given, slabs_and_edges=slabs_and_edges
+    )
     tracing_s = time.perf_counter() - started
     data, zeros = with_zeros(data, seen)
     t = replace(t, data=data).as_sought(sought).and_at(t.deciding, seen)
@@ -161,16 +163,20 @@ def _learned(
         t = t if keeps else t.without_records()
         again = time.perf_counter()
         more, _ = look(
-            surface, [places[k] for k in others], effects=choice.effects, rare=choice.effects, keeps=keeps
+            surface,
+            [places[k] for k in others],
+            effects=choice.effects,
+            slabs_and_edges=choice.effects,
+            keeps=keeps,
         )
         tracing_s += time.perf_counter() - again
         t = t.and_at(others, more)
     errors = cross_validate(t, choice)
-    choice, model = everyone(t, choice)
+    choice, model = fit_to_all(t, choice)
     wrong, noise_db = t.unexplained(model)
     if wrong:
         t = t.without(wrong)
-        choice, model = everyone(t, choice)
+        choice, model = fit_to_all(t, choice)
     if errors is not None:
         errors = replace(errors, covariance=covariance_of(t, choice))
     missed = left_out(t, model)
@@ -205,17 +211,17 @@ def choose(t: Training) -> Solution:
         best, least = trial, loss
     if best is None:
         raise ValueError("effects: got none to choose from")
-    best = _spared(t, best)
+    best = _without_needless(t, best)
     if np.isfinite(t.surface.appearance).all() and material.max() > 0 and not t.totals:
         best = merged(t, best)
     return best
 
 
-def _spared(t: Training, chosen: Solution) -> Solution:
-    """``chosen`` without those of :data:`RARE` that readings are predicted better without. Places held out are too few to say so
-    alone: none of them may be behind a wall."""
+def _without_needless(t: Training, chosen: Solution) -> Solution:
+    """``chosen`` without those of :data:`OPTIONAL` that readings are predicted better without. Places held out are too few to
+    say so alone: none of them may be behind a wall."""
     places = np.union1d(t.few(1), t.held)
-    for name, on in RARE.items() if t.options.effects == "auto" and t.options.relevance is None else ():
+    for name, on in OPTIONAL.items() if t.options.effects == "auto" and t.options.relevance is None else ():
         off: dict[str, Any] = dict.fromkeys(on, 0)
         fewer = replace(chosen.effects, **off)
         if fewer != chosen.effects:
@@ -231,8 +237,8 @@ def _spared(t: Training, chosen: Solution) -> Solution:
 def _choose_of_few(t: Training, trials: list[Solution]) -> Solution:
     """With too few receivers to hold any out: bounces as rooms have them, unless none fit much better."""
     if len(trials) == 1:
-        return t.refined(trials[0], t.kept, t.options.iterations, rounds=2)
-    single, room = (t.refined(trial, t.kept, t.options.iterations, rounds=2) for trial in trials[:2])
+        return t.refined(trials[0], t.not_held, t.options.iterations, rounds=2)
+    single, room = (t.refined(trial, t.not_held, t.options.iterations, rounds=2) for trial in trials[:2])
     models = [t.model(trial) for trial in (single, room)]
     wrong, also = (t.unexplained(model)[0] for model in models)
     counted = t.without({k: np.intersect1d(rows, also[k]) for k, rows in wrong.items() if k in also})
@@ -259,7 +265,7 @@ def merged(t: Training, best: Solution) -> Solution:
 
 
 def _name(effects: Effects) -> str:
-    """What a choice of effects is called in a report: the set that it is, whatever its mirrors and :data:`RARE` effects."""
+    """What a choice of effects is called in a report: the set that it is, whatever its mirrors and :data:`OPTIONAL` effects."""
     for name, one in SETS.items():
         if replace(with_slabs_and_edges(one, effects), mirrors=effects.mirrors) == effects:
             return name
@@ -293,12 +299,12 @@ def _folds(t: Training) -> list[np.ndarray]:
     """Places that are held out in turn to learn errors."""
     folds = [t.held]
     if len(t.observations) <= FEW_RECEIVERS:
-        others = np.setdiff1d(t.kept, t.always)
+        others = np.setdiff1d(t.not_held, t.always)
         folds += np.array_split(others, max(len(others) // max(len(t.held), 2), 2))
     return folds
 
 
-def everyone(t: Training, choice: Solution) -> tuple[Solution, Model]:
+def fit_to_all(t: Training, choice: Solution) -> tuple[Solution, Model]:
     """The choice fitted to readings of all places, and its model."""
     choice = t.refined(choice, t.telling, t.options.iterations)
     return choice, with_residual(t, choice, list(t.observations), quick=t.options.quick)
@@ -319,7 +325,7 @@ def with_residual(t: Training, choice: Solution, places: Sequence[int] | np.ndar
 
 def _offsets(t: Training, found: Model) -> dict[int, list[tuple[Place, np.ndarray]]]:
     """By data set of unknown positions its places, and how far each receiver is from where it is said to be [m]."""
-    heard: dict[tuple[int, bytes], list[Heard]] = {}
+    evidence: dict[tuple[int, bytes], list[Evidence]] = {}
     for o in t.observations.values():
         if getattr(t.data[o.place.data], "position_std_m", 0.0) == 0:
             continue
@@ -329,9 +335,9 @@ def _offsets(t: Training, found: Model) -> dict[int, list[tuple[Place, np.ndarra
         gain = o.gain(gains.parameters, total)
         other = np.maximum(total - direct @ o.measured.of_paths(o.view), 0.0)
         receiver = o.place.data, o.place.receiver.tobytes()
-        heard.setdefault(receiver, []).append((o, gain * other, gain * direct))
+        evidence.setdefault(receiver, []).append((o, gain * other, gain * direct))
     offsets: dict[int, list[tuple[Place, np.ndarray]]] = {}
-    for (data, _), own in heard.items():
+    for (data, _), own in evidence.items():
         offset = position_offset(t.data[data], own)  # type: ignore[arg-type]
         offsets.setdefault(data, []).extend((o.place, offset) for o, *_ in own)
     return offsets

@@ -6,7 +6,7 @@ what no spectrum shows near plausible values and tie a surface's scattered and m
 split one reflection (S^2 and 1 - S^2). Also free, where the readings can tell, are the share that each lets through (where
 paths pass slabs), and of all together a common gain (an uncalibrated receiver), the power of the carrier that roughness goes with
 (several carriers) and the gains of measuring chains. Slopes of scattered light come from :meth:`Columns.slopes`, those of line of
-sight and mirrors from the kernel of records, or where phases count from :meth:`Observation.heard_slopes`.
+sight and mirrors from the kernel of records, or where phases count from :meth:`Observation.coherent_slopes`.
 
 Parameters are fitted to a few hundred readings at each of many places: a :class:`Batch` is one table of several places'
 readings, because what is computed of all at once costs a fraction of what each costs alone.
@@ -129,28 +129,28 @@ class Batch:
         return self.observations[0].measured.together is not None
 
     @cached_property
-    def kept(self) -> list[np.ndarray]:
+    def counted(self) -> list[np.ndarray]:
         """Of each observation the line of sight and mirrors that count, L in all; all of them where phases do."""
-        every = [o.view.kept_paths(self.effects) | self.phases_count for o in self.observations]
+        every = [o.view.counted_paths(self.effects) | self.phases_count for o in self.observations]
         return [np.flatnonzero(own) for own in every]
 
     @cached_property
     def specular(self) -> Records:
         """Those paths: one launch serves all."""
-        each = zip(self.observations, self.kept, strict=True)
+        each = zip(self.observations, self.counted, strict=True)
         return Records.joined([o.view.records[SPECULAR].take(own) for o, own in each])
 
     @cached_property
     def path(self) -> csr_matrix:
         """Readings of unit power on each of them, in units of the floor, shape ``(L, N)``."""
-        each = zip(self.observations, self.kept, strict=True)
+        each = zip(self.observations, self.counted, strict=True)
         return block_diag([csr_matrix(o.path[own]) for o, own in each], format="csr")
 
     def power(self, materials: Materials) -> np.ndarray:
         """Predictions ``(N,)`` in units of each floor, without the gains of chains."""
         p = materials.parameters
         if self.phases_count:
-            direct = np.concatenate([o.heard(self.effects, materials) for o in self.observations])
+            direct = np.concatenate([o.coherent_power(self.effects, materials) for o in self.observations])
         else:
             direct = self.path.T @ self.specular.powers(materials).astype(np.float32)
         return np.asarray(p.gain * (self.by_materials.power(p) + direct), float)
@@ -160,7 +160,7 @@ class Batch:
         side = self.observations[0].view.tracer.surface.side_group
         place, index = layout.columns(self.material[self.specular.groups(side)])
         if self.phases_count:
-            own = [o.heard_slopes(self.effects, materials, place, len(index)) for o in self.observations]
+            own = [o.coherent_slopes(self.effects, materials, place, len(index)) for o in self.observations]
             table = np.concatenate(own, axis=1)
         else:
             rise = self.specular.slopes(materials, place, len(index))
@@ -208,7 +208,7 @@ class Problem:
         material: of each group, shape ``(G,)``.
         chains: measuring chains whose gain is unknown.
         gain_offset: whether a gain common to all paths is free.
-        energy: standard deviation a priori of the sum of S^2 and 1 - S^2, as fitted, from one.
+        energy_std: standard deviation a priori of the scattered and the mirrored share, added, from one.
         known_through: ln of the share that materials let through before any measurement, and its deviation, shape ``(2, M)``; None
             for that of the start.
     """
@@ -219,7 +219,7 @@ class Problem:
     material: np.ndarray
     chains: int = 0
     gain_offset: bool = False
-    energy: float = 0.25
+    energy_std: float = 0.25
     known_through: np.ndarray | None = None
 
     @classmethod
@@ -231,7 +231,7 @@ class Problem:
         p: Parameters,
         **settings: Any,
     ) -> Problem:
-        """That of observations where light comes as under parameters ``p`` of materials."""
+        """That of observations where what lights the second and later scatterers is as under parameters ``p`` of materials."""
         groups = p.take(material)
         columns = [columns_of(o, effects, groups) for o in observations]
         return cls(observations, columns, effects, material, **settings)
@@ -307,7 +307,11 @@ def layout_of(problem: Problem, start: Parameters) -> Layout:
 
 
 def priors(
-    p: Parameters, start: Parameters, layout: Layout, energy: float, known_through: np.ndarray | None = None
+    p: Parameters,
+    start: Parameters,
+    layout: Layout,
+    energy_std: float,
+    known_through: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Residuals of the priors ``(K,)`` and their Jacobian ``(K, F)``: distance to the start, energy kept."""
     own = np.arange(layout.groups)
@@ -333,12 +337,12 @@ def priors(
         add(np.array([p.log_gain / gain_std]), np.array([layout.common_gain]), 1.0 / gain_std)
     if layout.roughness:
         from_ament = np.array([(p.roughness - ROUGHNESS) / carrier_std])
-        add(from_ament, np.array([layout.carrier_power]), 1.0 / carrier_std)
+        add(from_ament, np.array([layout.roughness_exponent]), 1.0 / carrier_std)
     if layout.chains:
         add(p.log_gains / chain_std, layout.first_chain + np.arange(layout.chains), 1.0 / chain_std)
     shares = np.column_stack([p.weight, np.exp(p.log_mirror)])  # S^2 by lobes, and 1 - S^2
     places = np.column_stack([layout.weight(own), layout.mirror(own)])
-    add((shares.sum(axis=1) - 1.0) / energy, places, shares / energy)
+    add((shares.sum(axis=1) - 1.0) / energy_std, places, shares / energy_std)
     return np.concatenate(residuals), np.concatenate(rows)
 
 
@@ -347,7 +351,7 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
 
     Args:
         problem: observations, and which groups are of one material.
-        start: where the fit starts and the priors centre.
+        start: where the fit starts and the priors centre: those of a fit that goes on from another are about what that found.
         steps: most steps.
     """
     if len(start.log_gains) != problem.chains:
@@ -360,12 +364,12 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
     hessian, losses = np.eye(layout.size), []
     if steps == 0:
         hessian = _normal_equations(problem, start, layout)[0]
-        slopes = priors(start, start, layout, problem.energy, problem.known_through)[1]
+        slopes = priors(start, start, layout, problem.energy_std, problem.known_through)[1]
         hessian += slopes.T @ slopes
 
     def total(x: np.ndarray) -> float:
         p = layout.unpack(x, start)
-        prior = priors(p, start, layout, problem.energy, problem.known_through)[0]
+        prior = priors(p, start, layout, problem.energy_std, problem.known_through)[0]
         own = (batch.fit_loss(batch.gain(p, power) * power) for batch, _, power in problem.evaluated(p))
         return weight * sum(float(loss.sum()) for loss in own) + float((prior**2).sum())
 
@@ -375,7 +379,7 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
     for _ in range(steps):
         p = layout.unpack(vector, start)
         hessian, gradient = _normal_equations(problem, p, layout)
-        r, j = priors(p, start, layout, problem.energy, problem.known_through)
+        r, j = priors(p, start, layout, problem.energy_std, problem.known_through)
         hessian += j.T @ j
         gradient += j.T @ r
         improved = False

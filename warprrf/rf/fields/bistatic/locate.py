@@ -235,7 +235,7 @@ class Question:
         if quick:
             model = replace(model, effects=replace(model.effects, mirrors=min(model.effects.mirrors, 1)))
         sub_pixels = 1 if quick else 2  # to the end, because the noise of few rays moves the least loss
-        few = self._tracers.setdefault((place.seen_from, quick), tracer.on_grid(place.shape, sub_pixels))
+        few = self._tracers.setdefault((place.view_key, quick), tracer.on_grid(place.shape, sub_pixels))
         return path_gains(few.view(points, model.effects), model).apart
 
     def descend(

@@ -78,7 +78,7 @@ def slopes(
     side, specular = view.tracer.surface.side_group, tables.pop(SPECULAR)
     groups = [records.groups(side) for records in (specular, *tables.values())]
     place, index = layout.columns(materials.material[np.concatenate(groups)])
-    rise = specular.slopes(materials, place, len(index)) * view.kept_paths(effects)[:, None]
+    rise = specular.slopes(materials, place, len(index)) * view.counted_paths(effects)[:, None]
     sums = np.zeros((count, len(index)), np.float32)
     for records in tables.values():
         records.add_slopes(materials, Bins.of(own[records.ray], count), place, sums)

@@ -126,8 +126,8 @@ def _mirror_changes(batch: Batch, materials: Materials, unit_of: np.ndarray) -> 
     unit = np.where(meets, unit_of[group], -1)
     if batch.phases_count:
         for one in np.unique(unit[meets]):
-            heard = [_heard(o, batch.effects, materials, unit_of == one) for o in batch.observations]
-            found[int(one)] = np.concatenate(heard, axis=1)
+            power = [_coherent_power(o, batch.effects, materials, unit_of == one) for o in batch.observations]
+            found[int(one)] = np.concatenate(power, axis=1)
         return found
     now = np.where(meets, materials.material[group], -1).astype(np.int32)
     # Each group as if it were made of each material, as a slab of its own.
@@ -148,9 +148,11 @@ def _mirror_changes(batch: Batch, materials: Materials, unit_of: np.ndarray) -> 
     return found
 
 
-def _heard(o: Observation, effects: Effects, materials: Materials, changes: np.ndarray) -> np.ndarray:
+def _coherent_power(
+    o: Observation, effects: Effects, materials: Materials, changes: np.ndarray
+) -> np.ndarray:
     """The same of one observation where phases count: of all paths, where groups ``changes`` (G,) become each material."""
     p, now = materials.parameters, materials.material
     trials = (now, *(np.where(changes, material, now) for material in range(len(p.log_excess))))
-    heard = [o.heard(effects, materials.by_materials(p, trial)) for trial in trials]
-    return np.asarray(heard[1:], np.float32) - np.float32(heard[0])
+    power = [o.coherent_power(effects, materials.by_materials(p, trial)) for trial in trials]
+    return np.asarray(power[1:], np.float32) - np.float32(power[0])

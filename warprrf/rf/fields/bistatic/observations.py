@@ -47,7 +47,8 @@ from warprrf.rf.tracing.tracer import SPECULAR, View, sequences
 from warprrf.rows import Rows
 
 OWN_GAIN = -2
-"""In place of a measuring chain's index: readings of one place whose common gain is not known. Their sum tells it."""
+"""In place of a measuring chain's index: readings of one place whose common gain is not known: it is the ratio of what
+was read and what is predicted, summed."""
 NOISE_DB = 3.0
 """Standard deviation of an independent reading's error that priors are weighed against. Errors of a view's pixels hang
 together (one misplaced edge), which a larger value stands for."""
@@ -93,14 +94,14 @@ class Place:
     chain: str = ""
 
     @property
-    def lit_from(self) -> tuple[object, ...]:
-        """All of :attr:`seen_from` but the receiver: one tracer serves places where it is the same."""
+    def tracer_key(self) -> tuple[object, ...]:
+        """All of :attr:`view_key` but the receiver: one tracer serves places where it is the same."""
         return self.transmitter.tobytes(), self.frequency_hz, self.shape, self.beam_sigma_rad, self.air
 
     @property
-    def seen_from(self) -> tuple[object, ...]:
+    def view_key(self) -> tuple[object, ...]:
         """All that the geometry seen there depends on."""
-        return *self.lit_from, self.receiver.tobytes()
+        return *self.tracer_key, self.receiver.tobytes()
 
 
 Seen = tuple[Place, View]
@@ -138,8 +139,8 @@ class Target(Rows):
 
     Attributes:
         db: readings, 10 log10(P / N0 + 1), shape ``(N,)``.
-        trust: by which errors are multiplied: 1, as by default, but for readings with noise of their own; 0 for those left out,
-            shape ``(N,)``.
+        trust: by which errors are multiplied: :data:`NOISE_DB` over the standard deviation of each, by default 1; 0 for those left
+            out, shape ``(N,)``.
         censored: readings that only say that there was no more, shape ``(N,)`` bool; by default none.
         sight: share of line of sight in each before any measurement, where those of it alone, which hold no material, count for
             more, shape ``(N,)``; by default 0.
@@ -294,19 +295,19 @@ class Observation:
             raise TypeError("measured: got readings of which powers add, expected some of which phases count")
         return self.measured.together
 
-    def heard(self, effects: Effects, materials: Materials) -> np.ndarray:
+    def coherent_power(self, effects: Effects, materials: Materials) -> np.ndarray:
         """Readings of line of sight and mirrors whose phases count, in units of the floor, shape ``(N,)``."""
         return self.together.received(self._amplitudes(effects, materials)[0]) / self.floor
 
-    def heard_slopes(
+    def coherent_slopes(
         self, effects: Effects, materials: Materials, place: np.ndarray, count: int
     ) -> np.ndarray:
-        """Derivatives of :meth:`heard` to ``count`` parameters ``(count, N)`` float32; those of material m stand from
+        """Derivatives of :meth:`coherent_power` to ``count`` parameters ``(count, N)`` float32; those of material m stand from
         ``place[m]`` on."""
         specular, p = self.view.records[SPECULAR], materials.parameters
         amplitude, slope = self._amplitudes(effects, materials)
         rise = np.zeros((len(amplitude), count), np.float32)
-        counts = self.view.kept_paths(effects)[:, None] & (specular.index >= 0)
+        counts = self.view.counted_paths(effects)[:, None] & (specular.index >= 0)
         for path, mirror in zip(*np.nonzero(counts), strict=True):
             at = place[materials.material[specular.index[path, mirror]]] + len(p.lobes)
             rise[path, at + EXCESS_COLUMN] += slope[path, mirror]
@@ -316,7 +317,7 @@ class Observation:
 
     def _amplitudes(self, effects: Effects, materials: Materials) -> tuple[np.ndarray, np.ndarray]:
         """Of line of sight and mirrors, and their slopes, see :meth:`Records.fields`; 0 where one does not count."""
-        specular, kept = self.view.records[SPECULAR], self.view.kept_paths(effects)
+        specular, kept = self.view.records[SPECULAR], self.view.counted_paths(effects)
         amplitude, slope = specular.fields(materials, self.together.sent, self.together.heard)
         return amplitude * kept, slope * kept[:, None]
 
@@ -328,17 +329,17 @@ class Observation:
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Readings of scattered light as sums over groups, or materials, in units of the floor: a table collapsed.
+    """Readings of scattered light as sums over groups, or materials, in units of the floor.
 
     Fits and merging ask for powers so often that evaluating every record would take ten times as long. What comes over more
     than one surface or through slabs follows the share that the last one scatters of even light; all else of it is held, what
     slabs let through included: that is learned from single paths.
 
     Attributes:
-        groups: that scatter straight from the transmitter, shape ``(A,)``.
+        groups: or materials, that scatter straight from the transmitter, shape ``(A,)``.
         single: their readings at unit weight, by lobe and Fresnel component, shape ``(A, L, 3, N)`` float32.
         senders: that scatter or send on light that came over other surfaces, shape ``(C,)``.
-        further: what they bring per unit of that share, shape ``(C, N)`` float32.
+        further: what they bring per unit of ``Parameters.scattered_share``, shape ``(C, N)`` float32.
     """
 
     groups: np.ndarray
@@ -519,8 +520,10 @@ class _Tables(Kind):
         bare = Observation(place, view, measured, Target(np.zeros(len(rows))), floor)
         sight, steady = _shares(bare)
         bias, fading = fading_db(one.samples, steady)
-        heard = np.maximum(one.power[rows], floors)  # no more than the floor: what was read below it is noise
-        above = NEPER * np.log1p(heard / floor * 10.0 ** (-bias / 10.0))
+        clipped = np.maximum(
+            one.power[rows], floors
+        )  # no more than the floor: what was read below it is noise
+        above = NEPER * np.log1p(clipped / floor * 10.0 ** (-bias / 10.0))
         # Of all power errors of single directions average out.
         unexplained = 0.5 if one.total else READING_ERROR_DB
         trust = NOISE_DB / np.hypot(np.hypot(unexplained, np.asarray(one.std_db)[rows]), fading)
@@ -561,7 +564,7 @@ class _Arrays(Kind):
         bare = Observation(place, view, measured.part(known), target, unit * one.floor, chain)
         start, single = unmeasured(view), SETS["single"]
         scattered = columns_of(bare, single, start).power(start)
-        total = scattered + bare.heard(single, materials_of(view.tracer, start, single))
+        total = scattered + bare.coherent_power(single, materials_of(view.tracer, start, single))
         gain = bare.gain(start, total)
         spread = np.sqrt(scattered * np.maximum(2.0 * total - scattered, 0.0))
         std_db = NEPER * gain * spread / (1.0 + gain * total)
@@ -603,7 +606,9 @@ def observe(
 def unmeasured(view: View) -> Parameters:
     """What the groups that are seen are taken for before any measurement, with what slabs of them absorb there."""
     surface = view.tracer.surface
-    return replace(Parameters.prior(surface.groups), log_through=surface.slabs(view.tracer.frequency_hz)[2])
+    return replace(
+        Parameters.prior(surface.groups), log_through=surface.slab_properties(view.tracer.frequency_hz)[2]
+    )
 
 
 def _shares(o: Observation) -> tuple[np.ndarray, np.ndarray]:

@@ -52,7 +52,7 @@ class FitOptions:
         quick: one ray a pixel, and nothing held out to decide by.
         gain_offset: fit one gain common to all paths, for a receiver that was not calibrated; see ``report``.
         iterations: most steps of the fit of materials.
-        relevance: what it rules out is off.
+        relevance: what it rules out is off, unless ``effects`` are :class:`Effects`; lobes are those that it found.
         seed: of the choice of pixels and held-out receivers.
     """
 
@@ -74,7 +74,7 @@ class FitOptions:
         Parameters.prior(1, LOBES if self.lobes is None else self.lobes)
 
     def candidates(self, frequency_hz: float) -> list[Effects]:
-        """Effects to choose from, the fewest first; one where they are given. What ``relevance`` rules out is off."""
+        """Effects to choose from, the fewest first; one where they are given, else without what ``relevance`` rules out."""
         most = Effects() if self.relevance is None else self.relevance.needs(frequency_hz)[0]
         if isinstance(self.effects, Effects):
             return [self.effects]
@@ -88,7 +88,7 @@ class FitOptions:
         return list(dict.fromkeys(found))
 
     def exponents(self, frequency_hz: float) -> tuple[int, ...]:
-        """Of the lobes."""
+        """Exponents of the lobes."""
         if self.lobes is not None:
             return self.lobes
         known = None if self.relevance is None else self.relevance.needs(frequency_hz)[1]
@@ -100,8 +100,11 @@ class FitOptions:
         return self.sub_pixels or (1 if self.quick else SUB_PIXELS)
 
 
-RARE: dict[str, dict[str, Any]] = {"transmission": {"transmissions": 3}, "diffraction": {"diffractions": 1}}
-"""Effects by name, and what of :class:`Effects` has them whole."""
+OPTIONAL: dict[str, dict[str, Any]] = {
+    "transmission": {"transmissions": 3},
+    "diffraction": {"diffractions": 1},
+}
+"""Effects that few scenes need, by name, and what of :class:`Effects` switches each on."""
 SIMPLE = replace(SETS["single"], mirrors=2, residual=False)
 MOST_BLOCKED = 12
 """Blocked places at which effects are estimated."""
@@ -114,18 +117,18 @@ def assumed(surface: Surface, frequency_hz: float) -> Parameters:
     known = [assumed_permittivity(name, frequency_hz) for name in surface.group_names]
     prior = Parameters.prior(surface.groups)
     return replace(
-        prior, log_excess=np.log(np.array(known) - 1.0), log_through=surface.slabs(frequency_hz)[2]
+        prior, log_excess=np.log(np.array(known) - 1.0), log_through=surface.slab_properties(frequency_hz)[2]
     )
 
 
 def needed(effects: Effects, surface: Surface, places: Sequence[Place], device: DeviceLike = None) -> Effects:
-    """``effects`` with those of :data:`RARE` that raise the total path gain of blocked places by 0.25 dB rms, without the
+    """``effects`` with those of :data:`OPTIONAL` that raise the total path gain of blocked places by 0.25 dB rms, without the
     others."""
     needed_db = 0.25
     by_transmitter: dict[tuple[bytes, float], list[Place]] = {}
     for place in places:
         by_transmitter.setdefault((place.transmitter.tobytes(), place.frequency_hz), []).append(place)
-    changes: dict[str, list[float]] = {name: [] for name in RARE}
+    changes: dict[str, list[float]] = {name: [] for name in OPTIONAL}
     for own in by_transmitter.values():
         first = own[0]
         tracer = Tracer.of(surface, first.transmitter, first.frequency_hz, *RAYS, device=device)
@@ -135,13 +138,13 @@ def needed(effects: Effects, surface: Surface, places: Sequence[Place], device: 
         p, none = assumed(surface, first.frequency_hz), np.zeros((2, len(surface.cells)))
         model = Model(SIMPLE, p, none, tracer.transmitter)
         before = total(tracer, receivers[blocked], model, {})
-        for name, on in RARE.items():
+        for name, on in OPTIONAL.items():
             after = total(tracer, receivers[blocked], model, on)
             changes[name] += (NEPER * np.log(np.maximum(after, 1e-300) / np.maximum(before, 1e-300))).tolist()
-    off: dict[str, Any] = {key: 0 for on in RARE.values() for key in on}
+    off: dict[str, Any] = {key: 0 for on in OPTIONAL.values() for key in on}
     for name, found in changes.items():
         if found and np.sqrt(np.mean(np.square(found))) > needed_db:
-            off |= RARE[name]
+            off |= OPTIONAL[name]
     return replace(effects, **off)
 
 

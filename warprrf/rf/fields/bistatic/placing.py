@@ -110,21 +110,21 @@ def moved(one: Readings, offsets: Sequence[tuple[Place, np.ndarray]]) -> Reading
     return replace(one, receivers=receivers, position_std_m=0.0)
 
 
-Heard = tuple[Observation, np.ndarray, np.ndarray]
+Evidence = tuple[Observation, np.ndarray, np.ndarray]
 """What was read of a receiver; its prediction without line of sight and mirrors, shape ``(N,)``; and the power of those paths,
 shape ``(L,)``: both in the units of the target, gain of the chain included."""
 
 
-def position_offset(one: Readings, heard: Sequence[Heard]) -> np.ndarray:
+def position_offset(one: Readings, evidence: Sequence[Evidence]) -> np.ndarray:
     """Offset of a receiver from where it is said to be [m], shape ``(3,)``: the one that readings and prior like best.
 
     Args:
         one: table that holds its readings.
-        heard: under each transmitter, and by each measuring chain, where it is said to be.
+        evidence: under each transmitter, and by each measuring chain, where it is said to be.
     """
-    std, first = one.position_std_m, heard[0][0]
+    std, first = one.position_std_m, evidence[0][0]
     receiver, most = first.place.receiver, 2.0 * std  # along each axis
-    missed = [_missed(one, *own) for own in heard]
+    missed = [_missed(one, *own) for own in evidence]
     found = least_squares(
         lambda offset: np.concatenate([*(own(offset) for own in missed), offset / std]), np.zeros(3), bounds=(-most, most),
         loss="huber", f_scale=first.huber_db / NOISE_DB, x_scale=std, diff_step=1e-3,
@@ -138,7 +138,7 @@ def position_offset(one: Readings, heard: Sequence[Heard]) -> np.ndarray:
 def _missed(
     one: Readings, o: Observation, other: np.ndarray, power: np.ndarray
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """From an offset (3,) of a receiver [m] to errors of what was read (N,), in standard deviations; see :data:`Heard`."""
+    """From an offset (3,) of a receiver [m] to errors of what was read (N,), in standard deviations; see :data:`Evidence`."""
     place, paths = o.place, o.view.paths
     bent, (_, toward, _) = paths.over_edge[:, None], direct_paths(o.view)
     s = o.view.tracer.surface

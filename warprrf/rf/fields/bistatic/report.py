@@ -14,7 +14,7 @@ from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.base import Measured
 from warprrf.rf.fields.bistatic.gauss_newton import THROUGH_STD, Solution, layout_of
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, huber, observe
-from warprrf.rf.fields.bistatic.options import MOST_BLOCKED, RARE, RAYS, evenly, total
+from warprrf.rf.fields.bistatic.options import MOST_BLOCKED, OPTIONAL, RAYS, evenly, total
 from warprrf.rf.fields.bistatic.training import Training
 from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.tracing.model import Layout, Model
@@ -25,14 +25,16 @@ SIDE_LOBES_DB = 3.0
 
 
 def left_out(t: Training, model: Model) -> dict[str, Any]:
-    """Effects of :data:`RARE` that are not modelled and were not tried, estimated at a few ``"receivers"`` that are blocked: by
+    """Effects of :data:`OPTIONAL` that are not modelled and were not tried, estimated at a few ``"receivers"`` that are blocked: by
     how much they would raise all power there [dB], by name; and ``"error_db"``, by how much the fit has more than was read
     there, rms. What it lacks is no measure of its error: it may be just these effects."""
-    blocked = list({o.place.seen_from: k for k, o in t.observations.items() if _is_dark(o.view)}.values())
+    blocked = list({o.place.view_key: k for k, o in t.observations.items() if _is_dark(o.view)}.values())
     seen = [t.observations[k] for k in evenly(np.array(blocked, int), MOST_BLOCKED)]
     tried = model.effects, *t.candidates
-    lacking = {name: on for name, on in RARE.items() if not any(getattr(e, key) for e in tried for key in on)}
-    change, by_tracer = {name: np.zeros(len(seen)) for name in RARE}, dict[int, list[int]]()
+    lacking = {
+        name: on for name, on in OPTIONAL.items() if not any(getattr(e, key) for e in tried for key in on)
+    }
+    change, by_tracer = {name: np.zeros(len(seen)) for name in OPTIONAL}, dict[int, list[int]]()
     whole, over = np.zeros(len(seen)), np.zeros(len(seen))
     for k, o in enumerate(seen):
         gains = o.path_gains(model)

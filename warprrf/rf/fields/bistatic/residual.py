@@ -1,8 +1,8 @@
-"""What differs within a material group: a gain for each surface element and each cell of it, held close to one.
+"""What differs within a material group: gains of each surface element and each cell of it, held close to one.
 
-Photos tell materials apart only so far, and a mesh misses what it misses: that is the gain of single bounces. Light
-that surfaces send on to each other has a gain of its own, because it is known less well: elements are half a metre
-wide, and of further bounces some are left out. (Sionna RT's rays scatter at the same points whatever the receiver, so
+Photos tell materials apart only so far, and a mesh misses what it misses: that is the gain of light straight from the
+transmitter. All other light has a second gain, because it is known less well: elements are half a metre wide, and of further
+bounces some are left out. (Sionna RT's rays scatter at the same points whatever the receiver, so
 its dark corners have a texture that can be learned.)
 
 Both are fitted by Gauss-Newton with conjugate gradients: the Jacobian is the measurement after a sparse matrix.

@@ -123,12 +123,15 @@ class Sensitivity:
         return summed, csr_matrix(np.where(slope > least_db, (slope / READING_ERROR_DB) ** 2, 0.0))
 
 
-Measured = Sequence[tuple[Sensitivity, np.ndarray]]
+MeasuredPlaces = Sequence[tuple[Sensitivity, np.ndarray]]
 """Receivers (3,), each with how readings there depend on the gains, under its transmitter."""
 
 
 def precision(
-    measured: Measured, unknowns: Unknowns, turned: np.ndarray | None = None, progress: Progress | None = None
+    measured: MeasuredPlaces,
+    unknowns: Unknowns,
+    turned: np.ndarray | None = None,
+    progress: Progress | None = None,
 ) -> np.ndarray:
     """With which readings at all that was measured, at each ``turned`` to all of (K, 2), tell the gains [1/neper^2], shape
     ``(U,)``."""
@@ -144,7 +147,7 @@ def suggest(
     candidates: np.ndarray,
     n: int,
     *,
-    measured: Measured,
+    measured: MeasuredPlaces,
     turned: np.ndarray | None = None,
     progress: Progress | None = None,
 ) -> np.ndarray:

@@ -61,7 +61,7 @@ def trace(
     places: Sequence[Place],
     *,
     effects: Effects | None = None,
-    rare: Effects | None = None,
+    slabs_and_edges: Effects | None = None,
     keeps: bool = True,
     sub_pixels: int = SUB_PIXELS,
     client: Any = None,
@@ -72,9 +72,9 @@ def trace(
     and edges were sought.
 
     Args:
-        effects: which tables are traced at once (others when they are first asked for); None for single bounces, and for
-            as many mirrors up to 3 as can be searched (2 in a city).
-        rare: whose slabs and edges are sought; None for what the scene needs (:func:`needed`).
+        effects: whose mirrors are sought and whose tables are traced at once (others when they are first asked for); None for
+            single bounces, and for as many mirrors up to 3 as can be searched (2 in a city).
+        slabs_and_edges: whose are sought; None for what the scene needs (:func:`needed`).
         keeps: whether records are kept, if they are not too many; else they are traced whenever they are asked for.
         sub_pixels: square root of the rays per pixel.
         client: a ``dask.distributed.Client`` whose workers trace, to the same bits; this process by default.
@@ -86,12 +86,12 @@ def trace(
     """
     tell = progress or (lambda *_: None)
     wanted = replace(SETS["single"], mirrors=3) if effects is None else effects
-    decided = needed(wanted, surface, places, device) if rare is None else rare
+    decided = needed(wanted, surface, places, device) if slabs_and_edges is None else slabs_and_edges
     wanted = with_slabs_and_edges(wanted, decided)
     keeps = keeps and rays_of(places, sub_pixels) <= MOST_KEPT
     together: dict[tuple[object, ...], list[int]] = {}  # places under one transmitter
     for k, place in enumerate(places):
-        together.setdefault(place.lit_from, []).append(k)
+        together.setdefault(place.tracer_key, []).append(k)
     views: dict[int, View] = {}
     for own in together.values():
         first = places[own[0]]
@@ -199,13 +199,13 @@ class Training:
         return [chain.index(name) for name in self.chains]
 
     @property
-    def kept(self) -> np.ndarray:
+    def not_held(self) -> np.ndarray:
         """Places that are not held out."""
         return np.setdiff1d(np.arange(len(self.places)), self.held)
 
     def few(self, times: int) -> np.ndarray:
         """Places that trial fits learn from, up to ``times`` :data:`MOST_TO_CHOOSE`, those of every chain among them."""
-        others = np.setdiff1d(self.kept, self.always)
+        others = np.setdiff1d(self.not_held, self.always)
         chosen = evenly(others, max(times * MOST_TO_CHOOSE - len(self.always), 0))
         return np.union1d(self.always, chosen).astype(int)
 
@@ -299,18 +299,18 @@ class Training:
 
     def known_through(self, material: np.ndarray) -> np.ndarray:
         """ln of the share that materials let through before any measurement, and its standard deviation, shape ``(2, M)``."""
-        eta, _, through = self.surface.slabs(self.frequency_hz)
+        eta, _, through = self.surface.slab_properties(self.frequency_hz)
         std = np.where(np.abs(eta) > 0, KNOWN_THROUGH_STD, THROUGH_STD)
         return np.stack([np.bincount(material, own) for own in (through, std)]) / np.bincount(material)
 
     def problem(
         self, effects: Effects, material: np.ndarray, places: Iterable[int], p: Parameters
     ) -> Problem:
-        """What is fitted to readings of ``places``, lit as under parameters ``p`` of materials."""
+        """What is fitted to readings of ``places``; what lights second and later scatterers is as under parameters ``p``."""
         return Problem.of(
             [self.parts[k] for k in places], effects, material, p, chains=len(self.chains),
             gain_offset=self.options.gain_offset, known_through=self.known_through(material),
-            **({"energy": 1.0} if self.totals else {}),
+            **({"energy_std": 1.0} if self.totals else {}),
         )  # fmt: skip
 
     def model(self, choice: Solution) -> Model:
