@@ -1,4 +1,5 @@
-"""Spectra of a scene with known materials, by the tracer of radio fields: a truth to compare with.
+"""Spectra of a scene with known materials, by the tracer of radio fields: a truth to compare with, without noise up to single
+scatterings.
 
 Line of sight and mirrors come from the image method (:mod:`warprrf.rf.paths.trace`). Scattering is evaluated along 64
 directions per pixel, each with one receiver ray and one shadow ray on the mesh, without sampling noise: path gain
@@ -265,7 +266,7 @@ class ExactEngine:
         cos_out = np.clip(-(direction * normal).sum(axis=1), 0.0, 1.0)
         cos_mirror = np.clip(2.0 * up * cos_out + (onward * direction).sum(axis=1), -1.0, 1.0)
         angle = np.column_stack([up, cos_out, cos_mirror])[:, None]
-        surface = Interactions.alike(self.surface.group[rays.hits.face[ray], None], angle, SCATTER)
+        surface = Interactions.of_kind(self.surface.group[rays.hits.face[ray], None], angle, SCATTER)
         grid = self._tracer.grid
         weight = every * np.pi * (rays.hits.rays(ray)[2] * grid.transmittance(rays.hits.range_m[ray]))
         hits = grid.hit_along(point + ENDPOINT_CLEARANCE * normal, onward, weight)

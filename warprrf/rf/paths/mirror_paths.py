@@ -37,7 +37,8 @@ class MirrorPaths(Rows):
         patch: Patches that mirror, from the transmitter on, -1 for a slab and past the last, shape ``(L, K)``.
         slab: Faces by which slabs are entered, -1 for a mirror and past the last, shape ``(L, K)``.
         point: Points where either is met [m], shape ``(L, K, 3)``; NaN past the last.
-        share: Of the field of a free path of this length, shape ``(L,)``: what is not blocked, in (0, 1]; what an edge diffracts.
+        share: Field over that of a free path of this length, shape ``(L,)``: what blocking leaves, in (0, 1], or all that an edge
+            makes of it with its mirror or slab.
         length_m: Unfolded length, shape ``(L,)``.
         excess_m: What slabs make it longer by for a wave, shape ``(L,)``; 0 where their materials were not asked.
         arrival: Unit direction from the receiver to what it sees last, shape ``(L, 3)``.
@@ -91,7 +92,7 @@ class MirrorPaths(Rows):
 
     @property
     def slabs(self) -> np.ndarray:
-        """Number of slabs that are passed, shape ``(L,)``."""
+        """Number of slabs that are passed, shape ``(L,)``; 0 over any edge."""
         return (self.slab >= 0).sum(axis=1)
 
     def of_width(self, most: int) -> MirrorPaths:

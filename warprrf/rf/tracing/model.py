@@ -34,7 +34,8 @@ class Effects:
         mirrors: most mirror reflections on a path without scattering, 0 to 3.
         scatterings: most scatterings on a path, 0 to 3; from the second on by radiosity, on elements of half a metre in a room.
         mirror_scatter: whether mirrors light surfaces that scatter.
-        scatter_mirror: whether lit surfaces are seen in mirrors, and through slabs. Sionna RT has no such paths.
+        scatter_mirror: whether lit surfaces are seen otherwise than directly: in mirrors and through slabs. Sionna RT has no
+            such paths.
         transmissions: most slabs that a path passes, 0 to 8.
         diffractions: most edges on a path, 0 or 1; beside one mirror or one slab at most, and no scattering.
         residual: whether what surfaces scatter differs within their group.

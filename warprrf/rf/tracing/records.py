@@ -2,7 +2,7 @@
 
 A table holds the paths of one sequence of interactions, named from the transmitter to the receiver: ``M`` a mirror, ``S`` a
 surface that scatters, ``E`` an element of the surface that sends on what it got of others, ``T`` slabs that are passed.
-Mirrors and line of sight, paths of one direction each, are the table ``"specular"``. All kinds are evaluated by
+Paths without scattering, of one direction each, are the table ``"specular"``. All kinds are evaluated by
 :mod:`warprrf.kernels.radio.records`.
 """
 
@@ -42,7 +42,7 @@ class Interactions(Rows):
     kind: np.ndarray
 
     @classmethod
-    def alike(cls, index: np.ndarray, angle: np.ndarray, kind: int) -> Interactions:
+    def of_kind(cls, index: np.ndarray, angle: np.ndarray, kind: int) -> Interactions:
         """Those of one ``kind`` all."""
         return cls(index, angle, np.full(index.shape, kind, np.int8))
 
@@ -50,7 +50,7 @@ class Interactions(Rows):
     def of_mirrors(cls, group: np.ndarray, cosine: np.ndarray) -> Interactions:
         """One mirror each: group ``(N,)`` and cosine of incidence ``(N,)``."""
         angle = np.column_stack([cosine, 0.0 * cosine, 0.0 * cosine])
-        return cls.alike(group[:, None], angle[:, None], kernels.MIRROR)
+        return cls.of_kind(group[:, None], angle[:, None], kernels.MIRROR)
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
@@ -73,7 +73,8 @@ class Records(Interactions):
         power: path gain without interactions, shape ``(N,)``; where a ray sees what scatters or sends
             lambda^2 Omega cos(theta_i) / (4 pi d1)^2 or (lambda / 4 pi)^2 Omega. Its precision is that of what is computed.
         ray: what its maker sums over: rays of the receiver's grid, paths without scattering, or sides of elements, ``(N,)``.
-        residual_row: row of :attr:`Model.residual`: 0 where the transmitter lights the cell that is seen, else 1; -1 for none.
+        residual_row: row of :attr:`Model.residual`: 0 where light comes straight from the transmitter, 1 over mirrors, slabs or
+            elements; -1 for none.
         reach_m: of what is seen through slabs, how far along the ray that is [m], shape ``(N,)``; None elsewhere.
         half_width: half the spacing of rays in the cosine of scattering, over which 1 / cosine is averaged.
     """

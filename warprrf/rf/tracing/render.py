@@ -40,7 +40,7 @@ class PathGains:
 
     @property
     def specular(self) -> np.ndarray:
-        """Of each line of sight and mirror path, shape ``(L,)``."""
+        """Of each path without scattering, shape ``(L,)``."""
         return self.powers[SPECULAR]
 
     @property
@@ -69,7 +69,7 @@ class PathGains:
         return np.asarray(direct + self.by_ray().reshape(count, -1).sum(axis=1))
 
     @property
-    def nearest(self) -> tuple[np.ndarray, np.ndarray]:
+    def strongest_single(self) -> tuple[np.ndarray, np.ndarray]:
         """Of each ray the power of the strongest light that was scattered once, seen through slabs or not, and how far along the
         ray that was [m], shape ``(R K,)`` each."""
         power, range_m = self.single, self.view.hits.range_m

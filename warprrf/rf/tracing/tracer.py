@@ -128,7 +128,7 @@ class View:
         return {name: every[name] for name in (SPECULAR, *wanted)}
 
     def of(self, k: int) -> View:
-        """That of receiver ``k`` alone; nothing but its line of sight and mirrors is known."""
+        """That of receiver ``k`` alone; nothing but its paths without scattering is known."""
         h, own = self.hits, self.paths.receiver == k
         rays = slice(k * len(h.directions), (k + 1) * len(h.directions))
         hits = replace(h, origins=h.origins[[k]], face=h.face[rays], range_m=h.range_m[rays])
@@ -139,7 +139,7 @@ class View:
         )
 
     def without_records(self) -> View:
-        """The same that keeps no records but those of line of sight and mirrors."""
+        """The same that keeps no records but those of paths without scattering."""
         hits = replace(self.hits)
         return replace(self, hits=hits, records={SPECULAR: self.records[SPECULAR]}, keeps=False)
 
@@ -154,12 +154,12 @@ class View:
 @dataclass(frozen=True)
 class Rays:
     """Rays and what they hit: ``ray`` of the receiver's grid that each belongs to, and the interactions between the hit and
-    the receiver, if any; ``straight``: those are slabs alone."""
+    the receiver, if any; ``through_slabs``: those are slabs alone."""
 
     hits: Hits
     ray: np.ndarray
     after: Interactions | None = None
-    straight: bool = False
+    through_slabs: bool = False
 
 
 class Tracer:
@@ -222,7 +222,7 @@ class Tracer:
 
     @property
     def of_transmitter(self) -> Tracer:
-        """The same on the grid that it was made with: what belongs to the transmitter hangs on no other."""
+        """The same on the grid that it was made with: what belongs to the transmitter does not depend on later grids."""
         first = copy(self)
         first.grid = self._first_grid
         return first
@@ -250,7 +250,7 @@ class Tracer:
         return self.cache.get("slabs", lambda: self.surface.slab_properties(self.frequency_hz)[:2])
 
     def paths(self, receivers: np.ndarray, effects: Effects, progress: Progress | None = None) -> MirrorPaths:
-        """Line of sight and mirror paths of ``receivers`` (R, 3) that ``effects`` want, through slabs and over edges too."""
+        """Paths without scattering of ``receivers`` (R, 3) that ``effects`` want, through slabs and over edges too."""
         most = effects.transmissions
         walls = self.walls(most) if most else None
         found = self._delayed(
@@ -283,8 +283,8 @@ class Tracer:
 
         Args:
             receivers: positions, off the surface.
-            effects: whose mirrors and slabs line of sight and mirror paths are sought over.
-            paths: line of sight and mirror paths, if they are known.
+            effects: whose mirrors, slabs and edges paths without scattering are sought over.
+            paths: paths without scattering, if they are known.
             keeps: whether the view keeps what is made when it is first asked for.
         """
         places = np.asarray(receivers, np.float64).reshape(-1, 3)
@@ -313,7 +313,7 @@ class Tracer:
         return made
 
     def specular(self, p: MirrorPaths) -> Records:
-        """Line of sight and mirror paths as records, in double precision."""
+        """Paths without scattering as records, in double precision."""
         friis = (self.wavelength_m / (4.0 * np.pi * p.length_m)) ** 2 * p.share**2
         mirrors, slabs = p.patch >= 0, p.slab >= 0
         group = np.append(self.surface.patch_group, -1)[p.patch]  # no patch has no group
@@ -374,7 +374,7 @@ class Tracer:
         row, tile = self.grid.tiles_met(rays.hits)
         side, friis = self.surface.tile_side[tile], (self.wavelength_m / (4.0 * np.pi)) ** 2
         power = friis * rays.hits.rays(row)[2] * self.grid.transmittance(rays.hits.range_m[row])
-        own = Interactions.alike(side[:, None], np.zeros((len(row), 1, 3)), SOURCE)
+        own = Interactions.of_kind(side[:, None], np.zeros((len(row), 1, 3)), SOURCE)
         return self._records(rays, row, power, [own], 1)
 
     def scattered(
@@ -387,7 +387,7 @@ class Tracer:
     ) -> Records:
         """Records of scattering where the rays ``row`` hit, after the interactions ``before``."""
         group = self.surface.group[rays.hits.face[row]]
-        own = Interactions.alike(group[:, None], angle[:, None], SCATTER)
+        own = Interactions.of_kind(group[:, None], angle[:, None], SCATTER)
         met = [own] if before is None else [before, own]
         return self._records(rays, row, self.wavelength_m**2 * strength, met, int(before is not None))
 
@@ -404,7 +404,7 @@ class Tracer:
         return Records(
             index.astype(np.int32), angle.astype(dtype), kind, np.asarray(power, dtype),
             rays.ray[row].astype(np.int32), -1 if behind else residual_row, self.grid.half_width,
-            rays.hits.range_m[row].astype(np.float32) if rays.straight else None,
+            rays.hits.range_m[row].astype(np.float32) if rays.through_slabs else None,
         )  # fmt: skip
 
     def _through(self, slabs: Slabs, way: np.ndarray) -> Interactions:
@@ -417,7 +417,7 @@ class Tracer:
         turn[more] = np.where(met[more], turns(stops, normal), 0.0)
         thickness = np.nan_to_num(slabs.thickness_m) / self.wavelength_m
         index = np.where(met, s.group[slabs.face], -1)
-        return Interactions.alike(index, np.stack([slabs.cosine, turn, thickness], axis=2), SLAB)
+        return Interactions.of_kind(index, np.stack([slabs.cosine, turn, thickness], axis=2), SLAB)
 
     def behind(self, rays: Rays, most: int) -> Rays:
         """``rays`` that go straight on through what they hit, and what they meet behind up to ``most`` slabs."""
@@ -428,7 +428,7 @@ class Tracer:
         row, face, range_m, slabs = walls.behind(origins, directions, hits.face[ray], hits.range_m[ray])
         after = self._through(slabs.reversed, -directions[row])
         found = Hits(origins[row], directions[row], solid_angle[row], face.astype(np.int32), range_m)
-        return Rays(found, rays.ray[ray[row]], after, straight=True)
+        return Rays(found, rays.ray[ray[row]], after, through_slabs=True)
 
     def reached(self, most: int) -> np.ndarray:
         """Where light from the transmitter reaches each side of a tile, over any number of bounces [m]: first sides, then second
@@ -487,7 +487,7 @@ class Tracer:
 def view_of(
     make: Callable[[], Tracer], effects: Effects, keeps: bool, part: tuple[np.ndarray, MirrorPaths]
 ) -> View:
-    """What a receiver (3,) of known line of sight and mirror paths sees, without what all receivers share; ``make`` makes their
+    """What a receiver (3,) of known paths without scattering sees, without what all receivers share; ``make`` makes their
     tracer, in another process too."""
     view = make().view(part[0], effects, paths=part[1], keeps=keeps)
     if keeps:
@@ -505,7 +505,7 @@ class MirroredLight:
 
     Attributes:
         patch: of each pair of a piece and an image that lights it the mirror, shape ``(N,)``.
-        before: what its light meets on the way to the middle of the piece.
+        before: its light's way to the middle of the piece, of which interactions alone count.
         onto: its light on the sides of elements: records whose ray is the side, of irradiance where the transmitter gives
             cos(theta_i) / d1^2 [1/m^2].
         cosine: of incidence of each of those.

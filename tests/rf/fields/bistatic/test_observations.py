@@ -99,7 +99,7 @@ def test_places_where_a_horn_is_turned_alike_share_a_table(field):
     views, data = [field.view(place) for place in places], [horns]
     where = places_of(data, field.mesh, None)
     shared = [one.measured for one in observe(data, list(zip(where, views, strict=True)), 1.0, [])]
-    assert shared[0].of_bin is shared[1].of_bin and shared[0].alike == shared[1].alike
+    assert shared[0].of_bin is shared[1].of_bin and shared[0].batch_key == shared[1].batch_key
     own = [
         WeighedPaths.of(
             view, partial(path_weights, horns, place.rows), arrival=True, departure=False, delay_step_s=None

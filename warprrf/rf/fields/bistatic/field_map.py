@@ -148,7 +148,7 @@ def _mapped(bistatic: Any, part: tuple[np.ndarray, np.ndarray]) -> dict[str, np.
     pixel = np.ravel_multi_index((paths.receiver, *pixel_of(paths.arrival, SHAPE)), (count, *SHAPE))
     image = rays + np.bincount(pixel, gains.specular, len(rays))
     length, ray = np.zeros(len(rays)), np.flatnonzero(rays > 0)
-    length[ray] = view.over_m(ray, gains.nearest[1][ray])
+    length[ray] = view.over_m(ray, gains.strongest_single[1][ray])
     stronger = np.flatnonzero(gains.specular > rays[pixel])
     stronger = stronger[np.argsort(gains.specular[stronger], kind="stable")]
     length[pixel[stronger]] = paths.delay_m[stronger]

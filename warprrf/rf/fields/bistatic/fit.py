@@ -182,7 +182,7 @@ def _steps(
     missed = left_out(t, model)
     seconds = {"transport_time_s": tracing_s, "fit_time_s": time.perf_counter() - started}
     report = report_of(t, choice, wrong, noise_db) | seconds | {"left_out": missed}
-    t.step(last=True)
+    t.tick(last=True)
     found = {
         "surface": t.surface, "effects": model.effects, "residual": model.residual, "material": choice.material,
         "errors": errors, "report": report,
@@ -256,10 +256,10 @@ def merged(t: Training, best: Solution) -> Solution:
     problem = t.problem(best.effects, best.material, t.few(2), best.parameters)
     for _ in range(MERGES):
         material, start = merge(problem, trial.parameters, t.surface.appearance, t.area, by_shape=by_shape)
-        # What surfaces get of each other changes little with who is of which material: it is held.
+        # What surfaces get of each other changes little with who is of which material: it is frozen.
         problem = replace(problem, material=material, known_through=t.known_through(material))
         trial = gauss_newton(problem, start, SHORT_STEPS)
-        t.step()
+        t.tick()
     t.note(f"{best.material.max() + 1} materials as {trial.material.max() + 1}", True, t.held_loss(trial))
     return trial
 
@@ -319,7 +319,7 @@ def with_residual(t: Training, choice: Solution, places: Sequence[int] | np.ndar
     if not choice.effects.residual:
         return model
     shares = [shares_of(t.observations[k], model) for k in places]
-    t.step()
+    t.tick()
     return replace(model, effects=choice.effects, residual=fit_residual(shares, t.surface, quick=quick))
 
 

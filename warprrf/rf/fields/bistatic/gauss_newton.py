@@ -125,12 +125,12 @@ class Batch:
 
     @property
     def phases_count(self) -> bool:
-        """Whether line of sight and mirrors add up by their phases."""
+        """Whether paths without scattering add up by their phases."""
         return self.observations[0].measured.together is not None
 
     @cached_property
     def counted(self) -> list[np.ndarray]:
-        """Of each observation the line of sight and mirrors that count, L in all; all of them where phases do."""
+        """Of each observation the paths without scattering that count, L in all; all of them where phases do."""
         every = [o.view.counted_paths(self.effects) | self.phases_count for o in self.observations]
         return [np.flatnonzero(own) for own in every]
 

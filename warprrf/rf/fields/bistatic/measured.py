@@ -30,12 +30,12 @@ class Measurement(Protocol):
     """What is read of a receiver's path powers: rays are summed in B bins, and N readings are linear in those."""
 
     @property
-    def alike(self) -> object:
+    def batch_key(self) -> object:
         """Equal for measurements whose readings of powers in bins are the same."""
 
     @property
     def together(self) -> Superposition | None:
-        """How line of sight and mirrors add up where their phases count; None where their powers add."""
+        """How paths without scattering add up where their phases count; None where their powers add."""
 
     def bins(self, view: View) -> tuple[np.ndarray, int]:
         """Bin of each ray, shape ``(K,)``, -1 for none, and how many bins there are."""
@@ -115,7 +115,7 @@ class SpectrumPixels(ByPixels):
     together: None = None
 
     @property
-    def alike(self) -> object:
+    def batch_key(self) -> object:
         """Whole spectra through one beam are; of a part, itself."""
         return id(self.beam if self.pixels is None else self)
 
@@ -149,7 +149,7 @@ each, shape ``(N, K)``."""
 
 
 def direct_paths(view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Directions of arrival and departure (L, 3) and delays (L,) [s] of one receiver's line of sight and mirror paths."""
+    """Directions of arrival and departure (L, 3) and delays (L,) [s] of one receiver's paths without scattering."""
     paths, toward = view.paths, view.outward
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     return paths.arrival, toward, paths.delay_m / SPEED_OF_LIGHT
@@ -174,7 +174,7 @@ class WeighedPaths:
     together: None = None
 
     @property
-    def alike(self) -> object:
+    def batch_key(self) -> object:
         """The same rows of one table."""
         return id(self.of_bin), self.row.tobytes()
 
@@ -309,7 +309,7 @@ class ArrayImage(ByPixels):
     Attributes:
         steered: of each reading by lag, shape ``(N, K)`` float32.
         arriving: of unit power in each bin by lag, shape ``(K, B)`` float32; bins are pixels of the rays' grid.
-        together: line of sight and mirrors.
+        together: paths without scattering.
     """
 
     steered: np.ndarray
@@ -317,7 +317,7 @@ class ArrayImage(ByPixels):
     together: Superposition
 
     @property
-    def alike(self) -> object:
+    def batch_key(self) -> object:
         """Itself."""
         return id(self)
 

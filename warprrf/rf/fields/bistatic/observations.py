@@ -70,7 +70,7 @@ def huber(error: np.ndarray, threshold: float | np.ndarray) -> tuple[np.ndarray,
 
 @dataclass(frozen=True)
 class Place:
-    """A receiver under a transmitter, and what was read there.
+    """A receiver under a transmitter, and which readings are of it.
 
     Attributes:
         data: index of the data set.
@@ -242,7 +242,7 @@ class Observation:
 
     @cached_property
     def path(self) -> np.ndarray:
-        """Readings of unit power on each line of sight and mirror path, in units of the floor, shape ``(L, N)``."""
+        """Readings of unit power on each path without scattering, in units of the floor, shape ``(L, N)``."""
         return self.measured.of_paths(self.view) / np.float32(self.floor)
 
     def single(self, materials: Materials) -> tuple[np.ndarray, np.ndarray]:
@@ -286,7 +286,7 @@ class Observation:
 
     @property
     def together(self) -> Superposition:
-        """How line of sight and mirrors add up by their phases.
+        """How paths without scattering add up by their phases.
 
         Raises:
             TypeError: where their powers add.
@@ -296,7 +296,7 @@ class Observation:
         return self.measured.together
 
     def coherent_power(self, effects: Effects, materials: Materials) -> np.ndarray:
-        """Readings of line of sight and mirrors whose phases count, in units of the floor, shape ``(N,)``."""
+        """Readings of paths without scattering whose phases count, in units of the floor, shape ``(N,)``."""
         return self.together.received(self._amplitudes(effects, materials)[0]) / self.floor
 
     def coherent_slopes(
@@ -316,7 +316,7 @@ class Observation:
         return np.asarray(rise.T @ (self.together.slopes(amplitude) / self.floor).astype(np.float32))
 
     def _amplitudes(self, effects: Effects, materials: Materials) -> tuple[np.ndarray, np.ndarray]:
-        """Of line of sight and mirrors, and their slopes, see :meth:`Records.fields`; 0 where one does not count."""
+        """Of paths without scattering, and their slopes, see :meth:`Records.fields`; 0 where one does not count."""
         specular, kept = self.view.records[SPECULAR], self.view.counted_paths(effects)
         amplitude, slope = specular.fields(materials, self.together.sent, self.together.heard)
         return amplitude * kept, slope * kept[:, None]
@@ -332,8 +332,8 @@ class Columns:
     """Readings of scattered light as sums over groups, or materials, in units of the floor.
 
     Fits and merging ask for powers so often that evaluating every record would take ten times as long. What comes over more
-    than one surface or through slabs follows the share that the last one scatters of even light; all else of it is held, what
-    slabs let through included: that is learned from single paths.
+    than one surface or through slabs follows the share that the last one scatters of isotropic light; all else of it is frozen,
+    what slabs let through included: that is learned from single paths.
 
     Attributes:
         groups: or materials, that scatter straight from the transmitter, shape ``(A,)``.

@@ -45,7 +45,7 @@ def paths_of(
     exact = np.flatnonzero(gains.specular > 0)
     specular, vertices = gains.specular[exact], found.point[exact]
     diffuse = gains.by_ray().reshape(*image.shape, -1).sum(axis=-1)
-    point = _bounce_points(view, *gains.nearest, floor)
+    point = _bounce_points(view, *gains.strongest_single, floor)
     kept = diffuse > floor
     if not kept.any() and diffuse.max() > 0:
         kept = diffuse == diffuse.max()
@@ -77,7 +77,7 @@ def strongest(gains: PathGains, image: np.ndarray, beam_sigma_rad: float) -> tup
     receiver's beam; NaN where empty."""
     view, power = gains.view, gains.specular
     grid, receiver, transmitter = view.tracer.grid, view.receivers[0], view.tracer.transmitter
-    single, reach_m = gains.nearest
+    single, reach_m = gains.strongest_single
     ray = strongest_rays(grid.device_directions, single, grid.shape, beam_sigma_rad, device=grid.device)
     dark = ray < 0
     ray = np.maximum(ray, 0)

@@ -1,7 +1,7 @@
 """How a receiver stood, where that is not known: the zero of a rotator's azimuths or of a clock, and positions to some
 centimetres.
 
-Line of sight and mirrors hold no unknown but their strength, which matters little: the zero is where readings and what those
+Paths without scattering hold no unknown but their strength, which matters little: the zero is where readings and what those
 paths would give are most alike. It is found before anything else is fitted.
 
 A position is found after a first fit: moved by an offset, a receiver sees the same images of the transmitter elsewhere,
@@ -111,7 +111,7 @@ def moved(one: Readings, offsets: Sequence[tuple[Place, np.ndarray]]) -> Reading
 
 
 Evidence = tuple[Observation, np.ndarray, np.ndarray]
-"""What was read of a receiver; its prediction without line of sight and mirrors, shape ``(N,)``; and the power of those paths,
+"""What was read of a receiver; its prediction without paths without scattering, shape ``(N,)``; and the power of those paths,
 shape ``(L,)``: both in the units of the target, gain of the chain included."""
 
 

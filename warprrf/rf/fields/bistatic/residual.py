@@ -87,7 +87,7 @@ def fit_residual(shares: Sequence[Shares], surface: Surface, *, quick: bool = Fa
     enough = 0.02  # relative fall of the objective below which no step follows
     own_rows = [slice(*own) for own in pairwise(np.cumsum([0, *(len(s.rest) for s in shares)]))]
     # Receivers that are measured alike go through the measurement together, batches of them side by side.
-    alike = [list(own) for _, own in groupby(shares, key=lambda s: s.observed.measured.alike)]
+    alike = [list(own) for _, own in groupby(shares, key=lambda s: s.observed.measured.batch_key)]
     batches = []
     for group in alike:
         ends = np.linspace(0, len(group), max(ceil(len(group) / AT_ONCE), 2) + 1).astype(int)

@@ -143,7 +143,7 @@ class Training:
         held: of these, by index, the ones that are held out to decide by.
         candidates: effects to choose from, the fewest first.
         rng: chooses readings.
-        step: to be called after each fit.
+        tick: to be called after each fit.
         observations: by place, of those that were traced.
         parts: those readings of each that parameters are fitted to.
         log: choices, as they are made.
@@ -156,7 +156,7 @@ class Training:
     held: np.ndarray
     candidates: list[Effects]
     rng: np.random.Generator
-    step: Callable[..., None]
+    tick: Callable[..., None]
     observations: dict[int, Observation] = field(default_factory=dict)
     parts: dict[int, Observation] = field(default_factory=dict)
     log: list[dict[str, Any]] = field(default_factory=list)
@@ -326,7 +326,7 @@ class Training:
         for _ in range(rounds):
             problem = self.problem(choice.effects, choice.material, places, choice.parameters)
             choice = gauss_newton(problem, choice.parameters, max(steps // rounds, int(steps > 0)))
-        self.step()
+        self.tick()
         return choice
 
     def predicted(self, model: Model, places: Iterable[int]) -> list[np.ndarray]:
