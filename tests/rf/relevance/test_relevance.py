@@ -8,7 +8,7 @@ from furnished import RECEIVERS, ROOM, SHAPE, SIGMA, TX, F, furnished, spectra
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined
 
 from warprrf.rf.em.absorption import gas_attenuation_db_per_m
-from warprrf.rf.em.materials import Material, roughness_scattering
+from warprrf.rf.em.materials import Band, Material, roughness_scattering
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.relevance.model import full_field, material_parameters, with_lobes
@@ -17,7 +17,9 @@ from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.tracing.model import SETS, Effects
 
 RECEIVERS = RECEIVERS[:4]
-NOTHING = SlabMaterial("nothing", 1.0, 0.0, np.inf)  # reflects nothing: as good as empty space
+NOTHING = Material(  # reflects nothing: as good as empty space
+    "nothing", (Band(1e9, 1e12, 1.0, 0.0, 0.0, 0.0, "made up"),), thickness_m=np.inf, scattering=0.0
+)
 OPTIONS = {"transmitter": TX, "frequency_hz": F, "shape": SHAPE, "beam_sigma_rad": SIGMA}
 
 

@@ -72,8 +72,9 @@ def full_field(geometry: Any, frame: SpectrumDataset, device: Any = None) -> tup
     if not hasattr(geometry, "materials"):
         return field, "assumed"
     parameters = material_parameters(geometry.materials, frame.frequency_hz)
-    through = field.parameters.log_through
-    return replace(field, parameters=replace(parameters, log_through=through)), "scene"
+    scattering = surface_table(list(geometry.materials), frame.frequency_hz).scattering
+    known = replace(parameters, log_through=field.parameters.log_through)
+    return replace(field, parameters=known, surface=replace(field.surface, scattering=scattering)), "scene"
 
 
 def with_lobes(p: Parameters, kept: tuple[int, ...]) -> Parameters:

@@ -97,6 +97,8 @@ class Surface:
             that photos saw.
         face_object: object that each face belongs to, -1 for none, shape ``(F,)`` int32; by default none.
         object_names: what the objects are called.
+        scattering: coefficient S of each group before any measurement, which mirrors beside edges lose, shape ``(G,)``; by
+            default 0. It is not saved.
     """
 
     mesh: Mesh = field(repr=False)
@@ -116,11 +118,14 @@ class Surface:
     two_sided: bool = False
     face_object: np.ndarray = None  # type: ignore[assignment]  # made when it is not given
     object_names: tuple[str, ...] = ()
+    scattering: np.ndarray = None  # type: ignore[assignment]
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
 
     def __post_init__(self) -> None:
         if self.face_object is None:
             object.__setattr__(self, "face_object", np.full(len(self.mesh.faces), -1, np.int32))
+        if self.scattering is None:
+            object.__setattr__(self, "scattering", np.zeros(len(self.group_names)))
         sizes = {"F": len(self.mesh.faces), "G": len(self.group_names), "O": len(self.object_names)}
         check_arrays(vars(self), ARRAYS, **sizes)
         check_number("position_error_m", self.position_error_m, 0.0, 10.0)
@@ -369,7 +374,7 @@ class Surface:
         eta, thickness, _ = self.slab_properties(frequency_hz)
         known, none = np.abs(eta) > 0, np.zeros(self.groups, np.int32)
         thickness_m = np.where(known, thickness * SPEED_OF_LIGHT / frequency_hz, np.inf)
-        return SurfaceTable(np.where(known, eta, LOSSY), thickness_m, np.zeros(self.groups), none, none > 0)
+        return SurfaceTable(np.where(known, eta, LOSSY), thickness_m, self.scattering, none, none > 0)
 
     def walls(self, frequency_hz: float, most: int, device: DeviceLike = None) -> Walls:
         """Its faces that may be passed, as far as :meth:`slab_properties` tells, up to ``most`` on one way."""

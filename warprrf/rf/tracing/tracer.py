@@ -145,8 +145,8 @@ class View:
 
     def counted_paths(self, effects: Effects) -> np.ndarray:
         """Which ``paths`` count, shape ``(L,)`` bool."""
-        order, slabs = self.paths.order, (self.paths.code == SLAB).sum(axis=1)
-        few = (order <= effects.mirrors) & (slabs <= effects.transmissions)
+        mirrors, slabs = ((self.paths.code == kind).sum(axis=1) for kind in (MIRROR, SLAB))
+        few = (mirrors <= effects.mirrors) & (slabs <= effects.transmissions)
         few &= ~self.paths.over_edge | (effects.diffractions > 0)
         return np.asarray(few & (~self.paths.in_sight | effects.line_of_sight))
 
