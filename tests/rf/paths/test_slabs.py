@@ -9,12 +9,14 @@ from scipy.spatial.transform import Rotation
 from trimesh.remesh import subdivide
 
 from warprrf.geometry.mesh import Mesh
+from warprrf.kernels.radio.records import EDGE, MIRROR
 from warprrf.rf.em.fresnel import slab_passage, slab_reflection, slab_transmission
 from warprrf.rf.em.materials import Material, itu_material
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine, together
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.paths.trace import trace_paths
+from warprrf.rf.relevance.model import full_field
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.tracing.model import Effects
@@ -410,3 +412,18 @@ def test_what_counts_of_more_paths_is_what_is_traced_for_fewer(fewer):
     kept = view.counted_paths(few)
     assert 0 < len(known) == kept.sum() < len(kept)
     np.testing.assert_allclose(np.sort(view.paths.delay_m[kept]), np.sort(known.delay_m), rtol=1e-12)
+
+
+def test_a_mirror_beside_an_edge_loses_what_its_surface_scatters():
+    """Where materials are known: of the field that the floor mirrors sqrt(1 - 0.8^2) is left, glass scatters nothing."""
+    frame = SpectrumDataset.empty(
+        transmitter=TX, frequency_hz=F, shape=(18, 36), beam_sigma_rad=0.1, floor=1e-20
+    )
+    found = []
+    for floor in (FLOORING, replace(FLOORING, scattering=0.0)):
+        scene = Scene(SHEET.mesh, [floor, GLASS], SHEET.face_material)
+        paths = full_field(scene, frame)[0].view(RX).paths
+        beside = (paths.code == EDGE).any(axis=1) & (paths.code == MIRROR).any(axis=1)
+        found.append(paths.share[beside])
+    left = np.round(found[0] / found[1], 9)
+    assert 0.6 in left and set(left.tolist()) <= {0.6, 1.0}
