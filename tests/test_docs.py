@@ -64,8 +64,7 @@ def test_no_figure_is_typed(page):
     assert {*re.findall(r"\d+\.\d+ (?:dB|%|n?s|ms|mm|cm|degrees|times)(?!\w)", typed)} <= SETTINGS
 
 
-STALE = {
-    "filmed", "filmed-cafe", "locate",     "measured_flat", }  # fmt: skip
+STALE = {"filmed", "filmed-cafe", "locate", "measured_flat"}
 """Result files of before what they depend on computed something else; their pages say so. What is made anew leaves this list."""
 
 
