@@ -65,7 +65,7 @@ DEPENDS = {
     "measurements": ("geometry", "bistatic"),
     "office": ("bistatic",),
     "outside": ("bistatic",),
-    "relevance": ("exact",),
+    "relevance": ("exact", "bistatic"),
     "suggest": ("geometry", "bistatic"),
     "truths": ("exact",),
 }

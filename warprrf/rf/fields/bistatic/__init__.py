@@ -6,5 +6,5 @@ readings come from paths), ``gauss_newton`` on parameters, ``merging`` of materi
 finds where a receiver stood.
 
 Of each ``Place`` (a link) the tracer gives a ``View``, which with what was read is an ``Observation``; its ``Columns`` are what
-each group scatters into the readings. ``Batch`` es of these are a ``Problem``, and what that is solved by a ``Solution``.
+each group scatters into the readings. Those of several places are a ``Batch``, batches a ``Problem``, its fit a ``Solution``.
 """

@@ -69,8 +69,8 @@ def fit(
             raise ValueError("ds: got no pixel above the floor, expected spectra with power to fit to")
     places = places_of(data, mesh, device)
     tables = [one for one in data if isinstance(one, Readings)]
-    lit = [np.asarray(one.chain)[one.power > one.floor] for one in tables]
-    if dark := {place.chain for place in places} - {""}.union(*lit):
+    answered = [np.asarray(one.chain)[one.power > one.floor] for one in tables]
+    if dark := {place.chain for place in places} - {""}.union(*answered):
         raise ValueError(
             f"chain: got no reading of {sorted(dark)} above its floor, so that nothing tells the gain; leave it out"
         )

@@ -111,7 +111,7 @@ def moved(one: Readings, offsets: Sequence[tuple[Place, np.ndarray]]) -> Reading
 
 
 Evidence = tuple[Observation, np.ndarray, np.ndarray]
-"""What was read of a receiver; its prediction without paths without scattering, shape ``(N,)``; and the power of those paths,
+"""What was read of a receiver; what is predicted to come by scattering, shape ``(N,)``; and the power of all other paths,
 shape ``(L,)``: both in the units of the target, gain of the chain included."""
 
 
