@@ -39,7 +39,7 @@ VERSIONS = {
     "metrics": 1,
     "exact": 2,
     "sionna": 1,
-    "bistatic": 14,
+    "bistatic": 15,
     "harmonic": 1,
     "lookups": 1,
     "networks": 1,

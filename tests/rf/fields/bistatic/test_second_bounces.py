@@ -277,6 +277,25 @@ def test_what_groups_scatter_at_an_angle_is_told_from_what_they_do_of_even_light
         np.testing.assert_allclose(0.5 * even, p.scattered_share[group], rtol=2e-3)
 
 
+def test_slabs_that_the_data_lack_hide_no_bounces():
+    """Sets were compared with slabs and edges that no reading has, which erred more than bounces bring: single ones were kept."""
+    wall = box_mesh([3.4, 0, 0], [3.42, 3.2, 3])
+    mesh, part = joined(box_mesh([0, 0, 0], [7, 5, 3], inward=True), wall)
+    bright = wr.Material.custom("bright", relative_permittivity=5.0, scattering=0.9, thickness_m=0.02)
+    scene, rng = wr.Scene(mesh, [bright, bright], part), np.random.default_rng(2)
+    rooms = ([3.8, 0.5, 0.5], [6.5, 4.5, 2.5]), ([0.5, 0.5, 0.5], [3.1, 4.5, 2.5])
+    places = np.concatenate([rng.uniform(*room, (12, 3)) for room in rooms])
+    with pytest.warns(UserWarning, match="diffraction and transmission"):
+        ds = wr.simulate(
+            scene, transmitter=[6.2, 4.3, 2.6], receivers=places, frequency_hz=60e9, shape=(12, 24),
+            effects=replace(SETS["room"], residual=False),
+        )  # fmt: skip
+    field = wr.RadioField.fit(scene, ds, model="bistatic", sub_pixels=1)
+    tried = {choice["term"]: choice["kept"] for choice in field.report["choices"]}
+    assert tried["room"] and tried["no transmission"] and field.effects.scatterings > 1
+    assert field.effects.transmissions == 0
+
+
 def test_light_between_bright_surfaces_is_wanted_where_there_is_some():
     """Fitted from what single bounces alone found, too bright by far, it was given up."""
     mesh, part = joined(box_mesh([0, 0, 0], [7, 5, 3], inward=True), box_mesh([2, 1.5, 0], [3.2, 2.6, 0.8]))

@@ -49,7 +49,7 @@ from warprrf.rows import distinct_rows
 
 SHORT_STEPS = 10  # of a fit that only decides about something
 BETTER = 0.995
-"""Share to which further effects must lower the mean square error of receivers held out."""
+"""Share to which another choice of effects must lower the mean square error of :meth:`Training.choice_loss`."""
 
 
 def fit(
@@ -199,39 +199,39 @@ def choose(t: Training) -> Solution:
         return _choose_of_few(t, trials)
     best, least = None, np.inf
     for trial in trials:  # each holds the one before it: what is no better with some is not tried with more
+        if best is not None:
+            trial = replace(trial, effects=with_slabs_and_edges(trial.effects, best.effects))
         if best is not None and best.effects.scatterings > 1:
             trial = t.refined(replace(best, effects=trial.effects), t.few(1), SHORT_STEPS)
         else:  # not from what single bounces found: their surfaces are too bright where light between them counts
             trial = t.refined(trial, t.few(1), 2 * SHORT_STEPS, rounds=2)
-        loss = t.held_loss(trial)
+        loss = t.choice_loss(trial)
         kept = loss < BETTER * least
         t.note(_name(trial.effects), kept, loss)
         if not kept:
             break
-        best, least = trial, loss
+        # What slabs and edges get wrong would hide what bounces are worth.
+        best, least = _without_needless(t, trial, loss)
     if best is None:
         raise ValueError("effects: got none to choose from")
-    best = _without_needless(t, best)
     if np.isfinite(t.surface.appearance).all() and material.max() > 0 and not t.totals:
         best = merged(t, best)
     return best
 
 
-def _without_needless(t: Training, chosen: Solution) -> Solution:
-    """``chosen`` without those of :data:`OPTIONAL` that readings are predicted better without. Places held out are too few to
-    say so alone: none of them may be behind a wall."""
-    places = np.union1d(t.few(1), t.held)
+def _without_needless(t: Training, chosen: Solution, loss: float) -> tuple[Solution, float]:
+    """``chosen``, of a :meth:`Training.choice_loss` of ``loss``, without those of :data:`OPTIONAL` that readings are predicted
+    better without; and the loss of that."""
     for name, on in OPTIONAL.items() if t.options.effects == "auto" and t.options.relevance is None else ():
         off: dict[str, Any] = dict.fromkeys(on, 0)
         fewer = replace(chosen.effects, **off)
         if fewer != chosen.effects:
-            before = t.part_loss(chosen, places)
             trial = t.refined(replace(chosen, effects=fewer), t.few(1), SHORT_STEPS)
-            loss = t.part_loss(trial, places)
-            kept = loss < BETTER * before
-            t.note(f"no {name}", kept, loss)
-            chosen = trial if kept else chosen
-    return chosen
+            without = t.choice_loss(trial)
+            kept = without < BETTER * loss
+            t.note(f"no {name}", kept, without)
+            chosen, loss = (trial, without) if kept else (chosen, loss)
+    return chosen, loss
 
 
 def _choose_of_few(t: Training, trials: list[Solution]) -> Solution:
@@ -260,7 +260,7 @@ def merged(t: Training, best: Solution) -> Solution:
         problem = replace(problem, material=material, known_through=t.known_through(material))
         trial = gauss_newton(problem, start, SHORT_STEPS)
         t.tick()
-    t.note(f"{best.material.max() + 1} materials as {trial.material.max() + 1}", True, t.held_loss(trial))
+    t.note(f"{best.material.max() + 1} materials as {trial.material.max() + 1}", True, t.choice_loss(trial))
     return trial
 
 

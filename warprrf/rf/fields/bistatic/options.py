@@ -40,10 +40,11 @@ class FitOptions:
 
     Attributes:
         effects: what is modelled: :class:`Effects`, the name of one of :data:`SETS` (``"single"``, ``"room"``,
-            ``"everything"``), or ``"auto"``: the set that errs least on receivers held out (a quarter, 30 at most); a
-            larger set is tried where the one before it was better. With fewer than eight receivers it is ``"room"``, or
-            ``"single"`` if that fits much better. Slabs are passed and edges gone over where that is worth more than 0.25 dB
-            to all power of blocked receivers (:func:`needed`).
+            ``"everything"``), or ``"auto"``: the set that errs least, fitted to up to 24 receivers, on these and on
+            those held out (a quarter, 30 at most); a larger set is tried where the one before it was better. With fewer
+            than eight receivers it is ``"room"``, or ``"single"`` if that fits much better. Slabs are passed and edges gone
+            over where that is worth more than 0.25 dB to all power of blocked receivers (:func:`needed`), and predicts
+            better.
         lobes: exponents of the scattering lobes ((1 + cos psi) / 2)^n, 0 for Lambertian; None for 0, 2, 5, 12, 30.
         reciprocal: lobes that scatter alike when transmitter and receiver change places. By default they are those of
             Degli-Esposti et al. (2007), Sionna RT's, which do not.

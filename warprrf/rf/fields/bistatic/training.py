@@ -342,18 +342,11 @@ class Training:
         each = zip(places, predicted, strict=True)
         return float(np.mean([self.observations[k].losses(x).mean() for k, x in each]))
 
-    def held_loss(self, choice: Solution) -> float:
-        """Mean square error at the places held out, without residual [dB^2]: of all readings where they are few, else of
-        those chosen."""
-        few = 4  # places, of which all readings are looked at
-        if len(self.held) <= few:
-            return self.loss(self.model(choice), self.held)
-        return self.part_loss(choice, self.held)
-
-    def part_loss(self, choice: Solution, places: np.ndarray) -> float:
-        """The same of the readings chosen of ``places``."""
-        problem = self.problem(choice.effects, choice.material, places, choice.parameters)
-        p = choice.parameters
+    def choice_loss(self, choice: Solution) -> float:
+        """Mean square error that tells one choice from another [dB^2]: of the readings chosen of places that trial fits learn from
+        and of those held out, without residual. The latter are too few to say alone: none of them may be behind a wall."""
+        places, p = np.union1d(self.few(1), self.held), choice.parameters
+        problem = self.problem(choice.effects, choice.material, places, p)
         losses = [batch.losses(batch.gain(p, x) * x) for batch, _, x in problem.evaluated(p)]
         return float(np.mean(np.concatenate(losses)))
 
