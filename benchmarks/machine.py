@@ -53,7 +53,7 @@ DEPENDS = {
     "bistatic": ("geometry", "bistatic"),
     "edited": ("exact", "bistatic"),
     "engine": ("renderer",),
-    "filmed": ("geometry",),
+    "filmed": ("geometry", "bistatic"),
     "gpu": ("renderer",),
     "lobby": ("geometry", "bistatic", "harmonic"),
     "lobby_seeds": ("geometry", "bistatic", "harmonic"),
