@@ -267,6 +267,19 @@ def test_uncertainty_covers_the_error(field, data):
     assert (ratio <= 2).mean() > 0.75
 
 
+def test_directions_that_were_not_measured_leave_the_others_their_errors(scene, field, data):
+    """A single NaN pixel left a field without any."""
+    part = data.path_gain[:6].copy()
+    part[:, :5, ::3] = np.nan
+    part = RadioField.fit(scene, replace(data.subset(np.arange(6)), path_gain=part))
+    ratio = (
+        part.spectrum(RECEIVERS[7], uncertainty=True).std_db
+        / field.spectrum(RECEIVERS[7], uncertainty=True).std_db
+    )
+    assert 0.7 < np.median(ratio) < 1.4
+    assert np.isfinite(ratio).all()
+
+
 def test_what_parameters_leave_open_is_carried_to_the_pixels(field):
     """Of one material all lobes together: by differences of the spectrum."""
     bare = replace(field, effects=replace(SETS["single"], residual=False))

@@ -567,7 +567,7 @@ class BistaticField(RadioField):
         if self.errors is None:
             raise ValueError(
                 f"uncertainty: no receiver was held out of this field's fit to {self.report.get('receivers', 0)}, or it was "
-                "edited, or is of another carrier since, so its error is not known; fit whole spectra of four or more, without "
+                "edited, or is of another carrier since, so its error is not known; fit spectra of four or more, without "
                 "quick=True"
             )
         rows = np.unique(self.material, return_index=True)[1]

@@ -273,12 +273,8 @@ def _name(effects: Effects) -> str:
 
 
 def cross_validate(t: Training, choice: Solution) -> ErrorModel | None:
-    """The errors of places held out; where they are few, of all, held out in turn. None where not all are whole spectra."""
-    whole = (
-        isinstance(o.measured, SpectrumPixels) and (o.target.trust == 1.0).all()
-        for o in t.observations.values()
-    )
-    if not len(t.held) or not all(whole):
+    """The errors of places held out; where they are few, of all, held out in turn. None where not all are of spectra."""
+    if not len(t.held) or not all(isinstance(o.measured, SpectrumPixels) for o in t.observations.values()):
         return None
     places = np.stack([o.place.receiver for o in t.observations.values()])
     images, missed, gaps = list[np.ndarray](), list[np.ndarray](), list[float]()
@@ -290,7 +286,8 @@ def cross_validate(t: Training, choice: Solution) -> ErrorModel | None:
         for k, power in zip(held, t.predicted(model, held), strict=True):
             o = t.observations[k]
             images.append((NEPER * np.log1p(power)).reshape(o.place.shape))
-            missed.append(o.target.error(power).reshape(o.place.shape))
+            known = np.where(o.target.trust > 0, o.target.error(power), np.nan)
+            missed.append(known.reshape(o.place.shape))
             gaps.append(float(np.linalg.norm(places[kept] - places[k], axis=1).min()))
     return learn_errors(images, missed, np.array(gaps), places, covariance_of(t, choice))
 

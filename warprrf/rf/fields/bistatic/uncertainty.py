@@ -95,7 +95,7 @@ def learn_errors(
 
     Args:
         images: predicted images, dB above the floor, each ``(H, W)``.
-        errors: prediction less truth [dB], each ``(H, W)``.
+        errors: prediction less truth [dB], each ``(H, W)``, NaN where that is not known.
         gaps: distance of each to the nearest receiver that was learned from [m], shape ``(V,)``.
         receivers: all training receivers [m].
         covariance: of the group parameters.
@@ -104,6 +104,7 @@ def learn_errors(
     places = [bins(image) for image in images]
     row, column = (np.concatenate([p[k].ravel() for p in places]) for k in (0, 1))
     error = np.abs(np.concatenate([e.ravel() for e in errors]))
+    row, column, error = (one[np.isfinite(error)] for one in (row, column, error))
     table, enough = np.full(shape, np.nan), 60  # errors in a bin
     for i in range(shape[0]):
         for j in range(shape[1]):
@@ -117,7 +118,7 @@ def learn_errors(
             table[i] = np.interp(np.arange(shape[1]), np.flatnonzero(known), table[i][known])
         else:
             table[i] = overall
-    typical = np.array([np.sqrt(np.mean(e**2)) for e in errors])
+    typical = np.array([np.sqrt(np.nanmean(e**2)) for e in errors])
     growth, middle = 0.0, float(np.mean(gaps))
     if len(gaps) >= 4 and np.ptp(gaps) > 0.1:
         growth = float(np.clip(np.polyfit(gaps - middle, np.log(np.maximum(typical, 1e-3)), 1)[0], 0.0, 0.3))
