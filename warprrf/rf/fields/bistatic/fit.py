@@ -236,18 +236,21 @@ def _without_needless(t: Training, chosen: Solution, loss: float) -> tuple[Solut
 
 def _choose_of_few(t: Training, trials: list[Solution]) -> Solution:
     """With too few receivers to hold any out: bounces as rooms have them, unless none fit much better."""
-    if len(trials) == 1:
-        return t.refined(trials[0], t.not_held, t.options.iterations, rounds=2)
-    single, room = (t.refined(trial, t.not_held, t.options.iterations, rounds=2) for trial in trials[:2])
-    models = [t.model(trial) for trial in (single, room)]
+    found = []
+    for trial in trials[:2]:
+        trial = t.refined(trial, t.not_held, t.options.iterations, rounds=2)
+        found.append(_without_needless(t, trial, t.choice_loss(trial))[0])
+    if len(found) == 1:
+        return found[0]
+    models = [t.model(trial) for trial in found]
     wrong, also = (t.unexplained(model)[0] for model in models)
     counted = t.without({k: np.intersect1d(rows, also[k]) for k, rows in wrong.items() if k in also})
-    losses = [counted.loss(model, list(t.observations)) for model in models]
+    single, room = (counted.loss(model, list(t.observations)) for model in models)
     much_better = 0.8  # share to which single bounces must lower the error
-    fewer = losses[0] < much_better * losses[1]
-    t.note(_name(single.effects), fewer, losses[0])
-    t.note(_name(room.effects), not fewer, losses[1])
-    return single if fewer else room
+    fewer = single < much_better * room
+    t.note(_name(found[0].effects), fewer, single)
+    t.note(_name(found[1].effects), not fewer, room)
+    return found[0] if fewer else found[1]
 
 
 def merged(t: Training, best: Solution) -> Solution:
