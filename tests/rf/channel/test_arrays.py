@@ -44,6 +44,7 @@ def test_turning_array_and_waves_together_changes_nothing(pattern, polarisation)
         turned.response(d @ turn.T, WAVELENGTH), still.response(d, WAVELENGTH), atol=1e-11
     )
     np.testing.assert_allclose(turned.gain(d @ turn.T), still.gain(d), rtol=1e-9)
+    np.testing.assert_allclose(still.response(2.5 * d, WAVELENGTH), still.response(d, WAVELENGTH), atol=1e-11)
     point = 0.5 * d
     np.testing.assert_allclose(
         turned.spherical_response(point @ turn.T, WAVELENGTH),

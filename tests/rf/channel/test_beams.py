@@ -145,6 +145,8 @@ def test_multi_user_choice_is_as_good_as_trying_everything():
     )
     found = wr.channel.select_beams_multiuser(wr.Paths.stack(users), tx, rx, noise=0.3)
     np.testing.assert_allclose(np.log2(1.0 + found.sinr).sum(), best, rtol=1e-12)
+    with pytest.raises(ValueError, match="gains"):
+        signal_over_interference([-gains[0], gains[1]], [0, 0], [0, 0], 0.3)
 
 
 def test_what_no_codebook_can_be_made_of_is_named():

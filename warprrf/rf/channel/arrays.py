@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from warprrf.cache import cached_property
 from warprrf.checks import Count, check_array, checked, positive
+from warprrf.geometry.mesh import headings
 from warprrf.rf.spectra.antenna import Antenna, Pattern, as_antenna, check_rotation
 from warprrf.rf.spectra.spectrum import angles_from_directions, unit_vectors
 
@@ -100,7 +101,7 @@ class PlanarArray:
         return self.element.field(directions)
 
     def response(self, directions: ArrayLike, wavelength_m: float) -> np.ndarray:
-        """Plane-wave response exp(j 2 pi / lambda d . u) of elements at d to world ``directions`` u (..., 3).
+        """Plane-wave response exp(j 2 pi / lambda d . u) of elements at d to world ``directions`` u (..., 3), made of length one.
 
         Args:
             wavelength_m: lambda, of the wave, that the spacing is counted in.
@@ -108,8 +109,8 @@ class PlanarArray:
         Returns:
             Shape ``(..., N)``, complex, of unit modulus, phase zero at the array's centre.
         """
-        reach = check_array("directions", directions, (..., 3), finite=False) @ self.positions(wavelength_m).T
-        return np.exp(2j * np.pi / wavelength_m * reach)
+        toward, _ = headings(check_array("directions", directions, (..., 3), finite=False))
+        return np.exp(2j * np.pi / wavelength_m * (toward @ self.positions(wavelength_m).T))
 
     def spherical_response(self, points: ArrayLike, wavelength_m: float) -> np.ndarray:
         """Response to a source at ``points`` (..., 3) [m] from the array's centre, relative to that at the centre.

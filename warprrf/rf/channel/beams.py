@@ -308,7 +308,7 @@ def signal_over_interference(
     transmitted, received = (
         check_array(name, value, (users,), np.int64) for name, value in (("tx", tx), ("rx", rx))
     )
-    tables = [check_array("gains", g, (None, None)) for g in gains]
+    tables = [check_array("gains", g, (None, None), least=0.0) for g in gains]
     for name, index, axis in (("rx", received, 0), ("tx", transmitted, 1)):
         fewest = min((table.shape[axis] for table in tables), default=0)
         if users and not -fewest <= index.min() <= index.max() < fewest:
