@@ -66,10 +66,8 @@ def test_no_figure_is_typed(page):
 
 STALE = {
     "arrays",
-    "bare_mesh",
     "beams",
     "bistatic",
-    "edited",
     "filmed",
     "filmed-cafe",
     "lobby",
@@ -80,8 +78,6 @@ STALE = {
     "measured_hall",
     "measured_office",
     "measurements",
-    "office",
-    "outside",
     "relevance",
     "suggest",
 }
