@@ -42,9 +42,6 @@ from warprrf.rf.tracing.tracer import SPECULAR
 
 WEIGHT_STD, EXCESS_STD, MIRROR_STD = 2.0, 0.8, 1.5
 """Standard deviations a priori of lobe weights, permittivity less one and mirrored share from where a fit starts [nepers]."""
-ENERGY_STD = 0.25
-"""That of the scattered and the mirrored share, added, from one. Readings of power alone would otherwise take a room for more
-reverberant, and the gain of the chain for less, than either can be."""
 THROUGH_STD, KNOWN_THROUGH_STD = 1.5, 0.02
 """Those of the share let through from what it is before any measurement: where that is assumed, and of a slab of known thickness
 and permittivity. The latter is small because hundreds of pixels hold one path and err together."""
@@ -211,6 +208,7 @@ class Problem:
         material: of each group, shape ``(G,)``.
         chains: measuring chains whose gain is unknown.
         gain_offset: whether a gain common to all paths is free.
+        energy_std: standard deviation a priori of the scattered and the mirrored share, added, from one.
         known_through: ln of the share that materials let through before any measurement, and its deviation, shape ``(2, M)``; None
             for that of the start.
     """
@@ -221,6 +219,7 @@ class Problem:
     material: np.ndarray
     chains: int = 0
     gain_offset: bool = False
+    energy_std: float = 0.25
     known_through: np.ndarray | None = None
 
     @classmethod
@@ -311,6 +310,7 @@ def priors(
     p: Parameters,
     start: Parameters,
     layout: Layout,
+    energy_std: float,
     known_through: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Residuals of the priors ``(K,)`` and their Jacobian ``(K, F)``: distance to the start, energy kept."""
@@ -342,7 +342,7 @@ def priors(
         add(p.log_gains / chain_std, layout.first_chain + np.arange(layout.chains), 1.0 / chain_std)
     shares = np.column_stack([p.weight, np.exp(p.log_mirror)])  # S^2 by lobes, and 1 - S^2
     places = np.column_stack([layout.weight(own), layout.mirror(own)])
-    add((shares.sum(axis=1) - 1.0) / ENERGY_STD, places, shares / ENERGY_STD)
+    add((shares.sum(axis=1) - 1.0) / energy_std, places, shares / energy_std)
     return np.concatenate(residuals), np.concatenate(rows)
 
 
@@ -364,12 +364,12 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
     hessian, losses = np.eye(layout.size), []
     if steps == 0:
         hessian = _normal_equations(problem, start, layout)[0]
-        slopes = priors(start, start, layout, problem.known_through)[1]
+        slopes = priors(start, start, layout, problem.energy_std, problem.known_through)[1]
         hessian += slopes.T @ slopes
 
     def total(x: np.ndarray) -> float:
         p = layout.unpack(x, start)
-        prior = priors(p, start, layout, problem.known_through)[0]
+        prior = priors(p, start, layout, problem.energy_std, problem.known_through)[0]
         own = (batch.fit_loss(batch.gain(p, power) * power) for batch, _, power in problem.evaluated(p))
         return weight * sum(float(loss.sum()) for loss in own) + float((prior**2).sum())
 
@@ -379,7 +379,7 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
     for _ in range(steps):
         p = layout.unpack(vector, start)
         hessian, gradient = _normal_equations(problem, p, layout)
-        r, j = priors(p, start, layout, problem.known_through)
+        r, j = priors(p, start, layout, problem.energy_std, problem.known_through)
         hessian += j.T @ j
         gradient += j.T @ r
         improved = False

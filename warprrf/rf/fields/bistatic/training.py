@@ -310,6 +310,7 @@ class Training:
         return Problem.of(
             [self.parts[k] for k in places], effects, material, p, chains=len(self.chains),
             gain_offset=self.options.gain_offset, known_through=self.known_through(material),
+            **({"energy_std": 1.0} if self.totals else {}),
         )  # fmt: skip
 
     def model(self, choice: Solution) -> Model:
