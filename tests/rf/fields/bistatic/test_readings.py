@@ -8,7 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 from furnished import RECEIVERS, SHAPE, SIGMA, TX, F, spectra
+from radio_scenes import box_mesh
 
+import warprrf as wr
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import training
@@ -318,6 +320,23 @@ def test_directions_that_nobody_measured_do_not_count(scene, test):
         evaluate(part, field.spectrum)
     with pytest.raises(ValueError, match="path_gain"):
         RadioField.fit(scene, part, "rf3dgs+")
+
+
+def test_power_that_the_model_does_not_explain_counts_less():
+    """Walls of a room in which power does not fall with distance mirrored four times what reached them, and the gain of the
+    chain was too low by far: readings counted as if they erred by half a decibel."""
+    room, rng = wr.Mesh(*box_mesh([0, 0, 0], [7, 5, 3], inward=True)), np.random.default_rng(0)
+    scene = wr.Scene(
+        room, [wr.em.itu_material("brick", thickness_m=0.2)], np.zeros(len(room.faces), np.int32)
+    )
+    places = rng.uniform([0.5, 0.5, 0.5], [6.5, 4.5, 2.5], (60, 3))
+    power = (0.125 / (4.0 * np.pi)) ** 2 * 10.0 ** (0.2 * rng.normal(size=60))  # as a metre away, everywhere
+    sent = np.tile([1.0, 1.0, 2.6], (60, 1))
+    readings = Readings(sent, places, power, 2.4e9, 1e-12, chain=["tag"] * 60)
+    field = RadioField.fit(scene, readings, quick=True)
+    assert np.exp(field.parameters.log_mirror[0]) < 4.0
+    assert field.report["chains"]["tag"]["gain_db"] > -7.0
+    assert 1.0 < field.report["noise_db"]["readings"] < 4.0
 
 
 def test_a_censored_reading_says_only_that_there_was_no_more():

@@ -379,6 +379,18 @@ class Training:
             parts[k] = replace(parts[k], target=parts[k].target.trusted(counts[parts[k].rows]))
         return replace(self, observations=observations, parts=parts)
 
+    def weighed(self, noise_db: Mapping[str, float]) -> Training:
+        """The same in which no reading counts for more than by the noise [dB] of its table."""
+
+        def less(o: Observation) -> Observation:
+            most = NOISE_DB / max(noise_db.get(self.names[o.place.data], 0.0), 1e-9)
+            return replace(o, target=replace(o.target, trust=np.minimum(o.target.trust, most)))
+
+        observations, parts = (
+            {k: less(o) for k, o in own.items()} for own in (self.observations, self.parts)
+        )
+        return replace(self, observations=observations, parts=parts)
+
     def note(self, what: str, kept: bool, loss: float) -> None:
         """Log a choice."""
         self.log.append({"term": what, "kept": bool(kept), "rmse_db": float(np.sqrt(loss))})
