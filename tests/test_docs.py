@@ -71,7 +71,6 @@ STALE = {
     "filmed",
     "filmed-cafe",
     "lobby",
-    "lobby_seeds",
     "locate",
     "map",
     "measured_flat",
