@@ -68,7 +68,6 @@ STALE = {
     "arrays",
     "beams",
     "bistatic",
-    "filmed",
     "filmed-cafe",
     "lobby",
     "locate",
