@@ -72,7 +72,6 @@ STALE = {
     "locate",
     "map",
     "measured_flat",
-    "measured_hall",
     "measurements",
     "relevance",
     "suggest",
