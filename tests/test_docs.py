@@ -70,7 +70,6 @@ STALE = {
     "bistatic",
     "lobby",
     "locate",
-    "map",
     "measured_flat",
     "measurements",
     "relevance",
