@@ -173,12 +173,13 @@ def _steps(
         t = t.and_at(others, more)
     errors = cross_validate(t, choice)
     choice, model = fit_to_all(t, choice)
+    if t.totals:  # they count by how they err, from the beginning: what was fitted to noise would stay
+        t = t.weighed(t.unexplained(model)[1])
+        choice = t.refined(replace(choice, parameters=t.start(choice.material)), t.telling, SHORT_STEPS)
+        choice, model = fit_to_all(t, choice)
     wrong, noise_db = t.unexplained(model)
-    if wrong or t.totals:
+    if wrong:
         t = t.without(wrong)
-        if t.totals:  # count by how they err, from the beginning: what was fitted to noise would stay
-            t = t.weighed(noise_db)
-            choice = t.refined(replace(choice, parameters=t.start(choice.material)), t.telling, SHORT_STEPS)
         choice, model = fit_to_all(t, choice)
     if errors is not None:
         errors = replace(errors, covariance=covariance_of(t, choice))
