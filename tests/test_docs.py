@@ -68,7 +68,6 @@ STALE = {
     "arrays",
     "beams",
     "bistatic",
-    "lobby",
     "locate",
     "measured_flat",
     "measurements",
