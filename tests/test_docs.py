@@ -69,7 +69,6 @@ STALE = {
     "beams",
     "bistatic",
     "locate",
-    "measured_flat",
     "measurements",
     "relevance",
     "suggest",
