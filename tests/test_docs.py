@@ -124,7 +124,7 @@ def test_geometry_is_counted_up_with_its_steps():
             "initial": 4,
             "refined": 2,
             "depth": 4,
-            "surface": 10,
+            "surface": 11,  # 60 photos and fewer alone: no result is of so few
         },
     )
 

@@ -12,7 +12,14 @@ from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.gaussians.cells import occupancy
 from warprrf.geometry.photos.gaussians.initialise import discs
 from warprrf.geometry.photos.posed.images import PosedPhotos
-from warprrf.geometry.photos.surface.fusion import _sure, depth_maps, depth_views, fuse_depth, fuse_maps
+from warprrf.geometry.photos.surface.fusion import (
+    FEW_MAPS,
+    _sure,
+    depth_maps,
+    depth_views,
+    fuse_depth,
+    fuse_maps,
+)
 from warprrf.geometry.planes import Plane, PlaneConfig, detect_planes, plane_axes
 from warprrf.geometry.scans import SurfaceConfig, find_patches
 
@@ -219,6 +226,16 @@ def test_a_depth_map_with_few_known_pixels_does_not_end_the_fusion():
     few[8, 8] = 100.0  # beyond the largest range
     mesh = fuse_depth([WALL, few, WALL], [CAMERA] * 3, config=SurfaceConfig())
     assert np.abs(mesh.vertices[:, 2] - 2).max() < 0.01
+
+
+@pytest.mark.parametrize(("maps", "seen"), [(FEW_MAPS, True), (FEW_MAPS + 1, False)])
+def test_what_one_of_few_depth_maps_saw_is_kept(maps, seen):
+    half, rest = (
+        np.where(np.arange(64) < 32, WALL if left else 0.0, 0.0 if left else WALL) for left in (1, 0)
+    )
+    mesh = fuse_depth([half, *[rest] * (maps - 1)], [CAMERA] * maps, config=SurfaceConfig())
+    assert mesh.vertices[:, 0].max() > 1.0  # of the maps that all but one are
+    assert (mesh.vertices[:, 0].min() < -1.0) == seen
 
 
 def test_holes_that_stay_open_are_said_to():
