@@ -66,7 +66,6 @@ def test_no_figure_is_typed(page):
 
 STALE = {
     "arrays",
-    "beams",
     "bistatic",
     "locate",
     "measurements",
