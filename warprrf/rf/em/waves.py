@@ -24,6 +24,15 @@ def check_frequency(frequency_hz: ArrayLike | None, name: str = "frequency_hz") 
     return value
 
 
+def check_carrier(name: str, frequency_hz: float, field_hz: float) -> None:
+    """Errors call what is of another carrier than a field ``name``."""
+    of, told = frequency_hz / 1e9, field_hz / 1e9
+    if abs(of / told - 1.0) > 1e-3:
+        raise ValueError(
+            f"{name}: got {of:g} GHz, expected {told:g}; field.at_frequency(hz) is of another carrier"
+        )
+
+
 Hertz: TypeAlias = Annotated[float, lambda name, value: check_frequency(value, name)]
 """A carrier, checked where an argument is annotated so."""
 

@@ -22,6 +22,7 @@ from scipy.ndimage import uniform_filter
 
 from warprrf.checks import NotNegative, Shaped, check_alike, check_array, checked, warn, within
 from warprrf.device import Progress, with_progress
+from warprrf.rf.em.waves import check_carrier
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.deembedding import respond, scanned_kernel
 from warprrf.rf.spectra.spectrum import (
@@ -291,11 +292,7 @@ def _asked_alike(predict: Callable[[np.ndarray], Any], test: SpectrumDataset) ->
     owner: Any = getattr(predict, "__self__", None)
     if not hasattr(owner, "on_grid") or getattr(predict, "__name__", "") != "spectrum":
         return predict
-    of, told = test.frequency_hz / 1e9, owner.frequency_hz / 1e9
-    if abs(of / told - 1.0) > 1e-3:
-        raise ValueError(
-            f"test: got {of:g} GHz, expected {told:g}; field.at_frequency(hz) is of another carrier"
-        )
+    check_carrier("test", test.frequency_hz, owner.frequency_hz)
     spectrum: Callable[..., Any] = owner.on_grid(test.shape).spectrum
     same_m = 1e-3  # a transmitter this near is the same one
     if np.linalg.norm(owner.transmitter - test.transmitter) <= same_m:

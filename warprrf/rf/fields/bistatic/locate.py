@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 
 from warprrf.device import Progress
 from warprrf.rf.em.absorption import Air
-from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT
+from warprrf.rf.em.waves import NEPER, SPEED_OF_LIGHT, check_carrier
 from warprrf.rf.fields.base import Location, Measured
 from warprrf.rf.fields.bistatic.field_map import SPACING_M, FieldMap, best_on_map, coarse, maps_of
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, Place, as_list, huber, kinds_of, places_of
@@ -54,11 +54,7 @@ def as_data(field: Any, measured: Any) -> list[Measured]:
         )  # fmt: skip
     found = []
     for one in as_list(measured, "measured"):
-        of, told = one.frequency_hz / 1e9, field.frequency_hz / 1e9
-        if abs(of / told - 1.0) > 1e-3:
-            raise ValueError(
-                f"measured: got {of:g} GHz, expected {told:g}; field.at_frequency(hz) is of another carrier"
-            )
+        check_carrier("measured", one.frequency_hz, field.frequency_hz)
         if isinstance(one, Readings):
             if not one.azimuth_known and (one.departure is not None or one.delay_s is not None):
                 raise ValueError(
