@@ -60,11 +60,7 @@ class FieldMap:
 
     def decibels(self, key: Hashable, read: Callable[[], np.ndarray]) -> np.ndarray:
         """What ``read`` makes of the map, readings at every place ``(P, N)``, in decibels, float32; kept by ``key``."""
-
-        def made() -> np.ndarray:
-            return _decibels(read())
-
-        return self._read.get(key, made)
+        return self._read.get(key, lambda: _decibels(read()))
 
     def weighed(self, weights: np.ndarray) -> np.ndarray:
         """Readings at every place [dB], shape ``(P, N)``, of which ``weights`` (N, H W) say what each takes of ``image``."""
@@ -106,10 +102,8 @@ def maps_of(
     found = batch.gather(
         partial(_mapped, bistatic), VARIABLES, {}, bistatic._known_by(batch, SHAPE, list(VARIABLES))
     )
-    parts = [
-        np.asarray(found[name]).reshape(len(transmitters), len(places), *found[name].shape[1:])
-        for name in VARIABLES
-    ]
+    shape = len(transmitters), len(places), *SHAPE
+    parts = [np.asarray(found[name]).reshape(shape) for name in VARIABLES]
     return {
         source.tobytes(): FieldMap(places, *own) for source, *own in zip(transmitters, *parts, strict=True)
     }
@@ -238,13 +232,8 @@ def _table(one: Readings, maps: dict[bytes, FieldMap], chains: Sequence[str]) ->
         columns = count * row.reshape(-1) + (turn + np.arange(count)[:, None]) % count
         ask["arrival"] = np.column_stack([np.repeat(zenith, count), np.tile(turns, len(zenith))])
     count = int(columns.max()) + 1
-    ask |= {
-        "transmitters": one.transmitters[0],
-        "receivers": one.receivers[0],
-        "power": np.ones(count),
-        "floor": 0.5,
-    }
-    asked = replace(one, **ask, chain=None, std_db=0.0, azimuth_known=True)
+    ask |= {"transmitters": one.transmitters[0], "receivers": one.receivers[0], "power": np.ones(count)}
+    asked = replace(one, **ask, floor=0.5, chain=None, std_db=0.0, azimuth_known=True)
     weights, parts = path_weights(asked, np.arange(count), toward, toward, np.zeros(PIXELS)), []
     for source in np.unique(one.transmitters, axis=0):
         rows = np.flatnonzero((one.transmitters == source).all(axis=1))

@@ -271,9 +271,7 @@ class Question:
             return np.diag(np.full(3, np.inf))
         inverse, count = np.linalg.pinv(curvature), len(best.error)
         if not self.spectra:
-            return np.asarray(inverse * max(1.0, best.loss(threshold) / max(count - len(curvature), 1)))[
-                :3, :3
-            ]
+            return inverse[:3, :3] * max(1.0, best.loss(threshold) / max(count - len(curvature), 1))
         # Blocks of pixels are independent (Liang and Zeger 1986): what one edge in the wrong place spoils hangs together.
         shape, blocks = self.places[0].shape, 12  # along each axis
         # Not all that hangs together: half of the squared errors of 20 receivers of a lobby, none of them fitted to or
@@ -321,16 +319,8 @@ def search(question: Question, maps: dict[bytes, FieldMap]) -> Location:
     best = min(found, key=lambda one: one.loss(threshold))
     ahead = {id(one): least - best.loss(threshold) for one in rest}  # what all effects would bring them too
     spread = best.loss(threshold) / max(len(best.error) - len(best.unknown), 1)
-    pixels = max(
-        [
-            1.0,
-            *(
-                one.beam_sigma_rad**2 * one.path_gain.size
-                for one in question.data
-                if isinstance(one, SpectrumDataset)
-            ),
-        ]
-    )
+    spectra = [one for one in question.data if isinstance(one, SpectrumDataset)]
+    pixels = max([1.0, *(one.beam_sigma_rad**2 * one.path_gain.size for one in spectra)])
     loss = {id(one): one.loss(threshold) - ahead.get(id(one), 0.0) for one in found + rest}
     order = sorted(found + rest, key=lambda one: loss[id(one)])
     order = [one for k, one in enumerate(order) if not one.near(order[:k])]
@@ -342,7 +332,7 @@ def search(question: Question, maps: dict[bytes, FieldMap]) -> Location:
     covariance, misfit = question.covariance(best, threshold), float(np.sqrt(spread))
     sure, explained = bool(likelihood[0] > 0.95), misfit < 4.0
     close = float(np.sqrt(np.trace(covariance))) < SPACING_M
-    heard = any(not isinstance(d, SpectrumDataset) or (d.path_gain > d.floor).any() for d in question.data)
+    heard = len(spectra) < len(question.data) or any((d.path_gain > d.floor).any() for d in spectra)
     after: list[Any] = [question.data[k] for k in question.turned]
     zeros = list(zip(after, best.unknown[3:].tolist(), strict=False))
     gains = (NEPER * best.unknown[3 + len(question.turned) :]).tolist()
