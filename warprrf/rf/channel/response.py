@@ -46,7 +46,6 @@ from warprrf.rf.channel.sums import (
     spherical_lengths,
     squint_sum,
 )
-from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 
 
@@ -107,13 +106,14 @@ def frequency_response(
         )
     found = []
     for one in _links(paths, **link):
-        many = one.ports[0] * one.ports[1] * len(one.tau) * len(f) > 1e6
+        air_m = one.paths.air_m
+        many = one.ports[0] * one.ports[1] * len(air_m) * len(f) > 1e6
         gridded = method == "grid" or (method == "auto" and even and many)
         h = np.zeros((*one.ports, len(f)), dtype=complex)
         for index, ports, job in one.jobs():
-            h[ports] += _response(job, f, one.absorption(f), one.air_m[index], gridded)
+            h[ports] += _response(job, f, one.absorption(f), air_m[index], gridded)
         if amplitude == "friis":
-            h = h * (one.carrier_hz / f)
+            h = h * (one.paths.carrier_hz / f)
         found.append(h if one.shift_s == 0.0 else h * carrier_phase(-f, one.shift_s))
     return np.stack(found) if paths.batched else found[0]
 
@@ -150,7 +150,7 @@ def channel_taps(
         h = np.zeros((*one.ports, len(lags)), dtype=complex)
         for _, ports, job in one.jobs():
             h[ports] += dense_sum(job, basis, len(lags))
-        return h * carrier_phase(-one.carrier_hz, one.shift_s)
+        return h * carrier_phase(-one.paths.carrier_hz, one.shift_s)
 
     found = [taps(one) for one in _links(paths, **link)]
     return np.stack(found) if paths.batched else found[0]
@@ -174,15 +174,16 @@ def impulse_response(paths: PathArrays, **link: Unpack[LinkOptions]) -> tuple[np
     spherical = link.get("wave") == "spherical"
     coefficients, delays = [], []
     for one in _links(paths, **link):
+        carrier = one.paths.carrier_hz
         a = np.zeros((*one.ports, count), dtype=complex)
         each = np.full((*one.ports, count), np.nan)
         for index, (received, transmitted), job in one.jobs():
-            factor, longer = job.pairs(one.carrier_hz)
+            factor, longer = job.pairs(carrier)
             place = received, transmitted, one.index[index]
-            a[place] = job.amplitude * factor * carrier_phase(-one.carrier_hz, one.shift_s)
+            a[place] = job.amplitude * factor * carrier_phase(-carrier, one.shift_s)
             each[place] = longer / SPEED_OF_LIGHT + job.tau - one.shift_s
         tau = np.full(count, np.nan)
-        tau[one.index] = one.tau - one.shift_s
+        tau[one.index] = one.paths.tau - one.shift_s
         coefficients.append(a)
         delays.append(each if spherical else tau)
     return (np.stack(coefficients), np.stack(delays)) if paths.batched else (coefficients[0], delays[0])
@@ -212,8 +213,7 @@ class _Link:
 
     Attributes:
         index: Which of the receiver's paths are summed, P of them.
-        tau: Their delays [s], shape ``(P,)``.
-        air_m: Their lengths in air [m], shape ``(P,)``.
+        paths: These.
         amplitude: Between elements at the arrays' centres, shape ``(Kr, Kt, P)``, K polarisations at either end.
         lengths: What elements' places add, for groups of paths (indices into the P).
         shift_s: Delay that counts as zero.
@@ -221,15 +221,12 @@ class _Link:
     """
 
     index: np.ndarray
-    tau: np.ndarray
-    air_m: np.ndarray
+    paths: PathArrays
     amplitude: np.ndarray
     lengths: list[tuple[np.ndarray, PairLengths]]
     shift_s: float
     ports: tuple[int, int]
-    carrier_hz: float
     squint: bool
-    air: Air | None
 
     def jobs(self) -> Iterator[tuple[np.ndarray, tuple[slice, slice], Sum]]:
         """Sums to add up: the paths that they are over, the ports that they belong to."""
@@ -238,14 +235,15 @@ class _Link:
             for a, b in np.ndindex(self.amplitude.shape[:2]):
                 ports = slice(a * rows, (a + 1) * rows), slice(b * columns, (b + 1) * columns)
                 amplitude = self.amplitude[a, b, index]
-                yield index, ports, Sum(amplitude, self.tau[index], lengths, self.carrier_hz, self.squint)
+                delay, carrier = self.paths.tau[index], self.paths.carrier_hz
+                yield index, ports, Sum(amplitude, delay, lengths, carrier, self.squint)
 
     def absorption(self, f: np.ndarray) -> np.ndarray | None:
         """Loss per metre over that at the carrier [neper/m], shape ``(F,)``; None without air."""
-        if self.air is None:
+        air, carrier = self.paths.air, self.paths.carrier_hz
+        if air is None:
             return None
-        change = self.air.attenuation_db_per_m(f) - self.air.attenuation_db_per_m(self.carrier_hz)
-        return np.log(10.0) / 20.0 * change
+        return np.log(10.0) / 20.0 * (air.attenuation_db_per_m(f) - air.attenuation_db_per_m(carrier))
 
 
 def random_turns(paths: PathArrays, seed: int) -> np.ndarray:
@@ -298,10 +296,7 @@ def _links(
         index = np.flatnonzero(own.valid & ~scattered if diffuse == "power" else own.valid)
         chosen = own.select(index)
         chosen.check_delays()
-        for name, array, toward in (
-            ("tx_array", tx, chosen.departure),
-            ("rx_array", rx, chosen.arrival),
-        ):
+        for name, array, toward in (("tx_array", tx, chosen.departure), ("rx_array", rx, chosen.arrival)):
             if array.directed and np.isnan(toward).any():
                 raise ValueError(f"{name}: got one for paths whose angles there are NaN, expected None")
         amplitude = _amplitudes(chosen, tx, rx)
@@ -320,15 +315,12 @@ def _links(
             ]
         yield _Link(
             index=index,
-            tau=chosen.tau,
-            air_m=chosen.air_m,
+            paths=chosen,
             amplitude=amplitude,
             lengths=groups,
             shift_s=float(chosen.tau.min()) if normalize_delays and len(index) else 0.0,
             ports=(rx.ports, tx.ports),
-            carrier_hz=carrier,
             squint=squint,
-            air=paths.air,
         )
 
 
