@@ -19,7 +19,7 @@ from scipy.spatial.distance import cdist
 
 from warprrf.geometry.mesh import Mesh, components, connected_pieces, edge_pairs
 from warprrf.geometry.splats.gaussians import Y00, Gaussians
-from warprrf.rows import sums_of
+from warprrf.rows import distinct_rows, sums_of
 
 SHAPES = 6  # numbers that tell shapes apart
 
@@ -79,7 +79,7 @@ def colour_groups(
     cell_m, curved = 0.4, 2.0  # that colours are averaged over; pieces off all patches this near are one
     sheet = _sheets(mesh, patch)
     place = np.floor((mesh.triangles.mean(axis=1) - mesh.bounds[0]) / cell_m).astype(np.int64)
-    unit = np.unique(np.column_stack([sheet, place]), axis=0, return_inverse=True)[1].reshape(-1)
+    unit = distinct_rows(np.column_stack([sheet, place]))[1]
     owner = np.full(int(unit.max()) + 1, -1)
     owner[unit] = sheet
     size = np.bincount(unit, mesh.areas) + 1e-9

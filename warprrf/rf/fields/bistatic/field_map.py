@@ -29,6 +29,7 @@ from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings, path_weights, tap_share
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_of, sub_pixel_directions
 from warprrf.rf.tracing.render import path_gains
+from warprrf.rows import distinct_rows
 
 SHAPE = (30, 60)
 """Rows and columns of the directions that are told apart, a ray for each."""
@@ -273,7 +274,7 @@ def coarse(one: Measured) -> Measured:
 def _pointing(one: Readings, *more: np.ndarray) -> np.ndarray:
     """Equal for readings of one transmitter and one turn of the antennas, shape ``(N,)``, from 0."""
     turned = [a for a in (one.transmitters, one.arrival, one.departure) if a is not None]
-    return np.unique(np.column_stack([*turned, *more]), axis=0, return_inverse=True)[1].reshape(-1)
+    return distinct_rows(np.column_stack([*turned, *more]))[1]
 
 
 def _profiles(one: Readings, maps: dict[bytes, FieldMap], chains: Sequence[str]) -> Rough:

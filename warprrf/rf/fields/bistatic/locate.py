@@ -33,6 +33,7 @@ from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.spectra.spectrum import Spectrum, pixel_solid_angles
 from warprrf.rf.tracing.render import PathGains, path_gains
 from warprrf.rf.tracing.tracer import Tracer
+from warprrf.rows import sums_of
 
 
 def as_data(field: Any, measured: Any) -> list[Measured]:
@@ -280,7 +281,7 @@ class Question:
         row, column = np.indices(shape) * blocks // np.array(shape)[:, None, None]
         block = np.resize(blocks * row + column, count)
         score = best.rise * (huber(best.error, threshold)[1] * best.error)[:, None]
-        sums = np.stack([np.bincount(block, one) for one in score.T], axis=1)
+        sums = sums_of(score, block)
         return np.asarray(spread * inverse @ (sums.T @ sums) @ inverse)[:3, :3]
 
 

@@ -23,7 +23,7 @@ from warprrf.rf.tracing.rays import RayGrid
 from warprrf.rf.tracing.records import Bins, Materials
 from warprrf.rf.tracing.render import PathGains
 from warprrf.rf.tracing.tracer import SPECULAR, View
-from warprrf.rows import Rows
+from warprrf.rows import Rows, distinct_rows, sums_of
 
 
 class Measurement(Protocol):
@@ -217,16 +217,11 @@ class WeighedPaths:
             key += [np.floor(row).astype(int), np.floor(column).astype(int)]
         if delay_step_s is not None:
             key.append(np.floor(delay / delay_step_s).astype(int))
-        first, own = np.unique(np.column_stack(key), axis=0, return_index=True, return_inverse=True)[1:]
-        own, number = own.reshape(-1), len(first)
-        mean = [
-            np.stack([np.bincount(own, column, minlength=number) for column in values.T], axis=1)
-            for values in (toward, out, delay[:, None])
-        ]
+        _, own, count = distinct_rows(np.column_stack(key))
+        mean = [sums_of(values, own) for values in (toward, out, delay[:, None])]
         ray_bin = np.full(len(hit), -1)
         ray_bin[ray] = own
         unit = [v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9) for v in mean[:2]]
-        count = np.bincount(own, minlength=number)
         of_bin = weigh(unit[0], unit[1], mean[2][:, 0] / np.maximum(count, 1)).astype(np.float32, copy=False)
         return cls(ray_bin, of_bin, np.arange(len(of_bin)), _of_direct(view, weigh))
 

@@ -44,7 +44,7 @@ from warprrf.rf.tracing.model import SETS, Effects, Layout, Model, Parameters
 from warprrf.rf.tracing.records import Bins, Materials
 from warprrf.rf.tracing.render import PathGains, materials_of, path_gains
 from warprrf.rf.tracing.tracer import SPECULAR, View, sequences
-from warprrf.rows import Rows
+from warprrf.rows import Rows, distinct_rows
 
 OWN_GAIN = -2
 """In place of a measuring chain's index: readings of one place whose common gain is not known: it is the ratio of what
@@ -489,10 +489,8 @@ class _Tables(Kind):
         question_readings(one)
         names, chain = np.unique(np.asarray(one.chain), return_inverse=True)
         key = np.column_stack([one.transmitters, one.receivers, chain])
-        first, own, count = np.unique(
-            key, axis=0, return_index=True, return_inverse=True, return_counts=True
-        )[1:]
-        every = np.split(np.argsort(own.reshape(-1), kind="stable"), np.cumsum(count)[:-1])
+        first, own, count = distinct_rows(key)
+        every = np.split(np.argsort(own, kind="stable"), np.cumsum(count)[:-1])
         found = []
         for number in np.argsort(first):
             rows = every[number][np.isfinite(one.power[every[number]])]
@@ -628,9 +626,9 @@ def _pointings(one: Readings, view: View) -> tuple[np.ndarray, np.ndarray] | Non
     each reading is, shape ``(N,)``; None where arrival is not all that counts."""
     if one.arrival is None or one.departure is not None or one.delay_s is not None:
         return None
-    first, row = np.unique(one.arrival, axis=0, return_index=True, return_inverse=True)[1:]
+    first, row, _ = distinct_rows(one.arrival)
     toward = pixel_means(view.tracer.grid)
-    return path_weights(one, first, toward, toward, np.zeros(len(toward)), dtype=np.float32), row.reshape(-1)
+    return path_weights(one, first, toward, toward, np.zeros(len(toward)), dtype=np.float32), row
 
 
 def frame_of(data: Sequence[Measured]) -> SpectrumDataset:
