@@ -241,9 +241,8 @@ class ExactEngine:
             mirrors = described(ways, 1, walls)
             before, patch = tracer.specular(mirrors), ways.patch[:, 0]
             k, records = tracer.lit_by_images(rays.seen, ray[ways.row], patch, before, every)
-            yield self._paths(
-                rays, records, mirrors.length_m[k], mirrors.point[k, 0] - tracer.transmitter, name
-            )
+            out = mirrors.point[k, 0] - tracer.transmitter
+            yield self._paths(rays, records, mirrors.length_m[k], out, name)
 
     def _paths(
         self, rays: _Bundle, records: Records, legs: np.ndarray, departure: np.ndarray, name: str

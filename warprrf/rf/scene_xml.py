@@ -342,9 +342,8 @@ def _look_at(part: Element) -> np.ndarray:
     given = {"up": "0, 0, 1", **part.attrib}
     if not {"origin", "target"} <= given.keys():
         raise ValueError("has a lookat without 'origin' or 'target'")
-    origin, target, up = (
-        np.array(_numbers(given[name], f"the lookat {name}", 3)) for name in ("origin", "target", "up")
-    )
+    names = "origin", "target", "up"
+    origin, target, up = (np.array(_numbers(given[name], f"the lookat {name}", 3)) for name in names)
     forward = _unit(target - origin, "a lookat from origin to target")
     left = _unit(np.cross(up, forward), "a lookat whose 'up' lies along it,")
     return _affine(np.column_stack([left, np.cross(forward, left), forward]), origin)

@@ -81,10 +81,8 @@ class Band:
         if not self.low_hz < self.high_hz:
             raise ValueError(f"low_hz, high_hz: got {self.low_hz}, {self.high_hz}, expected 0 < low < high")
         for frequency_hz in (self.low_hz, self.high_hz):  # both laws are monotonic in between
-            what = f" at {frequency_hz / 1e9:g} GHz"
-            check_number(
-                "relative_permittivity (a f^b)" + what, self.relative_permittivity(frequency_hz), 1.0
-            )
+            what, permittivity = f" at {frequency_hz / 1e9:g} GHz", self.relative_permittivity(frequency_hz)
+            check_number("relative_permittivity (a f^b)" + what, permittivity, 1.0)
             check_number("conductivity (c f^d) [S/m]" + what, self.conductivity(frequency_hz), 0.0)
 
     def __str__(self) -> str:
@@ -99,9 +97,8 @@ class Band:
             low_hz, high_hz = (max(low_hz, end), high_hz) if self.b > 0 else (low_hz, min(high_hz, end))
         if not low_hz < high_hz:
             return None
-        return replace(
-            self, low_hz=low_hz, high_hz=high_hz, source=f"extrapolated from {self}: {self.source}"
-        )
+        source = f"extrapolated from {self}: {self.source}"
+        return replace(self, low_hz=low_hz, high_hz=high_hz, source=source)
 
     def relative_permittivity(self, frequency_hz: Hertz) -> float:
         """a f^b, f in GHz."""
@@ -529,11 +526,8 @@ def skin() -> Material:
         sigma = -epsilon.imag * 2e9 * np.pi * np.array([low, high]) * VACUUM_PERMITTIVITY
         b, d = (float(np.log(y[1] / y[0]) / np.log(high / low)) for y in (epsilon.real, sigma))
         source = "extrapolated from 0.1 to 100 GHz: " * (high > 100.1) + "Gabriel et al. 1996, dry skin"
-        rows.append(
-            Band(
-                1e9 * low, 1e9 * high, float(epsilon.real[0]) / low**b, b, float(sigma[0]) / low**d, d, source
-            )
-        )
+        a, c = float(epsilon.real[0]) / low**b, float(sigma[0]) / low**d
+        rows.append(Band(1e9 * low, 1e9 * high, a, b, c, d, source))
     return Material("skin", tuple(rows), thickness_m=np.inf)
 
 

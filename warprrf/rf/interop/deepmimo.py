@@ -140,6 +140,7 @@ def _matrices(paths: Paths, coefficient: np.ndarray, max_paths: int | None) -> d
     codes = np.zeros(bounces.shape)
     for met in np.moveaxis(paths.interactions, -1, 0):
         codes = np.where(met > 0, 10.0 * codes + np.vectorize(_DIGIT.get, otypes=[float])(met, 0), codes)
+    exact = np.float32 if codes.max() < 2**24 else np.float64
     return {
         "rx_pos": np.asarray(paths.receiver, dtype=np.float32).reshape(-1, 3),
         "tx_pos": np.asarray(paths.transmitter, dtype=np.float32).reshape(1, 3),
@@ -150,9 +151,7 @@ def _matrices(paths: Paths, coefficient: np.ndarray, max_paths: int | None) -> d
         "delay": real(pick(paths.tau)),
         "power": real(power),
         "phase": real(np.rad2deg(np.angle(gain))),
-        "inter": np.where(there, pick(codes), np.nan).astype(
-            np.float32 if codes.max() < 2**24 else np.float64
-        ),
+        "inter": np.where(there, pick(codes), np.nan).astype(exact),
         "inter_pos": pick(paths.vertices)[:, :, :deep].astype(np.float32),
     }
 

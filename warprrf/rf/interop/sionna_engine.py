@@ -109,9 +109,8 @@ class SionnaEngine:
         both = {"num_rows": 1, "num_cols": 1, "pattern": "iso", "polarization": "VH"}
         self._scene.tx_array = self._rt.PlanarArray(**both)
         self._scene.rx_array = self._rt.PlanarArray(**both)
-        self._scene.add(
-            self._rt.Transmitter("warprrf-tx", position=(self.transmitter - self._origin).tolist())
-        )
+        place = (self.transmitter - self._origin).tolist()
+        self._scene.add(self._rt.Transmitter("warprrf-tx", position=place))
         self._solver = self._rt.PathSolver(deterministic=True)
         # Sionna's default of 1e6 paths truncates silently; each sample can give one path a bounce.
         self._most = self.sampling.samples * max(self.sampling.depth, 1) + 100_000

@@ -181,9 +181,8 @@ def write_twin(
         _project(field, largest[m], names[largest[m]], float(area[m]), float(thickness[largest[m]]))
         for m in used
     ]
-    left_out = _left_out(
-        field, [surface.group_names[largest[m]] for m in used if np.isnan(thickness[largest[m]])]
-    )
+    half_spaces = [surface.group_names[largest[m]] for m in used if np.isnan(thickness[largest[m]])]
+    left_out = _left_out(field, half_spaces)
     table = {
         "about": [ABOUT, f"Fitted to spectra at {field.frequency_hz / 1e9:g} GHz. Left out:", *left_out],
         "materials": [table_entry(group.material) for group in groups],
@@ -295,9 +294,8 @@ def _project(field: BistaticField, g: int, name: str, area: float, thickness_m: 
     scattered = float(p.weight[g].sum()) if effects.scatterings else 0.0
     mirrored = float(np.exp(p.log_mirror[g])) if effects.mirrors else 0.0
     known = np.isfinite(thickness_m)
-    reflection = project_reflection(
-        float(p.log_excess[g]), scattered, mirrored, thickness_m / field.wavelength_m if known else np.inf
-    )
+    wavelengths = thickness_m / field.wavelength_m if known else np.inf
+    reflection = project_reflection(float(p.log_excess[g]), scattered, mirrored, wavelengths)
     permittivity = reflection.relative_permittivity
     alpha_r, lobe_error = LAMBERTIAN, 0.0
     if scattered > 0:

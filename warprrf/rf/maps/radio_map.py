@@ -130,9 +130,8 @@ class RadioMap:
         """
         value = self.plot_values(quantity)
         if ax is None:
-            _, ax = require("matplotlib.pyplot", extra="plots").subplots(
-                figsize=(8.0, 6.0), layout="constrained"
-            )
+            pyplot = require("matplotlib.pyplot", extra="plots")
+            _, ax = pyplot.subplots(figsize=(8.0, 6.0), layout="constrained")
         half = 0.5 * self.cell_m
         box = (self.x[0] - half, self.x[-1] + half, self.y[0] - half, self.y[-1] + half)
         drawing: dict[str, Any] = {"cmap": "viridis", "origin": "lower", "interpolation": "nearest"} | options

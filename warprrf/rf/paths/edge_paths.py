@@ -300,9 +300,8 @@ class EdgeFinder:
         matrix = transverse_basis(arrival) @ field @ np.swapaxes(transverse_basis(departure), 1, 2)
         if self.table is None:
             sign, matrix = bent[:, 1, 1], bent[:, 1, 1, None, None] * np.eye(2)
-        size = (
-            self.wavelength_m / (4.0 * np.pi * length) * np.sqrt(0.5 * (np.abs(matrix) ** 2).sum(axis=(1, 2)))
-        )
+        norm = np.sqrt(0.5 * (np.abs(matrix) ** 2).sum(axis=(1, 2)))
+        size = self.wavelength_m / (4.0 * np.pi * length) * norm
         code, point = ways.stops()
         return EdgePaths(
             ways.receiver, ways.patch, code, point, length, excess, length - ways.direct, departure, arrival, matrix,

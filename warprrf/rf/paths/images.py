@@ -81,9 +81,8 @@ class MirrorImages:
         max_chains: float = MOST_CHAINS,
         device: DeviceLike = None,
     ) -> None:
-        if patches.two_sided and patches.curved_m2 > max(
-            0.5, 0.01 * patches.area.sum()
-        ):  # what is less is detail
+        detail_m2 = max(0.5, 0.01 * patches.area.sum())
+        if patches.two_sided and patches.curved_m2 > detail_m2:
             warn(
                 f"mesh: {patches.curved_m2:.3g} m^2 of it are flat facets of smooth surfaces (a round pillar, say); each "
                 "mirrors as a plane or not at all, so that mirror paths off them are right in the mean alone"
@@ -92,12 +91,10 @@ class MirrorImages:
         self.max_chains = check_positive("max_chains", max_chains)
         self.transmitter = np.asarray(transmitter, float)
         self.device = resolve(device)
-        self._on_device = _patches_on_device(
-            patches, patches.tolerance_m if slack_m is None else slack_m, to_edges, self.device
-        )
-        self._kept = [
-            Chains(np.zeros((1, 0), np.int32), self.transmitter[None], np.zeros((1, 3)), np.array([2.0]))
-        ]
+        slack_m = patches.tolerance_m if slack_m is None else slack_m
+        self._on_device = _patches_on_device(patches, slack_m, to_edges, self.device)
+        patch, axis = np.zeros((1, 0), np.int32), np.zeros((1, 3))
+        self._kept = [Chains(patch, self.transmitter[None], axis, np.array([2.0]))]
 
     def search(self, points: np.ndarray, order: int, progress: Progress | None = None) -> Iterator[Ways]:
         """The straight way to each of ``points``, then :meth:`candidates` of 1, 2 ... ``order`` reflections.
@@ -144,9 +141,8 @@ class MirrorImages:
         if len(points) and len(self.patches):
             ends, kept = _Ends(points, self.device), self._keep(order)
             known = min(order, len(kept) - 1)
-            begun = (
-                kept[known] if first is None else kept[known].take(np.isin(kept[known].patch[:, 0], first))
-            )
+            begun = kept[known]
+            begun = begun if first is None else begun.take(np.isin(begun.patch[:, 0], first))
             for chains, share in self._descendants(begun, order - known, ends.middle, ends.radius):
                 if len(chains):
                     parts.append(self._unfolded(chains, ends))

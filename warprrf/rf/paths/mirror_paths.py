@@ -228,15 +228,15 @@ class ZoneRays:
 
     def radius(self, near: np.ndarray, far: np.ndarray) -> np.ndarray:
         """Radius of the first zone between two legs, widened by the mesh's error [m]."""
-        return np.sqrt(
-            self.wavelength_m * near * far / np.maximum(near + far, 1e-9) + self.position_error_m**2
-        )
+        zone = self.wavelength_m * near * far / np.maximum(near + far, 1e-9)
+        return np.sqrt(zone + self.position_error_m**2)
 
     def share(self, ways: Ways, beside: Walls | None = None) -> np.ndarray:
         """Share of each path's field that arrives: of its rays, and what walls ``beside`` the path let through of others, in phase
         as far as that leaves them, shape ``(L,)``."""
         share = self._mirror_share if ways.patch.shape[1] else self._direct_share
-        return np.asarray(np.abs(share(ways, beside)))
+        field = share(ways, beside).reshape(len(ways), len(_SAMPLES))
+        return np.asarray(np.abs(field.mean(axis=1)))
 
     def _through_any(self, beside: Walls, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Field that arrives through some walls over legs from ``begin`` to ``end`` (N, K, 3), complex, shape ``(N,)``."""
@@ -250,8 +250,8 @@ class ZoneRays:
         return np.where(count > 0, whole, 0.0)
 
     def _direct_share(self, ways: Ways, beside: Walls | None) -> np.ndarray:
-        """That of line of sight, by rays over the zone's widest place."""
-        count, source, receivers = len(ways), ways.stops[:, 0], ways.stops[:, 1]
+        """Field of each ray of line of sight, over the zone's widest place."""
+        source, receivers = ways.stops[:, 0], ways.stops[:, 1]
         toward, length = headings(source - receivers)
         radius = self.radius(0.5 * length, 0.5 * length)
         u, v = vectors_across(toward)
@@ -269,14 +269,14 @@ class ZoneRays:
             knee = self._past(start[dark], middle[dark])  # what lies at the middle is passed once
             stops = np.stack([source[dark // len(_SAMPLES)], knee, start[dark]], axis=1)
             field[dark] = self._through_any(beside, stops[:, :2], stops[:, 1:])
-        return np.asarray(field.reshape(count, len(_SAMPLES)).mean(axis=1))
+        return field
 
     def _past(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Points so far behind b, seen from a, that a ray to them misses nothing at b, where no surface is, shape ``(N, 3)``."""
         return np.asarray(b + 2.0 * self.position_error_m * headings(b - a)[0])
 
     def _mirror_share(self, ways: Ways, beside: Walls | None) -> np.ndarray:
-        """That of mirror paths; a zone cuts a patch's plane in an ellipse, longer by 1 / cos."""
+        """Field of each ray of mirror paths; a zone cuts a patch's plane in an ellipse, longer by 1 / cos."""
         count, order = ways.patch.shape
         along, lengths = headings(np.diff(ways.stops, axis=1))
         before = np.cumsum(lengths, axis=1)[:, :-1]
@@ -297,7 +297,7 @@ class ZoneRays:
             dark = np.flatnonzero(~met)
             dark = dark[replace(self, walls=beside).reached(each.take(dark))]
             field[dark] = self._through_any(beside, *each.take(dark).legs(beside.clearance_m))
-        return np.asarray(field.reshape(count, len(_SAMPLES)).mean(axis=1))
+        return field
 
     def reached(self, ways: Ways) -> np.ndarray:
         """Whether each leg reaches its patch and nothing stands between, or nothing but walls, shape ``(L,)``."""
@@ -343,9 +343,8 @@ class ZoneRays:
         met = p.face_patch[np.maximum(hit.face, 0)]
         # A torn seam of the patch passes for it, another patch does not.
         off = np.abs((np.nan_to_num(hit.point) * p.normal[patch]).sum(axis=1) - p.offset[patch])
-        return (
-            reached & (hit.face >= 0) & ((met == patch) | (near & (off <= self.position_error_m) & (met < 0)))
-        )
+        seam = near & (off <= self.position_error_m) & (met < 0)
+        return reached & (hit.face >= 0) & ((met == patch) | seam)
 
 
 def described(ways: Ways, order: int, walls: Walls | None) -> MirrorPaths:

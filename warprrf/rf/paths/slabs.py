@@ -119,9 +119,8 @@ class Walls:
         met = slabs.face >= 0
         face, solid, found = slabs.face[met], slabs.thickness_m[met], np.ones(met.shape, complex)
         thickness = np.where(np.isnan(solid) | ~self.known[face], self.thickness_m[face], solid)
-        te, tm, longer = slab_passage(
-            slabs.cosine[met], self.permittivity[face], thickness, self.wavelength_m
-        )
+        cosine, permittivity = slabs.cosine[met], self.permittivity[face]
+        te, tm, longer = slab_passage(cosine, permittivity, thickness, self.wavelength_m)
         found[met] = 0.5 * (te + tm) * np.exp(-2j * np.pi / self.wavelength_m * longer)
         return np.asarray(found.prod(axis=1))
 
@@ -185,9 +184,8 @@ class Walls:
         part, first, normal = self._part, self.mesh.first_at_place, self.mesh.face_normals
         while len(row):
             if known is None:
-                hit = self.mesh.cast(
-                    start[row] + gone[row, None] * direction[row], direction[row], device=self.device
-                )
+                point = start[row] + gone[row, None] * direction[row]
+                hit = self.mesh.cast(point, direction[row], device=self.device)
                 face, t = np.asarray(hit.face), gone[row] + hit.t
             else:
                 (face, t), known = known, None

@@ -167,10 +167,9 @@ def _check_question(
     check_positions(mesh, ends.transmitters, receivers, wavelength_m, on_surfaces=True, device=device)
     modelled = {"transmission": transmissions > 0, "diffraction": diffractions > 0}
     for source, own in ends.groups():
-        _refuse_along_surfaces(mesh, source, ends.receivers[own], device)
-        warn_of_unmodelled(
-            mesh, source, ends.receivers[own], frequency_hz=frequency_hz, device=device, **modelled
-        )
+        points = ends.receivers[own]
+        _refuse_along_surfaces(mesh, source, points, device)
+        warn_of_unmodelled(mesh, source, points, frequency_hz=frequency_hz, device=device, **modelled)
 
 
 def _refuse_along_surfaces(mesh: Mesh, source: np.ndarray, points: np.ndarray, device: DeviceLike) -> None:
@@ -227,9 +226,8 @@ class MirrorTracer:
         self._face_material = np.zeros(0, np.int32)
         if transmissions and self.table is not None and groups is not None:
             self._face_material = np.asarray(groups, np.int32)
-            eta, thickness = (
-                a[self._face_material] for a in (self.table.permittivity, self.table.thickness_m)
-            )
+            slabs = self.table.permittivity, self.table.thickness_m
+            eta, thickness = (a[self._face_material] for a in slabs)
             clearance = max(ENDPOINT_CLEARANCE, self.patches.tolerance_m)
             self.walls = Walls.of_slabs(
                 self.mesh, eta, thickness, self.wavelength_m, transmissions, clearance, device

@@ -78,9 +78,8 @@ class Ways(Rows):
         free = np.ones(len(self), bool)
         for k in range(begin.shape[1]):
             own = np.flatnonzero(free)
-            free[own] = (
-                self.patches.mesh.visible(begin[own, k], end[own, k], device=device) if len(own) else False
-            )
+            if len(own):
+                free[own] = self.patches.mesh.visible(begin[own, k], end[own, k], device=device)
         return free
 
     def through(self, walls: Walls) -> tuple[np.ndarray, Self]:

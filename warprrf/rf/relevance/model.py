@@ -83,9 +83,8 @@ def with_lobes(p: Parameters, kept: tuple[int, ...]) -> Parameters:
     A lobe between two others becomes their mix that is nearest to it over the hemisphere (at 45 degrees of incidence),
     a lobe beyond the last becomes that one. Scattered power is kept.
     """
-    theta, phi = np.meshgrid(
-        np.linspace(0.01, 0.5 * np.pi, 60), np.linspace(0, 2 * np.pi, 72, endpoint=False)
-    )
+    zenith, azimuth = np.linspace(0.01, 0.5 * np.pi, 60), np.linspace(0, 2 * np.pi, 72, endpoint=False)
+    theta, phi = np.meshgrid(zenith, azimuth)
     cos_in = np.sqrt(0.5)
     cos_mirror = cos_in * np.cos(theta) + np.sqrt(1 - cos_in**2) * np.sin(theta) * np.cos(phi)
     lobes = p.lobes

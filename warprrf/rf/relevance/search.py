@@ -399,9 +399,8 @@ def _rare(model: FullModel, name: str) -> str:
     blocked = model.blocked
     if not blocked.any():
         return "no receiver is blocked"
-    with_it, without = (
-        model.image(kept).sum(axis=(1, 2))[blocked] for kept in (model.all, model.all - {name})
-    )
+    both = model.all, model.all - {name}
+    with_it, without = (model.image(kept).sum(axis=(1, 2))[blocked] for kept in both)
     share = float(np.mean(1.0 - without / np.maximum(with_it, 1e-300)))
     return f"{_percent(share)} of the power of a blocked receiver, in the mean"
 

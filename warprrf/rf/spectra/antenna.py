@@ -243,9 +243,8 @@ class Antenna:
         if self.polarisation is not None:
             slants = np.array(SLANTS_RAD[self.polarisation])
             found = [np.sqrt(found[0])[..., None] * np.array([np.cos(z), np.sin(z)]) for z in slants]
-        turn = np.einsum(
-            "...ai,ij,...bj->...ab", transverse_basis(world), self.rotation, transverse_basis(local)
-        )
+        outside, own = transverse_basis(world), transverse_basis(local)
+        turn = np.einsum("...ai,ij,...bj->...ab", outside, self.rotation, own)
         return np.stack([(turn @ port[..., None])[..., 0] for port in found])
 
     def gain_off_boresight(self, angle: ArrayLike) -> np.ndarray:
@@ -362,9 +361,8 @@ def main_lobe(antenna: Antenna) -> Antenna:
     angle = np.linspace(0.0, np.pi, 3601)
     if isinstance(antenna.pattern, _OffBoresight):
         end = _flank_end(angle, antenna.pattern.at(angle), antenna.pattern.at(angle).max())
-        return replace(
-            antenna, pattern=_OffBoresight(partial(_up_to, antenna.pattern.gain, end)), polarisation=None
-        )
+        pattern = _OffBoresight(partial(_up_to, antenna.pattern.gain, end))
+        return replace(antenna, pattern=pattern, polarisation=None)
     own = replace(antenna.unpolarised(), orientation=(0.0, 0.0, 0.0))
     around = np.linspace(-np.pi, np.pi, 73)
     gain = own.gain(directions_from_angles(angle[:, None], around)[..., [2, 0, 1]])  # about +x, from +y to +z

@@ -460,9 +460,8 @@ class SpectrumDataset:
         Numbers in the header are text, because EXR headers hold 32-bit floats only.
         """
         spectrum = self[check_count("index", index, -len(self), len(self) - 1)]
-        dataset_files.export_exr(
-            path, replace(spectrum, attributes={**spectrum.attributes, "polarisation": self.polarisation})
-        )
+        attributes = {**spectrum.attributes, "polarisation": self.polarisation}
+        dataset_files.export_exr(path, replace(spectrum, attributes=attributes))
 
 
 @checked

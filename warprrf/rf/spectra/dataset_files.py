@@ -148,9 +148,8 @@ def export_exr(path: str | os.PathLike[str], spectrum: Spectrum) -> None:
     if spectrum.delay_s is None or spectrum.aod is None or spectrum.range_db is None:
         raise ValueError("spectrum: got one without delay, aod or range_db, expected one of a data set")
     planes = (spectrum.path_gain, spectrum.delay_s, spectrum.aod[..., 0], spectrum.aod[..., 1])
-    channels = {
-        name: np.ascontiguousarray(plane, np.float32) for name, plane in zip(_CHANNELS, planes, strict=True)
-    }
+    named = zip(_CHANNELS, planes, strict=True)
+    channels = {name: np.ascontiguousarray(plane, np.float32) for name, plane in named}
     numbers: dict[str, Any] = {"floor": spectrum.floor, "range_db": spectrum.range_db}
     numbers |= {name: spectrum.attributes[name] for name in _NUMBERS if name in spectrum.attributes}
     header: dict[str, Any] = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}

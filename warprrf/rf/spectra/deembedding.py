@@ -178,9 +178,8 @@ def _deembed_scanned(
             kept = np.where(one > one.max() * 10.0 ** (-dynamic_range_db / 10.0), one, 0.0)
             if kept.any():
                 kept *= one.sum() / kept.sum()
-                path_gain[k], source[k] = spread_paths(
-                    directions, kept.reshape(-1), shape, beam_sigma_rad, device=scan.device
-                )
+                found = spread_paths(directions, kept.ravel(), shape, beam_sigma_rad, device=scan.device)
+                path_gain[k], source[k] = found
             (progress or silent)("deembed", k + 1, count)
     return Deembedded(path_gain, source, steps, misfit, 1.0, SCANNED)
 

@@ -90,9 +90,8 @@ class PowerTable:
             raise ValueError(
                 f"power: got {count} rows, expected one or more, each of linear powers, or NaN where not measured"
             )
-        return {"power": power} | {
-            name: check_each(name, getattr(self, name), count, 3) for name in self._rows[:2]
-        }
+        ends = {name: check_each(name, getattr(self, name), count, 3) for name in self._rows[:2]}
+        return {"power": power} | ends
 
 
 @checked
@@ -240,9 +239,8 @@ class Readings(PowerTable):
         count = np.size(table["power_db"])
 
         def column(name: str) -> np.ndarray:
-            return check_array(
-                f"table[{name!r}]", np.asarray(table[name]), (count,), finite=name != "power_db"
-            )
+            values = np.asarray(table[name])
+            return check_array(f"table[{name!r}]", values, (count,), finite=name != "power_db")
 
         found: dict[str, Any] = {
             "transmitters": np.column_stack([column(c) for c in COLUMNS["transmitter"]]),
@@ -318,9 +316,8 @@ def question_readings(readings: Readings) -> None:
     for pattern in (r.receive_pattern, r.transmit_pattern):
         if pattern is not None:
             gain_db += 10.0 * np.log10(as_antenna(pattern).peak_gain)
-    free_space = np.minimum(
-        free_space_gain(r.transmitters, r.receivers, r.frequency_hz) * 10.0 ** (gain_db / 10.0), 1.0
-    )
+    isotropic = free_space_gain(r.transmitters, r.receivers, r.frequency_hz)
+    free_space = np.minimum(isotropic * 10.0 ** (gain_db / 10.0), 1.0)
     # a power at one place above the mean of its fading: 1 in 20,000, if Rayleigh's
     fading_db = 10.0 * (r.samples is not None)
     margin_db = MARGIN_DB + fading_db

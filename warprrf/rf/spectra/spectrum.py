@@ -115,9 +115,8 @@ def sub_pixel_directions(shape: tuple[int, int], sub_pixels: int) -> tuple[np.nd
     rows, columns = shape
     count = sub_pixels**2
     golden = 0.5 * (np.sqrt(5.0) - 1.0)
-    step = min(
-        (a for a in range(1, count + 1) if np.gcd(a, count) == 1), key=lambda a: abs(a - count * golden)
-    )
+    coprime = [a for a in range(1, count + 1) if np.gcd(a, count) == 1]
+    step = min(coprime, key=lambda a: abs(a - count * golden))
     k, i, j = np.arange(count), np.arange(rows)[:, None, None], np.arange(columns)[None, :, None]
     across = (k + np.mod(i * golden, 1.0)) / count  # one value a row and direction: no two alike in a column
     down = (k * step % count + np.mod(j * golden, 1.0)) / count

@@ -51,9 +51,8 @@ class Tiles:
     def fan(self) -> Mesh:
         """Triangles that each is made of, five for each; some have no area."""
         first = 7 * np.arange(len(self.face))[:, None, None]
-        return Mesh(
-            self.corners.reshape(-1, 3), (first + [[0, k, k + 1] for k in range(1, 6)]).reshape(-1, 3)
-        )
+        faces = first + [[0, k, k + 1] for k in range(1, 6)]
+        return Mesh(self.corners.reshape(-1, 3), faces.reshape(-1, 3))
 
     @cached_property
     def area(self) -> np.ndarray:
@@ -204,9 +203,8 @@ class Cells:
 
 def _flattened(mesh: Mesh, axis: np.ndarray) -> np.ndarray:
     """Corners of faces (F, 3, 5): first what they are along the axes across that of each face, then all three."""
-    return np.concatenate(
-        [np.take_along_axis(mesh.triangles, _ACROSS[axis][:, None], axis=2), mesh.triangles], axis=2
-    )
+    across = np.take_along_axis(mesh.triangles, _ACROSS[axis][:, None], axis=2)
+    return np.concatenate([across, mesh.triangles], axis=2)
 
 
 def _squares(x: np.ndarray, width_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

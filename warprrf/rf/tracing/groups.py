@@ -255,9 +255,8 @@ def _without_crumbs(mesh: Mesh, piece: np.ndarray, part: np.ndarray) -> np.ndarr
 
 def _moments(mesh: Mesh, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Centres ``(N, 3)`` [m] and covariances ``(N, 3, 3)`` [m^2] of the surfaces of each of ``owner`` (F,)."""
-    x = 0.5 * (
-        mesh.triangles + np.roll(mesh.triangles, 1, axis=1)
-    )  # midpoints of edges are exact for squares
+    # Midpoints of edges are exact for squares.
+    x = 0.5 * (mesh.triangles + np.roll(mesh.triangles, 1, axis=1))
     weight = np.repeat(mesh.areas + 1e-12, 3) / 3.0
     who, x = np.repeat(owner, 3), x.reshape(-1, 3)
     total = np.bincount(who, weight)

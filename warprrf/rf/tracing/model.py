@@ -204,9 +204,8 @@ class Parameters:
     def prior(cls, groups: int, lobes: Sequence[int] = LOBES, *, reciprocal: bool = False) -> Parameters:
         """What a surface is taken for before any measurement: half scattered, half mirrored, epsilon_r of 4."""
         share = np.full((groups, len(lobes)), np.log(0.5 / max(len(lobes), 1)))
-        return cls(
-            share, np.full(groups, np.log(3.0)), np.full(groups, np.log(0.5)), tuple(lobes), reciprocal
-        )
+        excess, mirror = np.full(groups, np.log(3.0)), np.full(groups, np.log(0.5))
+        return cls(share, excess, mirror, tuple(lobes), reciprocal)
 
 
 @dataclass(frozen=True)

@@ -135,9 +135,8 @@ class RayGrid:
 
     def hit(self, receivers: np.ndarray) -> Hits:
         """What the grid's rays from ``receivers``, (3,) or (O, 3), hit."""
-        return self.hit_along(
-            np.asarray(receivers, float).reshape(-1, 3), self.directions, self.solid_angle, True
-        )
+        origins = np.asarray(receivers, float).reshape(-1, 3)
+        return self.hit_along(origins, self.directions, self.solid_angle, True)
 
     def hit_along(
         self, origins: np.ndarray, directions: np.ndarray, solid_angle: np.ndarray, shared: bool = False
@@ -199,9 +198,8 @@ class RayGrid:
         all, hit if nothing threw a shadow."""
         count, where = len(hits.face) if ray is None else len(ray), self.device
         real = REALS[self.dtype]
-        found = [
-            wp.zeros(count, dtype=kind, device=where) for kind in (real, wp.types.vector(3, real), wp.vec3d)
-        ]
+        kinds = real, wp.types.vector(3, real), wp.vec3d
+        found = [wp.zeros(count, dtype=kind, device=where) for kind in kinds]
         each = max(len(hits.face) // max(len(hits.origins), 1), 1)
         inputs = [
             *self.surface.on_device(where, real), np.zeros(0, np.int32) if ray is None else ray,

@@ -122,13 +122,10 @@ class Records(Interactions):
             return np.zeros(0)
         if self.is_sent and not materials.has_sources:
             raise ValueError("materials: got none that elements send by, expected those with their radiance")
-        table, m, run = self._table(materials)
-        out = wp.empty(len(self), dtype=REALS[self.power.dtype], device=materials.device)
-        run(
-            kernels.build(REALS[self.power.dtype]).record_power,
-            len(self),
-            [table, m, m.weight, m.excess, m.mirror, m.through, out],
-        )
+        real, (table, m, run) = REALS[self.power.dtype], self._table(materials)
+        out = wp.empty(len(self), dtype=real, device=materials.device)
+        inputs = [table, m, m.weight, m.excess, m.mirror, m.through, out]
+        run(kernels.build(real).record_power, len(self), inputs)
         return np.asarray(out.numpy(), np.float64)
 
     def fields(
@@ -326,6 +323,5 @@ def _lobes(
     scale = [
         reciprocal_factor(n, cosine) if symmetric else 1.0 / lobe_norm(n, cosine) for n, symmetric in each
     ]
-    return wp.array(exponents, dtype=wp.int32, device=device), wp.array(
-        np.stack(scale), dtype=real, device=device
-    )
+    scales = wp.array(np.stack(scale), dtype=real, device=device)
+    return wp.array(exponents, dtype=wp.int32, device=device), scales

@@ -169,9 +169,8 @@ class Interreflection:
         self.tables = {name: replace(found, power=scale * found.power) for name, found in self.tables.items()}
         self._hit, met = grid.tiles_met(hits)
         self._met = surface.tile_side[met]
-        self._left = (
-            np.pi / ELEMENT_RAYS * np.broadcast_to(grid.transmittance(hits.range_m[self._hit]), len(met))
-        )
+        passed = np.broadcast_to(grid.transmittance(hits.range_m[self._hit]), len(met))
+        self._left = np.pi / ELEMENT_RAYS * passed
 
     def between(self, radiance: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """Irradiance of sides by ``radiance`` (E,) of sides, shape ``(E,)``, by rays of ``weight`` (K,)."""

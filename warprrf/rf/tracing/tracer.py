@@ -134,9 +134,8 @@ class View:
         hits = replace(h, origins=h.origins[[k]], face=h.face[rays], range_m=h.range_m[rays])
         paths, direct = self.paths.of(np.array([k])), self.records[SPECULAR].take(own)
         direct = replace(direct, ray=np.arange(len(paths), dtype=np.int32))
-        return View(
-            self.tracer, self.receivers[[k]], hits, paths, self.effects, {SPECULAR: direct}, self.keeps
-        )
+        tables = {SPECULAR: direct}
+        return View(self.tracer, self.receivers[[k]], hits, paths, self.effects, tables, self.keeps)
 
     def without_records(self) -> View:
         """The same that keeps no records but those of paths without scattering."""
@@ -235,9 +234,8 @@ class Tracer:
     def images(self) -> MirrorImages:
         """Images of the transmitter in the surface's mirrors, whose outlines may be torn."""
         s, device = self.surface, self.grid.device
-        return self.cache.get(
-            "images", lambda: MirrorImages(s.patches, self.transmitter, slack_m=MIRROR_SLACK_M, device=device)
-        )
+        make = partial(MirrorImages, s.patches, self.transmitter, slack_m=MIRROR_SLACK_M, device=device)
+        return self.cache.get("images", make)
 
     def walls(self, most: int) -> Walls:
         """What may be passed, up to ``most`` slabs on one way."""
@@ -253,9 +251,8 @@ class Tracer:
         """Paths without scattering of ``receivers`` (R, 3) that ``effects`` want, through slabs and over edges too."""
         most = effects.transmissions
         walls = self.walls(most) if most else None
-        found = self._delayed(
-            zone_paths(self.images, receivers, effects.mirrors, self.wavelength_m, progress, walls)
-        )
+        found = zone_paths(self.images, receivers, effects.mirrors, self.wavelength_m, progress, walls)
+        found = self._delayed(found)
         if not effects.diffractions:
             return found
         edges = self.cache.get(("edges", most), lambda: self._edges(walls))
@@ -289,9 +286,8 @@ class Tracer:
         """
         places = np.asarray(receivers, np.float64).reshape(-1, 3)
         found = self.paths(places, effects) if paths is None else paths
-        return View(
-            self, places, self.grid.hit(places), found, effects, {SPECULAR: self.specular(found)}, keeps
-        )
+        tables = {SPECULAR: self.specular(found)}
+        return View(self, places, self.grid.hit(places), found, effects, tables, keeps)
 
     def trace(self, view: View, wanted: dict[str, tuple[str, str]], most: int) -> dict[str, Records]:
         """Tables of the sequences ``wanted`` of what a receiver sees, with up to ``most`` slabs, by name; see :func:`sequences`."""
@@ -447,18 +443,16 @@ class Tracer:
             place = np.concatenate([one.points(ray) for one, (ray, _) in zip(found, met, strict=True)])
             tile = np.concatenate([own for _, own in met])
             # Of what is met for the first time the place nearest to a tile's middle.
-            first = np.lexsort(
-                (np.linalg.norm(place - s.tiles.centre[tile % len(s.tiles.face)], axis=1), tile)
-            )
+            middle = s.tiles.centre[tile % len(s.tiles.face)]
+            first = np.lexsort((np.linalg.norm(place - middle, axis=1), tile))
             first = first[np.unique(tile[first], return_index=True)[1]]
             first = first[np.isnan(point[tile[first], 0])]
             if len(first) == 0:
                 break
             point[tile[first]] = place[first]
             again = np.repeat(first, few)
-            hits = self.grid.hit_from(
-                tile[again], place[again], *quasi_random(len(first), few)[1:].reshape(2, -1)
-            )
+            u, v = quasi_random(len(first), few)[1:].reshape(2, -1)
+            hits = self.grid.hit_from(tile[again], place[again], u, v)
         if most:
             air = self.reached(0)
             own = np.isin(s.tile_side, s.tile_side[~np.isnan(air[:, 0])])

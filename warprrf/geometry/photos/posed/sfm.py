@@ -430,9 +430,8 @@ def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[
     for i in range(len(names) - 1):
         report("comparing", i, len(names))
         # One product of photo i with all later ones, shape (features of i, photos, features of j).
-        cosine = (stack[i] @ stack[i + 1 :].reshape(-1, stack.shape[2]).T).reshape(
-            coarse_features, -1, coarse_features
-        )
+        later = stack[i + 1 :].reshape(-1, stack.shape[2])
+        cosine = (stack[i] @ later.T).reshape(coarse_features, -1, coarse_features)
         back = cosine.argmax(axis=0)
         first = cosine.argmax(axis=2)[..., None]
         top = np.take_along_axis(cosine, first, axis=2)[..., 0]
@@ -708,9 +707,8 @@ def _sparse_model(
         cameras[name] = pinhole_of(lens, _pose(images[name]), (turns or {}).get(name, 0), max_pixels)
         share[images[name].image_id] = (cameras[name].fx + cameras[name].fy) / (lens.fx + lens.fy)
     position = {images[n].image_id: i for i, n in enumerate(cameras)}
-    points = [
-        p for _, p in sorted(model.points3D.items()) if p.track.elements
-    ]  # what no photo shows is no use
+    # What no photo shows is no use.
+    points = [p for _, p in sorted(model.points3D.items()) if p.track.elements]
     tracks = [sorted({position[e.image_id] for e in p.track.elements}) for p in points]
     return SparseModel(
         cameras=cameras,

@@ -99,9 +99,8 @@ def _group(s: Surface, name: str, material: Material | str | None, new: dict[str
 def _parts(field: Any, room: Room, materials: Sequence[Material | None]) -> dict[str, Any]:
     """The parts of ``field`` that are others in ``room``, whose new groups are of ``materials``; None where nobody knows."""
     frequency_hz, p, laws = field.frequency_hz, field.parameters, np.full((len(materials), 4), np.nan)
-    for k, (material, called) in enumerate(
-        zip(materials, room.materials[field.surface.groups :], strict=True)
-    ):
+    new = zip(materials, room.materials[field.surface.groups :], strict=True)
+    for k, (material, called) in enumerate(new):
         if material is not None:
             material.band(frequency_hz)  # it must be known there
             laws[k] = law_of(material, called.name, frequency_hz)
@@ -127,9 +126,8 @@ def _of_material(material: Material, frequency_hz: float, lobes: tuple[int, ...]
     scattered = material.scattering_coefficient(frequency_hz) ** 2
     exponent = 0 if material.pattern == "lambertian" else material.alpha_r
     weight = np.full((1, len(lobes)), -MOST_NEPERS)
-    weight[0, np.argmin(np.abs(np.log1p(lobes) - np.log1p(exponent)))] = np.log(
-        max(scattered, np.exp(-MOST_NEPERS))
-    )
+    nearest = np.argmin(np.abs(np.log1p(lobes) - np.log1p(exponent)))
+    weight[0, nearest] = np.log(max(scattered, np.exp(-MOST_NEPERS)))
     root = np.sqrt(material.permittivity(frequency_hz))
     reflected = min(abs((1.0 - root) / (1.0 + root)), 1.0 - 1e-6)
     of_conductor = 1e6

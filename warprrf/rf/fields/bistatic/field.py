@@ -183,17 +183,15 @@ class BistaticField(RadioField):
             return cls._unmeasured(geometry, data, chosen, device)
         found = fit(geometry, data, chosen, client=client, device=device, progress=progress)
         frame = frame_of(data)
-        fitted = replace(
-            cls.prior(found["surface"], frame, sub_pixels=chosen.rays_a_side, device=device), **found
-        )
+        prior = cls.prior(found["surface"], frame, sub_pixels=chosen.rays_a_side, device=device)
+        fitted = replace(prior, **found)
         if any(isinstance(one, SpectrumDataset) for one in data):
             return fitted
         receivers = found["fitted_on"][(found["fitted_under"] == frame.transmitter).all(axis=1)]
         gains = np.stack([fitted.spectrum(place).path_gain for place in evenly(receivers, 8)])
         floor = default_floor(gains)
-        return replace(
-            fitted, floor=floor, range_db=(10.0 * float(np.log10(floor)), float(to_db(gains.max(), floor)))
-        )
+        range_db = 10.0 * float(np.log10(floor)), float(to_db(gains.max(), floor))
+        return replace(fitted, floor=floor, range_db=range_db)
 
     @classmethod
     def _unmeasured(
@@ -581,9 +579,8 @@ class BistaticField(RadioField):
             table = np.concatenate([table, power[None].astype(np.float32)])
             index = np.append(index, layout.size)
         table *= (NEPER / (1.0 + power)).astype(np.float32)
-        return self.errors.std_db(
-            NEPER * np.log1p(power).reshape(image.shape), view.receivers[0], table, index
-        )
+        image_db = NEPER * np.log1p(power).reshape(image.shape)
+        return self.errors.std_db(image_db, view.receivers[0], table, index)
 
     def _taken_apart(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         return files.taken_apart({f.name: getattr(self, f.name) for f in fields(self)})

@@ -100,9 +100,8 @@ def maps_of(
     places = lattice(bistatic.mesh, bistatic.transmitter, np.stack(transmitters), bistatic.device)
     every = np.tile(places, (len(transmitters), 1)), np.repeat(transmitters, len(places), axis=0)
     batch = Batch("map", Ends.of(*every), store, None, progress)
-    found = batch.gather(
-        partial(_mapped, bistatic), VARIABLES, {}, bistatic._known_by(batch, SHAPE, list(VARIABLES))
-    )
+    known = bistatic._known_by(batch, SHAPE, list(VARIABLES))
+    found = batch.gather(partial(_mapped, bistatic), VARIABLES, {}, known)
     shape = len(transmitters), len(places), *SHAPE
     parts = [np.asarray(found[name]).reshape(shape) for name in VARIABLES]
     return {
@@ -207,9 +206,8 @@ def _array(one: ArraySpectra, maps: dict[bytes, FieldMap], chains: Sequence[str]
     toward, pixels = one.directions.reshape(-1, 3), pixel_directions(SHAPE).reshape(-1, 3)
     kept, most = np.flatnonzero(np.isfinite(one.power[0].ravel())), 400  # directions
     kept = kept[np.unique(np.linspace(0, len(kept) - 1, min(len(kept), most)).astype(int))]
-    heard = (
-        one.array.response(toward[kept], 1.0).conj() @ one.array.response(pixels, 1.0).T / one.array.elements
-    )
+    steered, arriving = one.array.response(toward[kept], 1.0), one.array.response(pixels, 1.0)
+    heard = steered.conj() @ arriving.T / one.array.elements
     table = maps[one.transmitters[0].tobytes()].weighed(np.abs(heard) ** 2 * one.array.gain(pixels))
     every, chain = np.arange(len(kept)), np.full(len(kept), len(chains)) if one.relative else None
     floor = np.full(len(kept), one.floor)

@@ -355,9 +355,8 @@ def gauss_newton(problem: Problem, start: Parameters, steps: int) -> Solution:
         steps: most steps.
     """
     if len(start.log_gains) != problem.chains:
-        start = replace(
-            start, log_gains=np.array([_first_gain(problem, start, c) for c in range(problem.chains)])
-        )
+        gains = [_first_gain(problem, start, c) for c in range(problem.chains)]
+        start = replace(start, log_gains=np.array(gains))
     layout = layout_of(problem, start)
     vector, damping, weight = layout.pack(start), 1e-3, 1.0 / NOISE_DB**2
     count = max(sum(len(o.target) for o in problem.observations), 1)

@@ -213,10 +213,8 @@ class Question:
             if chain is not None:
                 rise[:, chain] = target.slope(powers[0]) * powers[0] / NOISE_DB
             if weight is not None:
-                image = rise.reshape(*place.shape, -1)
-                rise = uniform_filter(
-                    image, (smooth, smooth, 1), mode=("nearest", "wrap", "nearest")
-                ).reshape(rise.shape)
+                image, ends = rise.reshape(*place.shape, -1), ("nearest", "wrap", "nearest")
+                rise = uniform_filter(image, (smooth, smooth, 1), mode=ends).reshape(rise.shape)
             errors.append(error)
             rises.append(rise)
         rise = np.concatenate(rises)
@@ -295,9 +293,8 @@ def locate(
         raise ValueError(f"measured: got the absorption of {len(air)} kinds of air, expected one")
     question = Question(field if air <= {field.air} else field.with_gas(*air), data)
     of, sources = question.field, question.transmitters
-    maps = field._maps.get(
-        (of.air, np.stack(sources).tobytes()), lambda: maps_of(of, sources, store, progress)
-    )
+    key = of.air, np.stack(sources).tobytes()
+    maps = field._maps.get(key, lambda: maps_of(of, sources, store, progress))
     with threadpool_limits(1, user_api="blas"):  # matrices are small
         return search(question, maps)
 
@@ -325,10 +322,8 @@ def search(question: Question, maps: dict[bytes, FieldMap]) -> Location:
     loss = {id(one): one.loss(threshold) - ahead.get(id(one), 0.0) for one in found + rest}
     order = sorted(found + rest, key=lambda one: loss[id(one)])
     order = [one for k, one in enumerate(order) if not one.near(order[:k])]
-    # Pixels within a beam have one error.
-    likelihood = np.exp(
-        [-0.5 * (loss[id(one)] - loss[id(best)]) / (pixels * max(spread, 1.0)) for one in order]
-    )
+    unit = pixels * max(spread, 1.0)  # pixels within a beam have one error
+    likelihood = np.exp([-0.5 * (loss[id(one)] - loss[id(best)]) / unit for one in order])
     likelihood /= likelihood.sum()
     covariance, misfit = question.covariance(best, threshold), float(np.sqrt(spread))
     sure, explained = bool(likelihood[0] > 0.95), misfit < 4.0

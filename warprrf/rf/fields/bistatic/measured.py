@@ -346,9 +346,8 @@ class ArrayImage(ByPixels):
 
     def of_bins(self, power: np.ndarray, *, quick: bool = False) -> np.ndarray:
         """By their lags."""
-        return np.asarray(
-            self.steered @ (self.arriving @ power.astype(np.float32 if quick else power.dtype, copy=False))
-        )
+        power = power.astype(np.float32 if quick else power.dtype, copy=False)
+        return np.asarray(self.steered @ (self.arriving @ power))
 
     def to_bins(self, readings: np.ndarray) -> np.ndarray:
         """By their lags, the other way."""

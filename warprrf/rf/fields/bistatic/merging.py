@@ -17,6 +17,7 @@ from warprrf.rf.fields.bistatic.gauss_newton import Batch, Problem
 from warprrf.rf.fields.bistatic.observations import NOISE_DB, Observation, huber
 from warprrf.rf.tracing.model import Effects, Parameters
 from warprrf.rf.tracing.records import Materials
+from warprrf.rows import sums_of
 
 
 def merge(
@@ -74,8 +75,7 @@ def _mean_appearance(
 ) -> np.ndarray:
     """Mean appearance of each material, shape ``(count, K)``."""
     size = np.maximum(np.bincount(material, area, minlength=count), 1e-12)
-    sums = [np.bincount(material, area * channel, minlength=count) for channel in appearance.T]
-    return np.stack(sums, axis=1) / size[:, None]
+    return sums_of(area[:, None] * appearance, material, count) / size[:, None]
 
 
 def _gaps(appearance: np.ndarray, typical: np.ndarray) -> np.ndarray:

@@ -280,9 +280,8 @@ class Observation:
         found, column = np.flatnonzero(sends), np.cumsum(sends) - 1
         cell = all_bins[k] * len(found) + column[all_groups[k]]
         table = np.bincount(cell, every[k], minlength=count * len(found)).reshape(count, len(found))
-        return found, np.maximum(
-            self.measured.of_bins(table.astype(np.float32), quick=True).T, 0.0
-        ) / np.float32(self.floor)
+        readings = self.measured.of_bins(table.astype(np.float32), quick=True).T
+        return found, np.maximum(readings, 0.0) / np.float32(self.floor)
 
     @property
     def together(self) -> Superposition:
@@ -363,21 +362,17 @@ class Columns:
 
     def by_materials(self, material: np.ndarray) -> Columns:
         """Those of materials; ``material`` (G,) is that of each group."""
-        return Columns(
-            *_summed(material[self.groups], self.single), *_summed(material[self.senders], self.further)
-        )
+        single = _summed(material[self.groups], self.single)
+        return Columns(*single, *_summed(material[self.senders], self.further))
 
     def power(self, p: Parameters) -> np.ndarray:
         """Readings, shape ``(N,)``."""
         curves = fresnel_curves()
-        mixed = (
-            p.weight[self.groups][:, :, None]
-            * curves.at(curves.coordinates, p.log_excess[self.groups])[0][:, None]
-        )
+        coordinates = curves.at(curves.coordinates, p.log_excess[self.groups])[0]
+        mixed = p.weight[self.groups][:, :, None] * coordinates[:, None]
         single = mixed.astype(np.float32).ravel() @ self.single.reshape(mixed.size, self.single.shape[-1])
-        return np.asarray(
-            np.maximum(single, 0.0) + p.scattered_share[self.senders].astype(np.float32) @ self.further, float
-        )
+        further = p.scattered_share[self.senders].astype(np.float32) @ self.further
+        return np.asarray(np.maximum(single, 0.0) + further, float)
 
     def slopes(self, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of the readings to parameters ``(C, N)`` float32, and their places ``(C,)``."""
@@ -497,10 +492,8 @@ class _Tables(Kind):
             if len(rows):
                 at = int(first[number])
                 ends = one.transmitters[at], one.receivers[at]
-                name = str(names[chain[at]])
-                found.append(
-                    Place(self.number, rows, *ends, one.frequency_hz, READINGS_SHAPE, one.air, chain=name)
-                )
+                known = one.frequency_hz, READINGS_SHAPE, one.air
+                found.append(Place(self.number, rows, *ends, *known, chain=str(names[chain[at]])))
         return found
 
     def observe(self, place: Place, view: View) -> Observation:
@@ -518,9 +511,7 @@ class _Tables(Kind):
         bare = Observation(place, view, measured, Target(np.zeros(len(rows))), floor)
         sight, steady = _shares(bare)
         bias, fading = fading_db(one.samples, steady)
-        clipped = np.maximum(
-            one.power[rows], floors
-        )  # no more than the floor: what was read below it is noise
+        clipped = np.maximum(one.power[rows], floors)  # what was read below the floor is noise
         above = NEPER * np.log1p(clipped / floor * 10.0 ** (-bias / 10.0))
         # Of all power errors of single directions average out.
         unexplained = 0.5 if one.total else READING_ERROR_DB
@@ -604,9 +595,8 @@ def observe(
 def unmeasured(view: View) -> Parameters:
     """What the groups that are seen are taken for before any measurement, with what slabs of them absorb there."""
     surface = view.tracer.surface
-    return replace(
-        Parameters.prior(surface.groups), log_through=surface.slab_properties(view.tracer.frequency_hz)[2]
-    )
+    log_through = surface.slab_properties(view.tracer.frequency_hz)[2]
+    return replace(Parameters.prior(surface.groups), log_through=log_through)
 
 
 def _shares(o: Observation) -> tuple[np.ndarray, np.ndarray]:

@@ -116,9 +116,8 @@ def fit_residual(shares: Sequence[Shares], surface: Surface, *, quick: bool = Fa
     deviations = ((0.5, 0.5), (1.0, 2.0))  # of elements and of cells of each from a gain of 1 [nepers]
     cell = np.arange(len(surface.cells))
     member = csr_matrix((np.ones(len(cell)), (cell, surface.element)))
-    gains = block_diag(
-        [hstack([element * member, own * identity(len(cell))]) for element, own in deviations], format="csr"
-    )
+    kinds = [hstack([element * member, own * identity(len(cell))]) for element, own in deviations]
+    gains = block_diag(kinds, format="csr")
     largest, longest = 4.0, 3.0  # gain [nepers], and step of one in standard deviations
     unknown, before = np.zeros(gains.shape[1]), np.inf
     with ThreadPoolExecutor(threads()) as pool:

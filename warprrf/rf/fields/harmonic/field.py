@@ -311,9 +311,8 @@ class HarmonicField(RadioField):
         kind = fitting.KINDS[self.options.gain if name == "gain" else "signed"]
         out = wp.zeros(self.shape[0] * self.shape[1], dtype=float, device=device)
         basis = self._uploaded.get("basis", lambda: harmonics(self.shape, wp.float32, device))
-        layer = self._uploaded.get(
-            name, lambda: wp.array(self.layers[name], dtype=kernels.vec16, device=device)
-        )
+        upload = partial(wp.array, self.layers[name], dtype=kernels.vec16, device=device)
+        layer = self._uploaded.get(name, upload)
         inputs = [kind, view.start, view.gaussian, view.weight, basis, layer, out]
         launch(kernels.predict, len(out), inputs, device=device)
         return out.numpy().reshape(self.shape).astype(np.float64)

@@ -69,9 +69,8 @@ class Problem:
 
     def upload(self, values: np.ndarray, dtype: type | None = None) -> wp.array:
         """``values`` on the device, in the problem's precision unless ``dtype`` says otherwise."""
-        return wp.array(
-            np.ascontiguousarray(values, dtype=self.precision), dtype=dtype or self.real, device=self.device
-        )
+        numbers = np.ascontiguousarray(values, dtype=self.precision)
+        return wp.array(numbers, dtype=dtype or self.real, device=self.device)
 
     def launch(self, kernel: wp.Kernel, dim: int, *inputs: Any) -> None:
         """Launch one of the problem's kernels on its device."""
