@@ -85,10 +85,8 @@ class EdgeRays:
         """Cosines of incidence at which the faces' coefficients are wanted, shape ``(4, ...)``: of transmission from the
         side of face 0 and of face n, of reflection by face 0 and by face n."""
         # Where the slant passes through 0, far from its boundary, |sin| alone would have a kink.
-        bent = [
-            1.0 - np.cos(a) ** 2 * (1.0 - np.sin(0.5 * d) ** 4)
-            for a, d in zip(self._slants, self._boundaries, strict=True)
-        ]
+        angles = zip(self._slants, self._boundaries, strict=True)
+        bent = [1.0 - np.cos(a) ** 2 * (1.0 - np.sin(0.5 * d) ** 4) for a, d in angles]
         return np.sqrt((1.0 - np.asarray(self.cosine) ** 2) * np.stack(np.broadcast_arrays(*bent)))
 
 

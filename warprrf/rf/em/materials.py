@@ -229,10 +229,8 @@ class Material:
         """Complex relative permittivity eps_r - j sigma / (2 pi f eps_0); ValueError outside the bands."""
         # ITU-R P.2040-4, section 2.1.4
         sigma = self.conductivity(frequency_hz)
-        return complex(
-            self.relative_permittivity(frequency_hz),
-            -sigma / (2 * np.pi * frequency_hz * VACUUM_PERMITTIVITY),
-        )
+        loss = -sigma / (2 * np.pi * frequency_hz * VACUUM_PERMITTIVITY)
+        return complex(self.relative_permittivity(frequency_hz), loss)
 
     def relative_permittivity(self, frequency_hz: float) -> float:
         """Real part of the relative permittivity; ValueError outside the bands."""

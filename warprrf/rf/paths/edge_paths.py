@@ -365,7 +365,5 @@ def _at_plane(
     """What a mirror or a slab makes of field vectors, shape ``(L, 3, 3)``."""
     across = across_incidence(before, normal, vectors_across(before)[0])
     inwards, outwards = np.cross(across, before), np.cross(across, behind)
-    return np.asarray(
-        te[:, None, None] * across[:, :, None] * across[:, None, :]
-        + tm[:, None, None] * outwards[:, :, None] * inwards[:, None, :]
-    )
+    of_te = te[:, None, None] * across[:, :, None] * across[:, None, :]
+    return of_te + tm[:, None, None] * outwards[:, :, None] * inwards[:, None, :]

@@ -176,11 +176,9 @@ class FullModel:
         if gas:
             powers = {}
             for name, power in gains.powers.items():
-                length = (
-                    view.paths.length_m
-                    if name == "specular"
-                    else view.over_m(gains.records[name].ray, gains.records[name].reach_m)
-                )
+                table, length = gains.records[name], view.paths.length_m
+                if name != "specular":
+                    length = view.over_m(table.ray, table.reach_m)
                 powers[name] = power * 10.0 ** (-0.1 * self.gas_db_per_m * length)
             gains = replace(gains, powers=powers)
         return spectra_of(gains, self.beam)[0]

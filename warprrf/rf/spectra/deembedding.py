@@ -137,10 +137,8 @@ def _angles_between(shape: tuple[int, int]) -> np.ndarray:
     zenith = pixel_angles(shape)[0]
     azimuth = np.arange(columns) * 2.0 * np.pi / columns
     # Half the chord, not the cosine: it does not cancel for small angles.
-    half = (
-        np.sin(0.5 * (zenith[:, None] - zenith[None, :]))[..., None] ** 2
-        + np.sin(zenith)[:, None, None] * np.sin(zenith)[None, :, None] * np.sin(0.5 * azimuth) ** 2
-    )
+    apart = np.sin(0.5 * (zenith[:, None] - zenith[None, :]))[..., None] ** 2
+    half = apart + np.sin(zenith)[:, None, None] * np.sin(zenith)[None, :, None] * np.sin(0.5 * azimuth) ** 2
     return 2.0 * np.arcsin(np.sqrt(np.clip(half, 0.0, 1.0)))
 
 

@@ -375,10 +375,8 @@ def _least_falls(shape: tuple[int, int], sigma: float, device: str) -> tuple[wp.
     nearest = np.maximum(chord - 0.5 * np.hypot(np.pi / rows, 2.0 * np.pi / columns), 0.0)
     fall = 0.5 * (nearest / sigma) ** 2 * (1.0 - 1e-6)
     fall[nearest > 2.0 * np.sin(0.5 * _cutoff(shape, sigma)) * (1.0 + 1e-6)] = np.inf
-    return (
-        wp.array(first, dtype=wp.int32, device=device),
-        wp.array(fall, dtype=wp.float32, device=device),
-    )
+    falls = wp.array(fall, dtype=wp.float32, device=device)
+    return wp.array(first, dtype=wp.int32, device=device), falls
 
 
 @dataclass(frozen=True)

@@ -135,10 +135,8 @@ def _lying_on(s: Surface, mesh: Mesh) -> tuple[Mesh, np.ndarray, np.ndarray]:
     found = np.where(at < count, np.append(s.group, -1)[np.minimum(at, count)], group[first])
     fan = tiles.fan.faces.reshape(-1, 5, 3)[part].reshape(-1, 3)
     cut = joined([(mesh.vertices, mesh.faces[whole]), (tiles.fan.vertices, fan)])
-    label, parent = (
-        np.concatenate([own[whole], np.repeat(more[part], 5)])
-        for own, more in ((found, group), (np.arange(len(none)), tiles.face))
-    )
+    columns = (found, group), (np.arange(len(none)), tiles.face)
+    label, parent = (np.concatenate([own[whole], np.repeat(more[part], 5)]) for own, more in columns)
     large = cut.areas > 0
     return Mesh(cut.vertices, cut.faces[large]), label[large], parent[large]
 

@@ -393,10 +393,8 @@ class Tracer:
         """Records of what the rays ``row`` see over ``met``, one after the other; the residual's row is that of direct sight."""
         dtype, behind = self.grid.dtype, [] if rays.after is None else [rays.after.take(row)]
         legs = [*met, *behind]
-        index, angle, kind = (
-            np.concatenate([getattr(leg, name) for leg in legs], axis=1)
-            for name in ("index", "angle", "kind")
-        )
+        names = "index", "angle", "kind"
+        index, angle, kind = (np.concatenate([getattr(leg, n) for leg in legs], axis=1) for n in names)
         return Records(
             index.astype(np.int32), angle.astype(dtype), kind, np.asarray(power, dtype),
             rays.ray[row].astype(np.int32), -1 if behind else residual_row, self.grid.half_width,

@@ -125,9 +125,8 @@ class _Refinement:
             name: wp.array(value.reshape(-1), dtype=int if name == "plane_of" else float, device=device)
             for name, value in arrays.items()
         }
-        self.gradients = {
-            name: wp.zeros(n * k, dtype=float, device=device) for name, k in self.widths.items()
-        }
+        widths = self.widths.items()
+        self.gradients = {name: wp.zeros(n * k, dtype=float, device=device) for name, k in widths}
         self.scales = wp.zeros(n, dtype=wp.vec3, requires_grad=True, device=device)
         self.opacities = wp.zeros(n, dtype=float, requires_grad=True, device=device)
         self.means = self.shaped("means", wp.vec3, (n,))

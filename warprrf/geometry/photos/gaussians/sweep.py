@@ -231,9 +231,8 @@ def _settled(piece: Plane, surface: Mesh | None, photos: GreyPhotos) -> Plane | 
     z = piece.offset * piece.normal[2]
     views = choose_views(surface, centres, piece.normal, photos.cameras)
     steps = np.arange(-0.05, 0.0501, FINE_M)
-    scores = [
-        float(agreement_of(photos, centres + [0, 0, step], piece.axes, views)[0].mean()) for step in steps
-    ]
+    moved = [centres + [0, 0, step] for step in steps]
+    scores = [float(agreement_of(photos, place, piece.axes, views)[0].mean()) for place in moved]
     best = int(np.argmax(scores))
     if best in (0, len(steps) - 1) or scores[best] < 0.5:
         return None

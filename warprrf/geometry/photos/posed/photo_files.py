@@ -71,11 +71,8 @@ def find_photos(photos: Photos) -> dict[str, Path]:
 
 def _of_workspace(file: Path, root: Path) -> bool:
     """Whether ``file`` lies in a folder of finished steps below ``root``."""
-    return any(
-        (folder / RECORDS).is_dir()
-        for folder in file.parents
-        if folder != root and folder.is_relative_to(root)
-    )
+    between = [folder for folder in file.parents if folder != root and folder.is_relative_to(root)]
+    return any((folder / RECORDS).is_dir() for folder in between)
 
 
 @dataclass(frozen=True)

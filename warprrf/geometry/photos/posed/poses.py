@@ -239,14 +239,12 @@ def _camera(values: Mapping[str, Any], folder: Path) -> KnownCamera:
 
 def _distortion(values: Mapping[str, Any]) -> tuple[str, tuple[float, ...]]:
     """COLMAP's name of a lens model, and its coefficients."""
-    model = (
-        "OPENCV_FISHEYE" if values.get("is_fisheye") else str(values.get("camera_model", "OPENCV")).upper()
-    )
+    named = str(values.get("camera_model", "OPENCV")).upper()
+    model = "OPENCV_FISHEYE" if values.get("is_fisheye") else named
     if model not in ("SIMPLE_PINHOLE", "PINHOLE", "PERSPECTIVE", "OPENCV", "OPENCV_FISHEYE"):
         raise ValueError(f"camera_model: got {model}, expected OPENCV, OPENCV_FISHEYE or PINHOLE")
-    k1, k2, k3, k4, p1, p2 = (
-        check_number(k, values.get(k, 0.0)) for k in ("k1", "k2", "k3", "k4", "p1", "p2")
-    )
+    names = "k1", "k2", "k3", "k4", "p1", "p2"
+    k1, k2, k3, k4, p1, p2 = (check_number(k, values.get(k, 0.0)) for k in names)
     if model == "OPENCV_FISHEYE":
         return model, (k1, k2, k3, k4)
     if k4:

@@ -262,10 +262,8 @@ def least_surface(grid: Grid, free: np.ndarray, solid: np.ndarray, closed: np.nd
             ``(3, 2)`` bool.
     """
     x, y, z = (np.diff(h) for h in grid.heights)
-    sides = [  # area of a box's side across each direction
-        np.broadcast_to(side, grid.shape)
-        for side in (y[None, :, None] * z, x[:, None, None] * z, (x[:, None] * y)[:, :, None])
-    ]
+    areas = y[None, :, None] * z, x[:, None, None] * z, (x[:, None] * y)[:, :, None]
+    sides = [np.broadcast_to(side, grid.shape) for side in areas]  # of a box, across each direction
     around = 2 * (sides[0] + sides[1] + sides[2])
     volume = x[:, None, None] * y[None, :, None] * z
     cross = ndimage.generate_binary_structure(3, 1)

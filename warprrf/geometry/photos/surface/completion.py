@@ -120,10 +120,9 @@ def _without_gaps(patches: PlanarPatches, cameras: Sequence[Camera]) -> PlanarPa
         if squares is not None:
             meshes.append(squares)
             labels.append(np.full(len(squares.faces), k, dtype=np.int32))
-    whole = joined([(part.vertices, part.faces) for part in meshes])
-    return PlanarPatches.from_planes(
-        whole, np.concatenate(labels), patches.normal, patches.offset, tolerance_m=patches.tolerance_m
-    )
+    whole, label = joined([(part.vertices, part.faces) for part in meshes]), np.concatenate(labels)
+    known = patches.normal, patches.offset
+    return PlanarPatches.from_planes(whole, label, *known, tolerance_m=patches.tolerance_m)
 
 
 def _gaps(patches: PlanarPatches, k: int, points: np.ndarray) -> Plane:

@@ -220,10 +220,8 @@ class Layer:
     def _data(self, receivers: np.ndarray) -> _BatchTarget:
         p, target, shape = self.problem, self.target, (len(receivers), *self.problem.transport.shape)
         image = np.asarray(target.image[receivers], p.precision)
-        factor, extra, mask = (
-            None if whole is None else p.upload(whole[receivers].ravel())
-            for whole in (target.factor, target.extra, target.mask)
-        )
+        whole = target.factor, target.extra, target.mask
+        factor, extra, mask = (None if a is None else p.upload(a[receivers].ravel()) for a in whole)
         if target.mask is not None:
             counted = max(float(target.mask[receivers].sum(dtype=np.float64)), 1.0)
             return _BatchTarget(p.upload(image.ravel()), factor, extra, mask, None, counted)
@@ -316,9 +314,8 @@ def fit_layer(
         table = np.zeros((len(p.seen), _kernels.COEFFICIENTS))
         table[:, 0] = target.initial
         state = State(table, np.zeros_like(table), np.zeros_like(table))
-    coefficients, first, second = (
-        p.upload(a, k.vec16) for a in (state.coefficients, state.first, state.second)
-    )
+    stand = state.coefficients, state.first, state.second
+    coefficients, first, second = (p.upload(a, k.vec16) for a in stand)
     initial = p.upload(target.initial)
     losses = list(state.losses)
     adam, width = build_adam(p.real), _kernels.COEFFICIENTS
