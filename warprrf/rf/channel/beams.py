@@ -52,9 +52,8 @@ class Codebook:
         axes = (self.array.cols, self.array.rows) if len(self.factors) == 2 else (self.array.elements,)
         if len(self.factors) != len(axes):
             raise ValueError(f"factors: got {len(self.factors)}, expected weights, or those across and down")
-        found = [
-            check_array("factors", f, (None, n), complex) for f, n in zip(self.factors, axes, strict=True)
-        ]
+        sides = zip(self.factors, axes, strict=True)
+        found = [check_array("factors", f, (None, n), complex) for f, n in sides]
         if any((np.abs(np.linalg.norm(f, axis=1) - 1.0) > 1e-3).any() for f in found):
             raise ValueError("factors: got weights of another norm than 1, which would count as gain")
         object.__setattr__(self, "factors", tuple(found))
@@ -305,17 +304,15 @@ def signal_over_interference(
         noise: Noise power over the total transmitted power.
     """
     users = len(gains)
-    transmitted, received = (
-        check_array(name, value, (users,), np.int64) for name, value in (("tx", tx), ("rx", rx))
-    )
+    transmitted = check_array("tx", tx, (users,), np.int64)
+    received = check_array("rx", rx, (users,), np.int64)
     tables = [check_array("gains", g, (None, None), least=0.0) for g in gains]
     for name, index, axis in (("rx", received, 0), ("tx", transmitted, 1)):
         fewest = min((table.shape[axis] for table in tables), default=0)
         if users and not -fewest <= index.min() <= index.max() < fewest:
             raise ValueError(f"{name}: got beams {index.min()} to {index.max()}, expected 0 to {fewest - 1}")
-    heard = np.array([table[r, transmitted] for table, r in zip(tables, received, strict=True)]).reshape(
-        users, users
-    )
+    own = zip(tables, received, strict=True)
+    heard = np.array([table[r, transmitted] for table, r in own]).reshape(users, users)
     signal = np.diag(heard)
     return signal / (heard.sum(axis=1) - signal + noise * len(heard))
 

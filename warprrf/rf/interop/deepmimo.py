@@ -79,9 +79,8 @@ def write_deepmimo(
     for key, values in matrices.items():
         write_arrays(folder / f"{key}_t000_tx000_r001.npz", {key: values})
     described = _write_scene(folder, scene, carrier)
-    most = {
-        code: int((several.interactions == code).sum(axis=-1).max(initial=0)) for code in (MIRROR, EDGE, SLAB)
-    }
+    met, codes = several.interactions, (MIRROR, EDGE, SLAB)
+    most = {code: int((met == code).sum(axis=-1).max(initial=0)) for code in codes}
     parameters = {
         "version": "4.0.5",  # of the format
         "rt_params": {

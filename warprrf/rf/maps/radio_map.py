@@ -254,9 +254,8 @@ def radio_map(
         raise ValueError("field: got one without a mesh, expected one that knows walls from air")
     source = field.transmitter if transmitter is None else transmitter
     source = check_array("transmitter", source, (3,)).copy()
-    check_positions(
-        mesh, source, np.zeros((0, 3)), field.wavelength_m, known=field.transmitter, device=field.device
-    )
+    nobody = np.zeros((0, 3))
+    check_positions(mesh, source, nobody, field.wavelength_m, known=field.transmitter, device=field.device)
     low, high = mesh.bounds[:, 2] - (mesh.bounds[0, 2] if o.above_ground else 0.0)
     if not low < height < high:
         raise ValueError(f"height: got {height!r} m, expected {low:.3g} to {high:.3g} m")

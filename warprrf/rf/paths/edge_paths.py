@@ -82,9 +82,8 @@ class EdgePaths(Rows):
         share = np.sqrt(self.power) / friis
         parents = found.order + found.slabs <= 1
         keys = found.receiver, found.patch.max(axis=1, initial=-1), found.slabs
-        free = dict(
-            zip(zip(*(k[parents].tolist() for k in keys), strict=True), found.share[parents], strict=True)
-        )
+        known = zip(*(k[parents].tolist() for k in keys), strict=True)
+        free = dict(zip(known, found.share[parents], strict=True))
         keys = self.receiver, self.patch.max(axis=1, initial=-1), (self.code == SLAB).sum(axis=1)
         left = np.array([1.0 - free.get(key, 0.0) for key in zip(*(k.tolist() for k in keys), strict=True)])
         near = self.detour_m < self.wavelength_m

@@ -402,6 +402,7 @@ class SpectrumDataset:
         floor = default_floor(gain) if gain.any() else self.floor
         ends, beam = (self.receivers, self.transmitter), (self.frequency_hz, self.beam_sigma_rad)
         guessed = np.array_equal(self.line_of_sight, _sees(*ends, self.path_gain, *beam))
+        stated = "as the pattern states" if boresight_gain_dbi is None else float(boresight_gain_dbi)
         return replace(
             self,
             path_gain=gain,
@@ -413,9 +414,7 @@ class SpectrumDataset:
             attributes={
                 **self.attributes,
                 "deembedded": done.method,
-                "deembedded_boresight_gain_dbi": (
-                    "as the pattern states" if boresight_gain_dbi is None else float(boresight_gain_dbi)
-                ),
+                "deembedded_boresight_gain_dbi": stated,
                 "deembedded_noise": float(noise),
                 "deembedded_share_of_sphere": done.covered,
                 "deembedded_steps_median": float(np.median(done.steps)) if count else 0.0,

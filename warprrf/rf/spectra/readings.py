@@ -212,10 +212,8 @@ class Readings(PowerTable):
 
     def without_side_lobes(self) -> Readings:
         """The same of antennas with nothing but their main lobes; see :func:`main_lobe`."""
-        names = ("receive_pattern", "transmit_pattern")
-        cut: dict[str, Any] = {
-            name: main_lobe(as_antenna(p)) for name in names if (p := getattr(self, name)) is not None
-        }
+        names = [n for n in ("receive_pattern", "transmit_pattern") if getattr(self, n) is not None]
+        cut: dict[str, Any] = {name: main_lobe(as_antenna(getattr(self, name))) for name in names}
         return replace(self, **cut)
 
     @classmethod

@@ -262,9 +262,8 @@ class Materials:
 
     def by_materials(self, parameters: Parameters, material: np.ndarray) -> Materials:
         """The same with parameters of materials in place of those of groups; ``material`` (G,) is that of each."""
-        return Materials(
-            parameters, self.slabs, material, self._side_group, self._radiance, device=self.device
-        )
+        sent = self._side_group, self._radiance
+        return Materials(parameters, self.slabs, material, *sent, device=self.device)
 
     def on_device(self, real: Any) -> Any:
         """The kernels' view of it."""

@@ -349,9 +349,8 @@ class Columns:
     @classmethod
     def joined(cls, parts: Sequence[Columns]) -> Columns:
         """Readings of several observations one after another."""
-        groups, senders = (
-            np.unique(np.concatenate([getattr(c, name) for c in parts])) for name in ("groups", "senders")
-        )
+        groups = np.unique(np.concatenate([c.groups for c in parts]))
+        senders = np.unique(np.concatenate([c.senders for c in parts]))
         ends = np.cumsum([0, *(c.single.shape[-1] for c in parts)])
         single = np.zeros((len(groups), *parts[0].single.shape[1:3], ends[-1]), np.float32)
         further = np.zeros((len(senders), ends[-1]), np.float32)
@@ -438,9 +437,8 @@ class Kind(ABC):
         """What a field's spectra are made with, if it is the first; its transmitter is the first of which anything was read."""
         one = self.one
         first = np.isfinite(one.power).reshape(len(one), -1).any(axis=1).argmax()
-        none = SpectrumDataset.empty(
-            transmitter=one.transmitters[first], frequency_hz=one.frequency_hz, shape=READINGS_SHAPE
-        )
+        source, carrier = one.transmitters[first], one.frequency_hz
+        none = SpectrumDataset.empty(transmitter=source, frequency_hz=carrier, shape=READINGS_SHAPE)
         return replace(none, attributes={} if one.air is None else one.air.attributes)
 
 

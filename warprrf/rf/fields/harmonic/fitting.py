@@ -348,9 +348,8 @@ def fit_layer(
 def _numbers(vectors: wp.array) -> wp.array:
     """The memory of ``vectors``, which have to live on, as numbers."""
     real = vectors.dtype._wp_scalar_type_
-    return wp.array(
-        ptr=vectors.ptr, dtype=real, shape=vectors.size * _kernels.COEFFICIENTS, device=vectors.device
-    )
+    count = vectors.size * _kernels.COEFFICIENTS
+    return wp.array(ptr=vectors.ptr, dtype=real, shape=count, device=vectors.device)
 
 
 def targets(

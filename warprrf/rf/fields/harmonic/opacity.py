@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -110,12 +111,9 @@ class OpacityTraining:
         self._logits, self._first, self._second = (problem.upload(row) for row in state)
         self.pairs = [self._pairs(batch, listed.responses) for batch in problem.batches]
         largest = max(len(b.pair_pixel) for b in problem.batches)
-        self._weight, self._pair_adjoint = (
-            wp.zeros(largest, dtype=problem.real, device=problem.device) for _ in range(2)
-        )
-        self.gradient, self._opacity = (
-            wp.zeros(len(problem.seen), dtype=problem.real, device=problem.device) for _ in range(2)
-        )
+        zeros = partial(wp.zeros, dtype=problem.real, device=problem.device)
+        self._weight, self._pair_adjoint = zeros(largest), zeros(largest)
+        self.gradient, self._opacity = zeros(len(problem.seen)), zeros(len(problem.seen))
         self._activate()
 
     def _pairs(self, batch: Pairs, responses: Sequence[wp.array]) -> tuple[wp.array, wp.array]:

@@ -7,6 +7,7 @@ do not leave the device that they were made on.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -95,18 +96,17 @@ class Problem:
         """The pairs of some receivers, sorted by Gaussian."""
         views = [self.transport.views[r] for r in receivers]
         count, pixels = sum(len(view.gaussian) for view in views), self.pixels * len(views)
-        keys, order = (wp.empty(2 * count, dtype=int, device=self.device) for _ in range(2))  # room to sort
-        pixel, place, pair_pixel, pair_direction = (
-            wp.empty(count, dtype=int, device=self.device) for _ in range(4)
-        )
-        pixel_start = wp.empty(pixels + 1, dtype=int, device=self.device)
+        empty = partial(wp.empty, dtype=int, device=self.device)
+        keys, order = empty(2 * count), empty(2 * count)  # room to sort
+        pixel, place, pair_pixel, pair_direction = (empty(count) for _ in range(4))
+        pixel_start = empty(pixels + 1)
         first = 0
         for k, view in enumerate(views):
             inputs = view.start, view.gaussian, self._row, pixel_start, pixel, keys, order
             self.launch(_pairs.gather_pairs, self.pixels + 1, self.pixels * k, first, *inputs)
             first += len(view.gaussian)
         wp.utils.radix_sort_pairs(keys, order, count, 0, len(self.seen).bit_length())
-        row_start = wp.empty(len(self.seen) + 1, dtype=int, device=self.device)
+        row_start = empty(len(self.seen) + 1)
         self.launch(tile_starts, len(row_start), keys, count, row_start)
         self.launch(_pairs.sorted_pairs, count, self.pixels, order, pixel, place, pair_pixel, pair_direction)
         weight = self.in_order(place, [view.weight for view in views])
