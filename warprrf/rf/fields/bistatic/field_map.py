@@ -191,7 +191,7 @@ def _spectrum(one: SpectrumDataset, maps: dict[bytes, FieldMap], *_: Any) -> Rou
     gain, m = one.path_gain[0].astype(float).ravel(), maps[one.transmitter.tobytes()]
     blur = beam_operator(SHAPE, BLUR_RAD)
     both = np.nan_to_num(gain), np.isfinite(gain) * 1.0
-    power, measured = (blur(np.bincount(own, one, PIXELS).reshape(SHAPE)).ravel() for one in both)
+    power, measured = (blur(np.bincount(own, value, PIXELS).reshape(SHAPE)).ravel() for value in both)
     smaller = len(gain) / PIXELS
     kept = np.flatnonzero(measured > 0.9 * smaller)  # elsewhere nothing was measured
     table = m.decibels("blurred", lambda: blur(np.moveaxis(m.image, 0, -1)).reshape(PIXELS, -1).T)

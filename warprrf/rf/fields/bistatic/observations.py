@@ -490,8 +490,8 @@ class _Tables(Kind):
             if len(rows):
                 at = int(first[number])
                 ends = one.transmitters[at], one.receivers[at]
-                known = one.frequency_hz, READINGS_SHAPE, one.air
-                found.append(Place(self.number, rows, *ends, *known, chain=str(names[chain[at]])))
+                place = Place(self.number, rows, *ends, one.frequency_hz, READINGS_SHAPE, one.air)
+                found.append(replace(place, chain=str(names[chain[at]])))
         return found
 
     def observe(self, place: Place, view: View) -> Observation:
