@@ -396,8 +396,7 @@ class Mesh:
             b: Other ends [m], shape ``(N, 3)`` or ``(3,)`` for all.
             clearance: Surfaces nearer than this to either end, measured along the segment, don't block [m]: ends may
                 lie on surfaces. Distances are judged in float64, so it need not cover float32 errors.
-            device: Where the hierarchy is searched.
-            backend: One of :data:`~warprrf.geometry.rays.BACKENDS`.
+            device, backend: As for :meth:`cast`.
 
         Returns:
             Shape ``(N,)``, bool.

@@ -82,8 +82,7 @@ def read_mesh(
     """Read a mesh file as it stands, in its own unit and axes; polygons become triangles.
 
     Args:
-        path: PLY, OBJ, STL, glTF or GLB, by the suffix.
-        allow_outside: whether it may name materials, textures and buffers outside its folder.
+        path, allow_outside: as for :meth:`Mesh.load`.
         colours: whether the files of materials and textures that it names are read.
 
     Raises:

@@ -1,8 +1,7 @@
 """Stage 1: from photos and a few surveyed camera positions to Gaussians, a mesh and its planar patches, in metres.
 
-Structure from motion, similarity to metres, cleaning, planes, initial Gaussians, photometric refinement, depth maps,
-fusion, planar patches. Every finished step is kept in the workspace for the inputs that it was made from: a stopped
-run continues, a change starts over from the first step that it changes.
+Every finished step (see :mod:`warprrf.geometry.photos`) is kept in the workspace for the inputs that it was made from: a
+stopped run continues, a change starts over from the first step that it changes.
 """
 
 from __future__ import annotations

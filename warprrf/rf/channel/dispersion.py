@@ -28,10 +28,8 @@ class Dispersion:
         mean_delay_s: Power-weighted mean delay, from zero [s].
         delay_spread_s: Root mean square delay spread [s].
         k_factor: Power of the line of sight over that of the rest [linear]; 0 without one, inf with nothing else.
-        azimuth_spread_arrival_rad: Angular spread of the azimuth of arrival [rad].
-        zenith_spread_arrival_rad: Of the zenith of arrival.
-        azimuth_spread_departure_rad: Of the azimuth of departure.
-        zenith_spread_departure_rad: Of the zenith of departure.
+        azimuth_spread_arrival_rad, zenith_spread_arrival_rad, azimuth_spread_departure_rad, zenith_spread_departure_rad:
+            Angular spreads [rad].
         coherence_bandwidth_hz: Frequency shift at which correlation first falls to one half [Hz]; inf if it never does.
     """
 

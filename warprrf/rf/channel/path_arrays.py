@@ -44,10 +44,8 @@ class PathArrays:
         gain: Complex gain between isotropic antennas, exp(-j 2 pi f tau) included; |gain|^2 is path gain averaged over
             vertical and horizontal transmit polarisation and summed over both receive polarisations. 0 where padded.
         tau: Delay [s]; NaN where padded, as the angles are.
-        theta_r: Zenith of arrival [rad].
-        phi_r: Azimuth of arrival [rad].
-        theta_t: Zenith of departure [rad].
-        phi_t: Azimuth of departure [rad].
+        theta_r, phi_r: Zenith and azimuth of arrival [rad].
+        theta_t, phi_t: Of departure [rad].
         vertices: Interaction points from the transmitter on [m], shape ``(..., depth, 3)``; NaN past the last.
         kind: "los", "mirror", "slab" (through walls, and mirrors perhaps), "edge" (over an edge, too) or "diffuse"; "" where
             padded.

@@ -199,15 +199,8 @@ def _alike(colour: np.ndarray, flat: np.ndarray, area: np.ndarray) -> np.ndarray
 
 
 def shape_groups(mesh: Mesh, patch: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Groups of faces by planar patch and connected part.
-
-    Args:
-        patch: planar patch of each, -1 for none, shape ``(F,)``.
-
-    Returns:
-        The group of each face, shape ``(F,)``; the material that each group is taken for, shape ``(G,)``; and its
-        shape in steps: height and place of its body, and the body's extents upward, along and across, shape ``(G, 6)``.
-    """
+    """Groups of faces by planar patch and connected part: as :func:`colour_groups`, with the shape of each in steps instead of
+    its colour: height and place of its body, and the body's extents upward, along and across, shape ``(G, 6)``."""
     shell = 0.5  # share of the mesh's extents along all axes that the room's shell has at least
     body_m2 = 0.5  # smaller bodies are taken for the material of the larger one that is most like them
     pairs = np.concatenate([edge_pairs(mesh.welded_faces), mesh.neighbours])

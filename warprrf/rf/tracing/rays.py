@@ -154,8 +154,7 @@ class RayGrid:
         )  # fmt: skip
 
     def hit_from(self, tile: np.ndarray, point: np.ndarray, u: np.ndarray, v: np.ndarray) -> Hits:
-        """What rays hit that start at places (N, 3) on sides of tiles (N,), each with a direction of its own: their density is
-        proportional to the cosine where ``u`` and ``v`` (N,) fill the unit square."""
+        """What rays hit that start at places (N, 3) on sides of tiles (N,), each with a direction :func:`by_cosine` of its own."""
         s = self.surface
         behind, tile = np.divmod(tile, len(s.tiles.face))
         normal = s.side_normal[s.tiles.face[tile]] * (1.0 - 2.0 * behind)[:, None]

@@ -1,9 +1,8 @@
 """Structure from motion: camera poses and a sparse point cloud from photo files.
 
 Wraps pycolmap (COLMAP: Schoenberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016): SIFT on the image
-files, matching, incremental mapping with one lens for each camera, which is estimated. The photos are then undistorted
-(:mod:`warprrf.geometry.photos.posed.undistort`); the model comes out with their pinhole cameras, in units and axes of its own;
-:mod:`warprrf.geometry.photos.posed.sparse` brings it to metres. Everything runs on the CPU and repeats itself for a given seed.
+files, matching, incremental mapping with one lens for each camera, which is estimated. Everything runs on the CPU and
+repeats itself for a given seed.
 """
 
 from __future__ import annotations
@@ -84,9 +83,9 @@ def structure_from_motion(
     """Camera poses and sparse points of ``photos``, in the model's own units (see :mod:`~warprrf.geometry.photos.posed.sparse`).
 
     The cameras are those of the undistorted, upright, reduced photos, which lie in ``sfm/photos`` of the workspace under
-    their own names. Photos of one size whose EXIF names the same camera share a lens; without EXIF those of one size in
-    one folder do. The estimate starts from EXIF's focal length, or from one that the matches agree on. Features are found in
-    photos of 1600 pixels at most, and not where a mask (``NAME.mask.png``) is black.
+    their own names. Photos of one camera (:func:`cameras_of`) share a lens. The estimate starts from EXIF's focal length, or
+    from one that the matches agree on. Features are found in photos of 1600 pixels at most, and not where a mask
+    (``NAME.mask.png``) is black.
 
     Finished steps are kept in ``workspace`` and reused as long as photos, options and pycolmap stay the same, so that
     a stopped run goes on where it was.

@@ -36,12 +36,10 @@ class SparseModel:
         track_camera: photos (position in ``list(cameras)``) that see the points, point by point, shape
             ``(sum of track lengths,)``.
         unposed: names of the photos that no pose was found for, or that lie in a smaller, separate model.
-        causes: why each of these has no pose, by name, where that is known.
         pieces: names of the photos of each model that too few features join to the others; ``cameras`` are those of the first.
         metric: whether lengths are metres.
         upright: whether z is up.
-        scale_rms_m: rms distance between surveyed and reconstructed camera positions after alignment [m], else NaN.
-        guessed: what nobody measured and the photos do not show, a sentence each.
+        causes, scale_rms_m, guessed: as of :class:`~warprrf.geometry.reconstruction.Reconstruction`.
         photos: the files that ``cameras`` show: undistorted, upright, reduced; by photo name.
         lenses: of the photos as they were taken, by photo name.
     """

@@ -102,7 +102,7 @@ def stored_pixels(lens: Lens, slopes: np.ndarray, turns: int) -> np.ndarray:
 
     Args:
         slopes: x / z and y / z of the directions, shape ``(N, 2)``.
-        turns: quarter turns clockwise that bring the stored photo upright.
+        turns: as for :func:`pinhole_of`.
     """
     for _ in range(turns % 4):
         slopes = np.column_stack([slopes[:, 1], -slopes[:, 0]])

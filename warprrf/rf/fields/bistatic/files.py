@@ -43,11 +43,7 @@ def taken_apart(parts: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str,
 
 
 def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict[str, Any]:
-    """What :func:`taken_apart` took apart, by the names of a field's attributes.
-
-    Raises:
-        KeyError, TypeError, ValueError: for what is missing or does not fit.
-    """
+    """See :meth:`RadioField._put_together`."""
     names, objects, two_sided = header["group_names"], header.get("object_names", []), header["two_sided"]
     check_type("two_sided", two_sided, bool)
     for what, every in (("group_names", names), ("object_names", objects)):

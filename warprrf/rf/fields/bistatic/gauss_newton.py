@@ -56,9 +56,7 @@ class Batch:
 
     Attributes:
         observations: B of them; phases count in all or in none.
-        columns: what scatters in each, by groups.
-        effects: what is modelled.
-        material: of each group, shape ``(G,)``.
+        columns, effects, material: as of :class:`Problem`.
     """
 
     observations: Sequence[Observation]
