@@ -31,8 +31,8 @@ from warprrf.geometry.splats.render import render
 
 FEW_MAPS = 60
 """A surface is kept where two depth maps at least saw it, of no more maps than this where one did: photos far apart show much once
-only. Of 33 of a filmed cafe's photos and 32 of a kitchen's (7-Scenes) one map shows 9 % more, and spectra of fields on these meshes
-are .5 and .8 dB better; of 120 photos of the lobby, what only one map saw is wrong, and fields lose .2 to .7 dB."""
+only. Of some 35 photos of two films and of the lobby this shows 9 % more, and spectra of fields on these meshes are .5 to .8 dB
+better; of 120 of the lobby what only one map saw is wrong, and fields lose .2 to .7 dB."""
 VIEWS = 120  # most depth maps that are fused, spread over all cameras
 EDGE_TOLERANCE = 8.0
 """A pixel is left out where inverse depth bends by more than this part of itself, per focal length in pixels: on a plane
