@@ -115,13 +115,16 @@ def test_a_killed_run_continues_to_the_same_result(whole, made, monkeypatch):
     for name in ("refined", "depth", "surface"):
         (workspace / f"{name}.safetensors").unlink()
 
-    def killed(*args, **kwargs):
-        raise KeyboardInterrupt
+    def killed(*args, least_views, **kwargs):
+        raise KeyboardInterrupt(least_views)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(from_photos, "fuse_maps", killed)
-        with pytest.raises(KeyboardInterrupt):
-            made(workspace)
+    # Of few photos one depth map is enough to keep what it saw.
+    for few, least in ((9, "1"), (8, "2")):
+        with monkeypatch.context() as patch:
+            patch.setattr(from_photos, "FEW_MAPS", few)
+            patch.setattr(from_photos, "fuse_maps", killed)
+            with pytest.raises(KeyboardInterrupt, match=least):
+                made(workspace)
     (workspace / "surface.safetensors.partial").write_bytes(b"half")
     resumed, told = made(workspace)
     assert steps(told) == {"surface"}  # depth maps were kept

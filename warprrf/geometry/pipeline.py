@@ -45,7 +45,7 @@ from warprrf.geometry.photos.posed.sparse import (
     scaled,
 )
 from warprrf.geometry.photos.posed.upright import turned, upright
-from warprrf.geometry.photos.surface.fusion import depth_maps, depth_views, fuse_maps
+from warprrf.geometry.photos.surface.fusion import FEW_MAPS, depth_maps, depth_views, fuse_maps
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.reconstruction import (
     Arrays,
@@ -279,7 +279,10 @@ def _steps(
         else:
             views = depth_views(cameras, config.surface)
             ranges = [rendered[str(k)] for k in range(len(views))]
-        patches, whole = fuse_maps(views, ranges, planes=planes, config=config, progress=attempt.progress)
+        least_views = 2 if measured or len(views) > FEW_MAPS else 1
+        patches, whole = fuse_maps(
+            views, ranges, planes=planes, config=config, least_views=least_views, progress=attempt.progress
+        )
         skipped = float(config.completion and not whole)
         seen = how_seen(patches.mesh, list(sparse.cameras.values()), device=device)
         return of_patches(patches) | {"shares": np.array([*seen.unseen_and_plain(planes), skipped])}

@@ -13,7 +13,6 @@ from warprrf.geometry.photos.gaussians.cells import occupancy
 from warprrf.geometry.photos.gaussians.initialise import discs
 from warprrf.geometry.photos.posed.images import PosedPhotos
 from warprrf.geometry.photos.surface.fusion import (
-    FEW_MAPS,
     _sure,
     depth_maps,
     depth_views,
@@ -228,14 +227,13 @@ def test_a_depth_map_with_few_known_pixels_does_not_end_the_fusion():
     assert np.abs(mesh.vertices[:, 2] - 2).max() < 0.01
 
 
-@pytest.mark.parametrize(("maps", "seen"), [(FEW_MAPS, True), (FEW_MAPS + 1, False)])
-def test_what_one_of_few_depth_maps_saw_is_kept(maps, seen):
-    half, rest = (
-        np.where(np.arange(64) < 32, WALL if left else 0.0, 0.0 if left else WALL) for left in (1, 0)
-    )
-    mesh = fuse_depth([half, *[rest] * (maps - 1)], [CAMERA] * maps, config=SurfaceConfig())
-    assert mesh.vertices[:, 0].max() > 1.0  # of the maps that all but one are
-    assert (mesh.vertices[:, 0].min() < -1.0) == seen
+@pytest.mark.parametrize("least_views", [1, 2])
+def test_as_many_depth_maps_as_must_see_a_surface_do(least_views):
+    left = np.where(np.arange(64) < 32, WALL, 0.0)
+    right = np.where(np.arange(64) < 32, 0.0, WALL)
+    mesh = fuse_depth([left, right, right], [CAMERA] * 3, config=SurfaceConfig(), least_views=least_views)
+    assert mesh.vertices[:, 0].max() > 1.0  # what two saw
+    assert (mesh.vertices[:, 0].min() < -1.0) == (least_views == 1)
 
 
 def test_holes_that_stay_open_are_said_to():

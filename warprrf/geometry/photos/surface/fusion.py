@@ -30,9 +30,9 @@ from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.render import render
 
 FEW_MAPS = 60
-"""A surface is kept where two depth maps at least saw it, of no more maps than this where one did: photos far apart show much once
-only. Of some 35 photos of two films and of the lobby this shows 9 % more, and spectra of fields on these meshes are .5 to .8 dB
-better; of 120 of the lobby what only one map saw is wrong, and fields lose .2 to .7 dB."""
+"""Of no more depth maps of photos than this one is enough to keep a surface: photos far apart show much once only, and others prove
+what it says. Of some 35 photos of two films and of the lobby this shows 9 % more, and spectra of fields on these meshes are .5 to
+.8 dB better; of 120 of the lobby what only one map saw is wrong, and fields lose .2 to .7 dB."""
 VIEWS = 120  # most depth maps that are fused, spread over all cameras
 EDGE_TOLERANCE = 8.0
 """A pixel is left out where inverse depth bends by more than this part of itself, per focal length in pixels: on a plane
@@ -125,6 +125,7 @@ def fuse_maps(
     *,
     planes: Sequence[Plane] = (),
     config: ReconstructionConfig,
+    least_views: int = 2,
     progress: Progress | None = None,
 ) -> tuple[PlanarPatches, bool]:
     """Mesh of depth maps with its planar patches, the largest first; and whether its holes were closed.
@@ -132,10 +133,12 @@ def fuse_maps(
     Args:
         depths: ranges [m], 0 where unknown, each of one of ``views``.
         planes: known beforehand; the mesh is snapped to them.
+        least_views: see :func:`fuse_depth`.
     """
     report = progress or silent
     report("surface", 0, 4)
-    mesh = fuse_depth(depths, views, config=_with_voxels(config.surface, views, depths))
+    surface = _with_voxels(config.surface, views, depths)
+    mesh = fuse_depth(depths, views, config=surface, least_views=least_views)
     report("surface", 1, 4)
     patches = snapped(mesh, planes, config.surface)
     report("surface", 2, 4)
@@ -159,11 +162,14 @@ def _with_voxels(
     return replace(config, voxel_m=min(config.voxel_m, voxel_pixels * float(np.median(pixel_m))))
 
 
-def fuse_depth(depths: Sequence[np.ndarray], cameras: Sequence[Camera], *, config: SurfaceConfig) -> Mesh:
+def fuse_depth(
+    depths: Sequence[np.ndarray], cameras: Sequence[Camera], *, config: SurfaceConfig, least_views: int = 2
+) -> Mesh:
     """One mesh from depth maps of pinhole cameras, by a truncated signed distance field.
 
     Args:
         depths: Euclidean range per pixel [m], each ``(height, width)`` of its camera; inf, NaN or 0 where unknown.
+        least_views: depth maps that must have seen a surface.
     """
     o3d = open3d()
     core = o3d.core
@@ -187,7 +193,6 @@ def fuse_depth(depths: Sequence[np.ndarray], cameras: Sequence[Camera], *, confi
         blocks = grid.compute_unique_block_coordinates(image, lens, pose, *limits)
         grid.integrate(blocks, image, lens, pose, *limits)
         filled = True
-    least_views = 2 if len(depths) > FEW_MAPS else 1
     raw = grid.extract_triangle_mesh(least_views - 0.5).to_legacy() if filled else None
     if raw is None or len(raw.triangles) == 0:
         raise ValueError("depths: no surface came out; are the maps ranges in metres and the poses right?")
