@@ -68,7 +68,6 @@ STALE = {
     "arrays",
     "bistatic",
     "locate",
-    "measurements",
     "relevance",
     "suggest",
 }
