@@ -65,7 +65,6 @@ def test_no_figure_is_typed(page):
 
 
 STALE = {
-    "arrays",
     "bistatic",
     "locate",
     "relevance",
