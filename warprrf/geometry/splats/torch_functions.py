@@ -43,7 +43,10 @@ def rasterize(
     """Blend Gaussians front to back, as :func:`warprrf.render` does; differentiable in every tensor.
 
     Args:
-        means, quaternions, scales, opacities: as of :class:`Gaussians`; quaternions of any length but zero.
+        means: centres [m], shape ``(N, 3)``.
+        quaternions: wxyz of any length but zero, shape ``(N, 4)``.
+        scales: standard deviations [m], shape ``(N, 3)``.
+        opacities: in [0, 1], shape ``(N,)``.
         features: shape ``(N, C)``.
         background: shape ``(C,)``; default: zero.
 

@@ -212,8 +212,8 @@ class _Link:
     """Paths of one receiver between two arrays, ready to be summed.
 
     Attributes:
-        index: Which of the receiver's paths are summed, P of them.
-        paths: These.
+        index: Which of the receiver's paths are summed.
+        paths: Those, P of them.
         amplitude: Between elements at the arrays' centres, shape ``(Kr, Kt, P)``, K polarisations at either end.
         lengths: What elements' places add, for groups of paths (indices into the P).
         shift_s: Delay that counts as zero.

@@ -255,8 +255,8 @@ class MirrorImages:
                 stop = max(done + 1, int(np.searchsorted(ends, before + BLOCK, side="right")))
                 some = slice(first + done, first + stop)
                 parents = chains.take(some)
-                known = last[some], middle, reach, count[done:stop]
-                _, parent, patch, image, axis, sine = self._extend(parents, *known)
+                inputs = last[some], middle, reach, count[done:stop]
+                _, parent, patch, image, axis, sine = self._extend(parents, *inputs)
                 longer = np.column_stack([parents.patch[parent], patch]).astype(np.int32, copy=False)
                 yield Chains(longer, image, axis, sine), (first + stop) / len(chains)
                 done = stop

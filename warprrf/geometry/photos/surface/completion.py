@@ -121,8 +121,8 @@ def _without_gaps(patches: PlanarPatches, cameras: Sequence[Camera]) -> PlanarPa
             meshes.append(squares)
             labels.append(np.full(len(squares.faces), k, dtype=np.int32))
     whole, label = joined([(part.vertices, part.faces) for part in meshes]), np.concatenate(labels)
-    known = patches.normal, patches.offset
-    return PlanarPatches.from_planes(whole, label, *known, tolerance_m=patches.tolerance_m)
+    planes = patches.normal, patches.offset
+    return PlanarPatches.from_planes(whole, label, *planes, tolerance_m=patches.tolerance_m)
 
 
 def _gaps(patches: PlanarPatches, k: int, points: np.ndarray) -> Plane:

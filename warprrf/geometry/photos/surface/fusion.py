@@ -30,9 +30,9 @@ from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.render import render
 
 FEW_MAPS = 60
-"""Of no more depth maps of photos than this one is enough to keep a surface: photos far apart show much once only, and others prove
-what it says. Of some 35 photos of two films and of the lobby this shows 9 % more, and spectra of fields on these meshes are .5 to
-.8 dB better; of 120 of the lobby what only one map saw is wrong, and fields lose .2 to .7 dB."""
+"""Of no more depth maps of photos than this one is enough to keep a surface: photos far apart show much once only. Of some 35
+photos of two films and of the lobby spectra of fields on the meshes are .5 to .8 dB better; of 120 of the lobby what only one map
+saw is wrong, and fields lose .2 to .7 dB."""
 VIEWS = 120  # most depth maps that are fused, spread over all cameras
 EDGE_TOLERANCE = 8.0
 """A pixel is left out where inverse depth bends by more than this part of itself, per focal length in pixels: on a plane
