@@ -209,7 +209,7 @@ def choose(t: Training) -> Solution:
             trial = t.refined(replace(best, effects=trial.effects), t.few(1), SHORT_STEPS)
         else:  # not from what single bounces found: their surfaces are too bright where light between them counts
             trial = t.refined(trial, t.few(1), 2 * SHORT_STEPS, rounds=2)
-        loss = t.choice_loss(trial)
+        loss = t.choice_loss(trial, BETTER * least)
         kept = loss < BETTER * least
         t.note(_name(trial.effects), kept, loss)
         if not kept:
@@ -231,7 +231,7 @@ def _without_needless(t: Training, chosen: Solution, loss: float) -> tuple[Solut
         fewer = replace(chosen.effects, **off)
         if fewer != chosen.effects:
             trial = t.refined(replace(chosen, effects=fewer), t.few(1), SHORT_STEPS)
-            without = t.choice_loss(trial)
+            without = t.choice_loss(trial, BETTER * loss)
             kept = without < BETTER * loss
             t.note(f"no {name}", kept, without)
             chosen, loss = (trial, without) if kept else (chosen, loss)

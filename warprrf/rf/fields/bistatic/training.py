@@ -342,13 +342,20 @@ class Training:
         each = zip(places, predicted, strict=True)
         return float(np.mean([self.observations[k].losses(x).mean() for k, x in each]))
 
-    def choice_loss(self, choice: Solution) -> float:
+    def choice_loss(self, choice: Solution, most: float = np.inf) -> float:
         """Mean square error that tells one choice from another [dB^2]: of the readings chosen of places that trial fits learn from
-        and of those held out, without residual. The latter are too few to say alone: none of them may be behind a wall."""
-        places, p = np.union1d(self.few(1), self.held), choice.parameters
-        problem = self.problem(choice.effects, choice.material, places, p)
-        losses = [batch.losses(batch.gain(p, x) * x) for batch, _, x in problem.evaluated(p)]
-        return float(np.mean(np.concatenate(losses)))
+        and of those held out, without residual. The latter are too few to say alone: none of them may be behind a wall. Of a choice
+        that some of the places show to have ``most`` or more, that at these."""
+        few, p = self.few(1), choice.parameters
+        places, parts = np.concatenate([few, np.setdiff1d(self.held, few)]), 4  # those first whose paths are traced
+        count, losses = sum(len(self.parts[k].target) for k in places), np.zeros(0)
+        for some in np.array_split(places, parts):
+            problem = self.problem(choice.effects, choice.material, some, p)
+            own = [batch.losses(batch.gain(p, x) * x) for batch, _, x in problem.evaluated(p)]
+            losses = np.concatenate([losses, *own])
+            if losses.sum() >= most * count:
+                break
+        return float(np.mean(losses))
 
     def unexplained(self, model: Model) -> tuple[dict[int, np.ndarray], dict[str, float]]:
         """Readings of tables that ``model`` misses by more than 5 of their standard deviations, ``(N,)`` by place; and what it
