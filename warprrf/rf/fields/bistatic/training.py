@@ -347,7 +347,10 @@ class Training:
         and of those held out, without residual. The latter are too few to say alone: none of them may be behind a wall. Of a choice
         that some of the places show to have ``most`` or more, that at these."""
         few, p = self.few(1), choice.parameters
-        places, parts = np.concatenate([few, np.setdiff1d(self.held, few)]), 4  # those first whose paths are traced
+        places, parts = (
+            np.concatenate([few, np.setdiff1d(self.held, few)]),
+            4,
+        )  # those first whose paths are traced
         count, losses = sum(len(self.parts[k].target) for k in places), np.zeros(0)
         for some in np.array_split(places, parts):
             problem = self.problem(choice.effects, choice.material, some, p)
