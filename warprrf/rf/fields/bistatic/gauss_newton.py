@@ -155,21 +155,19 @@ class Batch:
 
     def slopes(self, materials: Materials, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of :meth:`power`, but of its common gain, ``(C, N)`` float32, and the places of those parameters ``(C,)``."""
-        side = self.observations[0].view.tracer.surface.side_group
-        place, index = layout.columns(self.material[self.specular.groups(side)])
+        side, by_materials = self.observations[0].view.tracer.surface.side_group, self.by_materials
+        met = self.material[self.specular.groups(side)]
+        place, index = layout.columns(np.concatenate([met, by_materials.groups, by_materials.senders]))
+        found = by_materials.slopes(materials.parameters, layout, place, len(index))
         if self.phases_count:
             own = [o.coherent_slopes(self.effects, materials, place, len(index)) for o in self.observations]
-            table = np.concatenate(own, axis=1)
+            found += np.concatenate(own, axis=1)
         else:
-            rise = self.specular.slopes(materials, place, len(index))
-            table = (csr_matrix(rise, dtype=np.float32).T @ self.path).toarray()
-        scattered, also = self.by_materials.slopes(materials.parameters, layout)
-        every = np.union1d(index, also)
-        found = np.zeros((len(every), table.shape[1]), np.float32)
-        found[np.searchsorted(every, index)] = table
-        found[np.searchsorted(every, also)] += scattered
+            rise = csr_matrix(self.specular.slopes(materials, place, len(index)), dtype=np.float32)
+            direct = (rise.T @ self.path).tocoo()
+            found[direct.row, direct.col] += direct.data
         found *= np.float32(materials.parameters.gain)
-        return found, every
+        return found, index
 
     def gain(self, p: Parameters, power: np.ndarray) -> np.ndarray:
         """Of the measuring chain of each reading, where ``power`` is predicted, shape ``(N,)``."""

@@ -373,23 +373,23 @@ class Columns:
         further = p.scattered_share[self.senders].astype(np.float32) @ self.further
         return np.asarray(np.maximum(single, 0.0) + further, float)
 
-    def slopes(self, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of the readings to parameters ``(C, N)`` float32, and their places ``(C,)``."""
-        curves, seen = fresnel_curves(), np.union1d(self.groups, self.senders)
-        found = np.zeros((len(seen), layout.stride, self.single.shape[-1]), np.float32)
+    def slopes(self, p: Parameters, layout: Layout, place: np.ndarray, count: int) -> np.ndarray:
+        """Derivatives of the readings to ``count`` parameters ``(count, N)`` float32; those of material m stand from ``place[m]``
+        on."""
+        curves, excess = fresnel_curves(), layout.lobes + EXCESS_COLUMN
+        found = np.zeros((count, self.single.shape[-1]), np.float32)
         alpha, rise = curves.at(curves.coordinates, p.log_excess)
         for g, columns in zip(self.groups, self.single, strict=True):
-            row, weight = found[np.searchsorted(seen, g)], p.weight[g].astype(np.float32)
+            row, weight = found[place[g] :], p.weight[g].astype(np.float32)
             value, slope = np.moveaxis(np.stack([alpha[g], rise[g]]).astype(np.float32) @ columns, 1, 0)
             row[: layout.lobes] += weight[:, None] * value
-            row[layout.lobes + EXCESS_COLUMN] += weight @ slope
+            row[excess] += weight @ slope
         even, steeper = curves.even(p.log_excess)
         for g, column in zip(self.senders, self.further, strict=True):
-            row = found[np.searchsorted(seen, g)]
+            row = found[place[g] :]
             row[: layout.lobes] += (p.weight[g] * even[g])[:, None] * column
-            row[layout.lobes + EXCESS_COLUMN] += p.weight[g].sum() * steeper[g] * column
-        index = layout.stride * seen[:, None] + np.arange(layout.stride)
-        return found.reshape(index.size, found.shape[-1]), index.ravel()
+            row[excess] += p.weight[g].sum() * steeper[g] * column
+        return found
 
 
 def columns_of(o: Observation, effects: Effects, p: Parameters) -> Columns:
