@@ -201,11 +201,10 @@ def choose(t: Training) -> Solution:
     trials = [Solution(effects, material, start, np.zeros((0, 0)), []) for effects in t.candidates]
     if len(t.held) < 2:  # one alone likes what others do not
         return _choose_of_few(t, trials)
-    best, least = None, np.inf
+    best, least = trials[0], np.inf
     for trial in trials:  # each holds the one before it: what is no better with some is not tried with more
-        if best is not None:
-            trial = replace(trial, effects=with_slabs_and_edges(trial.effects, best.effects))
-        if best is not None and best.effects.scatterings > 1:
+        trial = replace(trial, effects=with_slabs_and_edges(trial.effects, best.effects))
+        if least < np.inf and best.effects.scatterings > 1:
             trial = t.refined(replace(best, effects=trial.effects), t.few(1), SHORT_STEPS)
         else:  # not from what single bounces found: their surfaces are too bright where light between them counts
             trial = t.refined(trial, t.few(1), 2 * SHORT_STEPS, rounds=2)
@@ -216,8 +215,6 @@ def choose(t: Training) -> Solution:
             break
         # What slabs and edges get wrong would hide what bounces are worth.
         best, least = _without_needless(t, trial, loss)
-    if best is None:
-        raise ValueError("effects: got none to choose from")
     if np.isfinite(t.surface.appearance).all() and material.max() > 0 and not t.totals:
         best = merged(t, best)
     return best
@@ -240,10 +237,8 @@ def _without_needless(t: Training, chosen: Solution, loss: float) -> tuple[Solut
 
 def _choose_of_few(t: Training, trials: list[Solution]) -> Solution:
     """With too few receivers to hold any out: bounces as rooms have them, unless none fit much better."""
-    found = []
-    for trial in trials[:2]:
-        trial = t.refined(trial, t.not_held, t.options.iterations, rounds=2)
-        found.append(_without_needless(t, trial, t.choice_loss(trial))[0])
+    every = [t.refined(one, t.not_held, t.options.iterations, rounds=2) for one in trials[:2]]
+    found = [_without_needless(t, one, t.choice_loss(one))[0] for one in every]
     if len(found) == 1:
         return found[0]
     models = [t.model(trial) for trial in found]

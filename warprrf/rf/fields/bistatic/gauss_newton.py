@@ -5,8 +5,7 @@ mirror share) and the strength of its mirror reflection. All are positive, so th
 what no spectrum shows near plausible values and tie a surface's scattered and mirrored shares together, because they
 split one reflection (S^2 and 1 - S^2). Also free, where the readings can tell, are the share that each lets through (where
 paths pass slabs), and of all together a common gain (an uncalibrated receiver), the power of the carrier that roughness goes with
-(several carriers) and the gains of measuring chains. Slopes of scattered light come from :meth:`Columns.slopes`, those of line of
-sight and mirrors from the kernel of records, or where phases count from :meth:`Observation.coherent_slopes`.
+(several carriers) and the gains of measuring chains.
 
 Parameters are fitted to a few hundred readings at each of many places: a :class:`Batch` is one table of several places'
 readings, because what is computed of all at once costs a fraction of what each costs alone.
@@ -15,7 +14,7 @@ readings, because what is computed of all at once costs a fraction of what each 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from math import ceil
 from typing import Any
@@ -25,7 +24,7 @@ from scipy.linalg import solve
 from scipy.linalg.blas import ssyrk
 from scipy.sparse import block_diag, csr_matrix
 
-from warprrf.cache import cached_property
+from warprrf.cache import Cache, cached_property
 from warprrf.rf.em.waves import NEPER
 from warprrf.rf.fields.bistatic.observations import (
     NOISE_DB,
@@ -217,6 +216,7 @@ class Problem:
     gain_offset: bool = False
     energy_std: float = 0.25
     known_through: np.ndarray | None = None
+    _evaluated: Cache = field(init=False, repr=False, default_factory=lambda: Cache(1))
 
     @classmethod
     def of(
@@ -237,14 +237,17 @@ class Problem:
         """All observations, as few tables as may be."""
         return Batch.several(self.observations, self.columns, self.effects, self.material)
 
-    def evaluated(self, p: Parameters) -> Iterator[tuple[Batch, Materials, np.ndarray]]:
-        """Batches with the parameters ``p`` of materials at their carriers as kernels take them, and predictions without the
-        gains of chains, in units of each floor."""
-        for batch in self.batches:
+    def evaluated(self, p: Parameters) -> list[tuple[Batch, Materials, np.ndarray]]:
+        """Batches, parameters ``p`` at their carriers as kernels take them, and predictions without the gains of chains, in units
+        of each floor; the last are kept."""
+
+        def evaluate(batch: Batch) -> tuple[Batch, Materials, np.ndarray]:
             tracer = batch.observations[0].view.tracer
             here = p.at_ratio(batch.ratio)
             materials = Materials(here, tracer.slabs, self.material, device=tracer.grid.device)
-            yield batch, materials, batch.power(materials)
+            return batch, materials, batch.power(materials)
+
+        return self._evaluated.get(p.values, lambda: [evaluate(batch) for batch in self.batches])
 
     def linearised(
         self, p: Parameters, layout: Layout

@@ -195,7 +195,7 @@ class Observation:
         ratio: carrier of the readings over that of the fit's parameters.
         huber_db: larger errors count linearly in a fit [dB]: shadows that the geometry puts in the wrong place. More for
             readings that fade, whose decibels have a long tail of their own, and for totals, which may miss a mirror of
-            metal: priors have weaker ones.
+            metal.
         robust: whether single readings may be wrong, so that errors count so among places held out too.
         rows: which of the place's readings these are, shape ``(N,)``; None for all.
     """

@@ -1,7 +1,5 @@
-"""What a fit learns from: what receivers see of the geometry, what was read there, and which of it is held out.
-
-:func:`trace` finds what is seen. A :class:`Training` says which places decide about effects and materials, and which are held
-out, has the observations of both, and fits and judges models by them.
+"""What a fit learns from: what receivers see of the geometry (:func:`trace`), what was read there, and which places decide about
+effects and materials or are held out. A :class:`Training` fits and judges models by them.
 """
 
 from __future__ import annotations
@@ -335,17 +333,13 @@ class Training:
 
     def loss(self, model: Model, places: Sequence[int] | np.ndarray) -> float:
         """Mean loss of all readings at ``places`` [dB^2]."""
-        return self.mean_loss(places, self.predicted(model, places))
-
-    def mean_loss(self, places: Iterable[int], predicted: Iterable[np.ndarray]) -> float:
-        """The same of what is ``predicted`` at each, in units of its floor."""
-        each = zip(places, predicted, strict=True)
+        each = zip(places, self.predicted(model, places), strict=True)
         return float(np.mean([self.observations[k].losses(x).mean() for k, x in each]))
 
     def choice_loss(self, choice: Solution, most: float = np.inf) -> float:
-        """Mean square error that tells one choice from another [dB^2]: of the readings chosen of places that trial fits learn from
-        and of those held out, without residual. The latter are too few to say alone: none of them may be behind a wall. Of a choice
-        that some of the places show to have ``most`` or more, that at these."""
+        """Mean square error that tells one choice from another [dB^2], without residual: of the readings chosen of places that
+        trial fits learn from, and of those held out, which are too few to say alone (none may be behind a wall). Of a choice that
+        some places show to have ``most`` or more, that at these."""
         few, p = self.few(1), choice.parameters
         places, parts = (
             np.concatenate([few, np.setdiff1d(self.held, few)]),
