@@ -61,7 +61,7 @@ from warprrf.geometry.report.sight import how_seen
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.steps import Attempt, Steps
 
-VERSIONS = {**sfm.VERSIONS, "initial": 4, "refined": 2, "depth": 4, "surface": 11}
+VERSIONS = {**sfm.VERSIONS, "initial": 4, "refined": 2, "depth": 4, "surface": 12}
 """Of all steps: counted up by whoever changes what a step computes."""
 
 MUCH_UNKNOWN = 0.25  # share of a surface that is worth a warning

@@ -29,10 +29,10 @@ from warprrf.geometry.splats.camera import Camera, slopes_of
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.render import render
 
-FEW_MAPS = 60
+FEW_MAPS = 80
 """Of no more depth maps of photos than this one is enough to keep a surface: photos far apart show much once only. Of some 35
-photos of two films and of the lobby spectra of fields on the meshes are .5 to .8 dB better; of 120 of the lobby what only one map
-saw is wrong, and fields lose .2 to .7 dB."""
+photos of two films and of the lobby, and of 62 and 84 of the lobby, spectra of fields on the meshes are .2 to .9 dB better; of 120
+of the lobby what only one map saw is wrong, and fields lose .2 to .7 dB."""
 VIEWS = 120  # most depth maps that are fused, spread over all cameras
 EDGE_TOLERANCE = 8.0
 """A pixel is left out where inverse depth bends by more than this part of itself, per focal length in pixels: on a plane
