@@ -175,6 +175,14 @@ def test_receivers_that_decide_are_spread_over_the_order_in_which_they_came():
         assert few[0] == 0 and few[-1] == 99 and np.diff(few).max() <= 8
 
 
+def test_of_seventy_receivers_some_decide(scene, data, field):
+    """Trial fits learn from half of those whose paths are traced first, which all but a few of seventy are."""
+    every = data.subset(np.tile(np.arange(6), 12)[:70])
+    many = RadioField.fit(scene, every)
+    assert many.report["receivers"] == 70
+    assert psnr(many, data.subset(np.arange(6, 10))) > psnr(field, data.subset(np.arange(6, 10))) - 1.0
+
+
 def test_ten_times_better_than_the_nearest_measurement(field, data):
     test = data.subset(np.arange(6, 10))
     ours = evaluate(test, field.spectrum)

@@ -202,9 +202,11 @@ class Training:
         return np.setdiff1d(np.arange(len(self.places)), self.held)
 
     def few(self, times: int) -> np.ndarray:
-        """Places that trial fits learn from, up to ``times`` :data:`MOST_TO_CHOOSE`, those of every chain among them."""
-        others = np.setdiff1d(self.not_held, self.always)
-        chosen = evenly(others, max(times * MOST_TO_CHOOSE - len(self.always), 0))
+        """Places that trial fits learn from, up to ``times`` :data:`MOST_TO_CHOOSE`, those of every chain among them; those of once
+        are among those of twice, whose paths are traced."""
+        chosen = np.setdiff1d(self.not_held, self.always)
+        for most in (2, times):
+            chosen = evenly(chosen, max(most * MOST_TO_CHOOSE - len(self.always), 0))
         return np.union1d(self.always, chosen).astype(int)
 
     @property
