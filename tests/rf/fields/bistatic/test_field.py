@@ -183,6 +183,22 @@ def test_of_seventy_receivers_some_decide(scene, data, field):
     assert psnr(many, data.subset(np.arange(6, 10))) > psnr(field, data.subset(np.arange(6, 10))) - 1.0
 
 
+def test_places_refuse_a_choice_only_if_all_would(scene, data, monkeypatch):
+    kept = []
+    monkeypatch.setattr(
+        fitting, "choose", lambda t, real=fitting.choose: kept.append((t, real(t))) or kept[-1][1]
+    )
+    RadioField.fit(scene, data)
+    ((t, choice),) = kept
+    for places in (t, replace(t, held=t.not_held[:2])):
+        whole = places.choice_loss(choice)
+        for share in (0.1, 0.5, 0.9, 0.999, 1.001, 1.1, 2.0):
+            found = places.choice_loss(choice, share * whole)
+            assert (found < share * whole) == (share > 1.0)
+            assert found == whole or share < 1.0
+        assert places.choice_loss(choice, 0.1 * whole) != whole  # of some places alone
+
+
 def test_ten_times_better_than_the_nearest_measurement(field, data):
     test = data.subset(np.arange(6, 10))
     ours = evaluate(test, field.spectrum)
