@@ -176,7 +176,7 @@ def test_receivers_that_decide_are_spread_over_the_order_in_which_they_came():
 
 
 def test_of_seventy_receivers_some_decide(scene, data, field):
-    """Trial fits learn from half of those whose paths are traced first, which all but a few of seventy are."""
+    """Trial fits ask for no receiver whose paths are not traced yet."""
     every = data.subset(np.tile(np.arange(6), 12)[:70])
     many = RadioField.fit(scene, every)
     assert many.report["receivers"] == 70

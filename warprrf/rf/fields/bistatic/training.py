@@ -202,8 +202,8 @@ class Training:
         return np.setdiff1d(np.arange(len(self.places)), self.held)
 
     def few(self, times: int) -> np.ndarray:
-        """Places that trial fits learn from, up to ``times`` :data:`MOST_TO_CHOOSE`, those of every chain among them; those of once
-        are among those of twice, whose paths are traced."""
+        """Places that trial fits learn from, up to ``times`` :data:`MOST_TO_CHOOSE`, those of every chain among them; the fewer are
+        some of the more, whose paths are traced."""
         chosen = np.setdiff1d(self.not_held, self.always)
         for most in (2, times):
             chosen = evenly(chosen, max(most * MOST_TO_CHOOSE - len(self.always), 0))
@@ -340,15 +340,12 @@ class Training:
 
     def choice_loss(self, choice: Solution, most: float = np.inf) -> float:
         """Mean square error that tells one choice from another [dB^2], without residual: of the readings chosen of places that
-        trial fits learn from, and of those held out, which are too few to say alone (none may be behind a wall). Of a choice that
-        some places show to have ``most`` or more, that at these."""
+        trial fits learn from, and of those held out, which are too few to say alone (none may be behind a wall). Where some of
+        the places show that it is ``most`` or more, that at these."""
         few, p = self.few(1), choice.parameters
-        places, parts = (
-            np.concatenate([few, np.setdiff1d(self.held, few)]),
-            4,
-        )  # those first whose paths are traced
+        places = np.concatenate([few, np.setdiff1d(self.held, few)])  # those first whose paths are traced
         count, losses = sum(len(self.parts[k].target) for k in places), np.zeros(0)
-        for some in np.array_split(places, parts):
+        for some in np.array_split(places, 4):
             problem = self.problem(choice.effects, choice.material, some, p)
             own = [batch.losses(batch.gain(p, x) * x) for batch, _, x in problem.evaluated(p)]
             losses = np.concatenate([losses, *own])
